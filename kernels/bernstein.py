@@ -1,0 +1,98 @@
+"""Bernstein polynomials of degree one to three: evaluation, splitting, restriction and division (paper, 3.2).
+
+A polynomial is the vector of its Bernstein coefficients on [0, 1]. A parameter t is given **homogeneously** by two
+weights a, b >= 0, t = a / (a + b), and a polynomial of degree m is evaluated times (a + b)^m, so that its sign needs no
+division (paper, supplement 4).
+"""
+
+import warp as wp
+
+TWO = wp.constant(wp.float64(2.0))
+THREE = wp.constant(wp.float64(3.0))
+
+
+@wp.func
+def evaluate_quadratic(q: wp.vec3d, a: wp.float64, b: wp.float64) -> wp.float64:
+    """Value of a quadratic at t = a / (a + b), times (a + b)^2."""
+    return (q[0] * b + TWO * q[1] * a) * b + q[2] * a * a
+
+
+@wp.func
+def evaluate_cubic(k: wp.vec4d, a: wp.float64, b: wp.float64) -> wp.float64:
+    """Value of a cubic at t = a / (a + b), times (a + b)^3."""
+    return ((k[0] * b + THREE * k[1] * a) * b + THREE * k[2] * a * a) * b + k[3] * a * a * a
+
+
+@wp.func
+def split_quadratic(q: wp.vec3d, a: wp.float64, b: wp.float64):
+    """Both parts of a quadratic split at t = a / (a + b), times (a + b)^2 (de Casteljau)."""
+    sum = a + b
+    q01 = b * q[0] + a * q[1]
+    q12 = b * q[1] + a * q[2]
+    middle = b * q01 + a * q12
+    return wp.vec3d(sum * sum * q[0], sum * q01, middle), wp.vec3d(middle, sum * q12, sum * sum * q[2])
+
+
+@wp.func
+def split_cubic(k: wp.vec4d, a: wp.float64, b: wp.float64):
+    """Both parts of a cubic split at t = a / (a + b), times (a + b)^3 (de Casteljau)."""
+    sum = a + b
+    k01 = b * k[0] + a * k[1]
+    k12 = b * k[1] + a * k[2]
+    k23 = b * k[2] + a * k[3]
+    k012 = b * k01 + a * k12
+    k123 = b * k12 + a * k23
+    middle = b * k012 + a * k123
+    square = sum * sum
+    return (
+        wp.vec4d(square * sum * k[0], square * k01, sum * k012, middle),
+        wp.vec4d(middle, sum * k123, square * k23, square * sum * k[3]),
+    )
+
+
+@wp.func
+def mix(a: wp.float64, b: wp.float64, t: wp.float64) -> wp.float64:
+    """Linear interpolation (1 - t) a + t b; for t in [0, 1] the rounding error is at most 3 roundoff max(|a|, |b|)."""
+    return (wp.float64(1.0) - t) * a + t * b
+
+
+@wp.func
+def restrict_quadratic(q: wp.vec3d, start: wp.float64, end: wp.float64) -> wp.vec3d:
+    """Bernstein coefficients of a quadratic on [start, end], a part of [0, 1]: its blossom at the ends."""
+    s01 = mix(q[0], q[1], start)
+    s12 = mix(q[1], q[2], start)
+    e01 = mix(q[0], q[1], end)
+    e12 = mix(q[1], q[2], end)
+    return wp.vec3d(mix(s01, s12, start), mix(s01, s12, end), mix(e01, e12, end))
+
+
+@wp.func
+def restrict_cubic(k: wp.vec4d, start: wp.float64, end: wp.float64) -> wp.vec4d:
+    """Bernstein coefficients of a cubic on [start, end], a part of [0, 1]: its blossom at the ends."""
+    at_start = wp.vec3d(mix(k[0], k[1], start), mix(k[1], k[2], start), mix(k[2], k[3], start))
+    at_end = wp.vec3d(mix(k[0], k[1], end), mix(k[1], k[2], end), mix(k[2], k[3], end))
+    from_start = restrict_quadratic(at_start, start, end)
+    from_end = restrict_quadratic(at_end, start, end)
+    return wp.vec4d(from_start[0], from_start[1], from_start[2], from_end[2])
+
+
+@wp.func
+def divide_cubic(k: wp.vec4d, q: wp.vec3d):
+    """Pseudo-division D^2 Y = L q + K of a cubic Y by a quadratic q, with D = q0 - 2 q1 + q2 (paper, equation 15).
+
+    The paper's decomposition with its determinant D^2 multiplied out. With the first differences d of q and the
+    second differences e of Y, its 2 x 2 system solves to L_i = 3 e_i D - 2 d_i (e_1 - e_0).
+
+    Returns:
+        The linear polynomials L and K.
+    """
+    d0 = q[1] - q[0]
+    d1 = q[2] - q[1]
+    e0 = (k[2] - k[1]) - (k[1] - k[0])
+    e1 = (k[3] - k[2]) - (k[2] - k[1])
+    leading_q = d1 - d0
+    leading_k = e1 - e0
+    l0 = THREE * e0 * leading_q - TWO * d0 * leading_k
+    l1 = THREE * e1 * leading_q - TWO * d1 * leading_k
+    square = leading_q * leading_q
+    return wp.vec2d(l0, l1), wp.vec2d(square * k[0] - l0 * q[0], square * k[3] - l1 * q[2])

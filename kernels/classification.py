@@ -1,0 +1,122 @@
+"""Classification of a query by Bernstein signs: FREE, HIT or UNSURE (paper, Algorithm 1)."""
+
+import warp as wp
+
+from .bernstein import split_cubic, split_quadratic
+from .polynomials import Coplanarity, InsideTests, Motion, inside_tests, largest_axis
+from .roots import TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quadratic_signs
+from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic, certified_sign_quadratic
+
+_SPLIT = wp.constant(wp.float64(2.5))
+
+
+@wp.func
+def constant_signs(tests: InsideTests) -> wp.vec4i:
+    """The sign of each inside test over the whole time, 0 where it is not certainly constant."""
+    return wp.vec4i(
+        certified_sign_quadratic(tests.q0, tests.bounds[0]),
+        certified_sign_quadratic(tests.q1, tests.bounds[1]),
+        certified_sign_quadratic(tests.q2, tests.bounds[2]),
+        certified_sign_quadratic(tests.q3, tests.bounds[3]),
+    )
+
+
+@wp.func
+def verdict(signs: wp.vec4i) -> int:
+    """What the signs of the inside tests say of a time at which the four points lie in a plane."""
+    low = wp.min(wp.min(signs[0], signs[1]), wp.min(signs[2], signs[3]))
+    high = wp.max(wp.max(signs[0], signs[1]), wp.max(signs[2], signs[3]))
+    if low < 0 and high > 0:
+        return FREE
+    return wp.where(low == high and low != 0, HIT, UNSURE)
+
+
+@wp.func
+def either(first: int, second: int) -> int:
+    """Status of a query from the statuses of two parts of its time."""
+    if first == HIT or second == HIT:
+        return HIT
+    return wp.where(first == FREE and second == FREE, FREE, UNSURE)
+
+
+@wp.func
+def _classify_piece(
+    k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int
+) -> int:
+    """Status over a time in which the cubic has at most one extremum."""
+    if certified_sign_cubic(k, bound) != 0:
+        return FREE
+    roots = count_roots(k, bound, shape)
+    if roots == 0:
+        return FREE
+    if roots == UNKNOWN:
+        return UNSURE
+    size = largest(k)
+    s0 = quadratic_signs(tests.q0, tests.bounds[0], k, bound, size, roots)
+    s1 = quadratic_signs(tests.q1, tests.bounds[1], k, bound, size, roots)
+    s2 = quadratic_signs(tests.q2, tests.bounds[2], k, bound, size, roots)
+    s3 = quadratic_signs(tests.q3, tests.bounds[3], k, bound, size, roots)
+    return either(
+        verdict(wp.vec4i(s0[0], s1[0], s2[0], s3[0])),
+        verdict(wp.vec4i(s0[1], s1[1], s2[1], s3[1])),
+    )
+
+
+@wp.func
+def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
+    """One part of a quadratic split at t = a / (a + b)."""
+    left, right = split_quadratic(q, a, b)
+    return wp.where(first, left, right)
+
+
+@wp.func
+def classify(motion: Motion, y: Coplanarity) -> int:
+    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
+
+    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests there;
+    where Y may have two extrema it is split at its inflection first, homogeneously.
+
+    Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of size s^3 k,
+    below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
+    """
+    if certified_sign_cubic(y.k, y.bound) != 0:
+        return FREE
+    tests = inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1))
+    constant = verdict(constant_signs(tests))
+    if constant == FREE:
+        return FREE
+    end_signs = certified_sign(y.k[0], y.bound) * certified_sign(y.k[3], y.bound)
+    if constant == HIT and end_signs < 0:
+        return HIT
+    shape = curve_class(y.k, y.bound)
+    if end_signs == 0 or shape == UNKNOWN:
+        return UNSURE
+    if shape != TWO_EXTREMA:
+        return _classify_piece(y.k, y.bound, tests, shape)
+
+    e0 = (y.k[2] - y.k[1]) - (y.k[1] - y.k[0])
+    e1 = (y.k[3] - y.k[2]) - (y.k[2] - y.k[1])
+    a = wp.abs(e0)
+    b = wp.abs(e1)
+    square = (a + b) * (a + b)
+    bound = _SPLIT * square * (a + b) * y.bound
+    k_first, k_second = split_cubic(y.k, a, b)
+    status = FREE
+    for piece in range(2):
+        first = piece == 0
+        k = wp.where(first, k_first, k_second)
+        part = InsideTests()
+        part.bounds = _SPLIT * square * tests.bounds
+        part.q0 = _half(tests.q0, a, b, first)
+        part.q1 = _half(tests.q1, a, b, first)
+        part.q2 = _half(tests.q2, a, b, first)
+        part.q3 = _half(tests.q3, a, b, first)
+        half_shape = curve_class(k, bound)
+        half = UNSURE
+        if certified_sign_cubic(k, bound) != 0 or verdict(constant_signs(part)) == FREE:
+            half = FREE
+        elif certified_sign(k[0], bound) * certified_sign(k[3], bound) != 0 and half_shape != UNKNOWN:
+            if half_shape != TWO_EXTREMA:
+                half = _classify_piece(k, bound, part, half_shape)
+        status = either(status, half)
+    return status

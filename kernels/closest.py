@@ -1,0 +1,98 @@
+"""Closest points of the two features of a query at one time: separating directions, contact coordinates and normal.
+
+Nothing here is certified: a direction may be any, and coordinates are a result rounded like any other.
+"""
+
+import warp as wp
+
+from .polynomials import VERTEX_FACE, Motion
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_FLAT = wp.constant(wp.float64(1.0e-24))
+
+
+@wp.func
+def _ratio(x: wp.float64, y: wp.float64) -> wp.float64:
+    """x / y in [0, 1]; 0 where y is zero, the length of a point."""
+    if y > _ZERO:
+        return wp.clamp(x / y, _ZERO, _ONE)
+    return _ZERO
+
+
+@wp.func
+def _closest_vertex_face(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
+    """(beta, gamma) of the point of the triangle 0, u, v that is closest to w."""
+    n = wp.cross(u, v)
+    beta = wp.dot(wp.cross(w, v), n)
+    gamma = wp.dot(wp.cross(u, w), n)
+    nn = wp.dot(n, n)
+    if nn > _ZERO and beta >= _ZERO and gamma >= _ZERO and beta + gamma <= nn:
+        return wp.vec2d(beta / nn, gamma / nn)
+    s_u = _ratio(wp.dot(w, u), wp.dot(u, u))
+    s_v = _ratio(wp.dot(w, v), wp.dot(v, v))
+    s_uv = _ratio(wp.dot(w - u, v - u), wp.dot(v - u, v - u))
+    to_u = wp.length_sq(w - s_u * u)
+    to_v = wp.length_sq(w - s_v * v)
+    to_uv = wp.length_sq(w - u - s_uv * (v - u))
+    if to_u <= to_v and to_u <= to_uv:
+        return wp.vec2d(s_u, _ZERO)
+    if to_v <= to_uv:
+        return wp.vec2d(_ZERO, s_v)
+    return wp.vec2d(_ONE - s_uv, s_uv)
+
+
+@wp.func
+def _closest_edge_edge(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
+    """(s, r) of the closest points s u and w + r v of two segments."""
+    uu = wp.dot(u, u)
+    vv = wp.dot(v, v)
+    uv = wp.dot(u, v)
+    uw = wp.dot(u, w)
+    vw = wp.dot(v, w)
+    s = _ratio(uw * vv - uv * vw, uu * vv - uv * uv)
+    r = _ratio(uv * s - vw, vv)
+    return wp.vec2d(_ratio(uv * r + uw, uu), r)
+
+
+@wp.func
+def closest_coordinates(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
+    """Coordinates of the closest points: (beta, gamma) of the triangle, or (s, r) along the edges."""
+    if kind == VERTEX_FACE:
+        return _closest_vertex_face(u, v, w)
+    return _closest_edge_edge(u, v, w)
+
+
+@wp.func
+def between(kind: int, coordinates: wp.vec2d, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
+    """Vector from the second feature (face, edge c d) to the first (vertex, edge a b) at the given coordinates."""
+    if kind == VERTEX_FACE:
+        return w - coordinates[0] * u - coordinates[1] * v
+    return coordinates[0] * u - coordinates[1] * v - w
+
+
+@wp.func
+def contact_at(motion: Motion, time: wp.float64):
+    """Where and in which direction the features touch at the time of a contact.
+
+    Returns:
+        Coordinates (vertex-face: barycentric in the face; edge-edge: s along a b, r along c d, 0), and the unit normal, which
+        points against the velocity of the vertex or of edge a b relative to the other feature. Parallel edges and
+        collapsed triangles have no plane: their normal is the direction of that velocity.
+    """
+    u = (_ONE - time) * motion.u0 + time * motion.u1
+    v = (_ONE - time) * motion.v0 + time * motion.v1
+    w = (_ONE - time) * motion.w0 + time * motion.w1
+    closest = closest_coordinates(motion.kind, u, v, w)
+    velocity = between(motion.kind, closest, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+    normal = wp.cross(u, v)
+    if wp.length_sq(normal) <= _FLAT * wp.length_sq(u) * wp.length_sq(v):
+        normal = velocity
+    if wp.length_sq(normal) == _ZERO:
+        normal = wp.vec3d(_ZERO, _ZERO, _ONE)
+    if wp.dot(normal, velocity) > _ZERO:
+        normal = -normal
+    coordinates = wp.vec3d(closest[0], closest[1], _ZERO)
+    if motion.kind == VERTEX_FACE:
+        coordinates = wp.vec3d(_ONE - closest[0] - closest[1], closest[0], closest[1])
+    return coordinates, wp.normalize(normal)

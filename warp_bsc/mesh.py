@@ -1,0 +1,59 @@
+"""The collision mesh: what of a triangle mesh takes part in collision detection."""
+
+import numpy as np
+import warp as wp
+
+__all__ = ["CollisionMesh"]
+
+
+class CollisionMesh:
+    """The faces, edges and vertices of a triangle mesh whose positions change and whose faces do not.
+
+    Vertices that no face uses (the inner particles of a soft body, say) take no part. Several bodies make one mesh: their
+    faces index one array of positions.
+
+    Attributes:
+        faces: Vertex indices of the faces, int32, shape [face_count, 3].
+        edges: Vertex indices of the edges, smaller first, sorted, int32, shape [edge_count, 2].
+        vertices: Indices of the vertices that faces use, sorted, int32, shape [used_vertex_count].
+        vertex_count: Number of positions.
+        device: Warp device of the arrays that the detector uses.
+    """
+
+    def __init__(self, faces, vertex_count, *, device=None):
+        """Finds the edges and puts the mesh on a device.
+
+        Args:
+            faces: Vertex indices, integers, shape [face_count, 3], NumPy or Warp array.
+            vertex_count: Number of positions.
+            device: Warp device; default: Warp's default.
+
+        Raises:
+            ValueError: If the faces have another shape or type, or an index is not in [0, vertex_count).
+        """
+        faces = faces.numpy() if isinstance(faces, wp.array) else np.asarray(faces)
+        if faces.size == 0:
+            faces = faces.reshape(0, 3).astype(np.int32)
+        if faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError(f"faces must have shape (n, 3), not {faces.shape}")
+        if not np.issubdtype(faces.dtype, np.integer):
+            raise ValueError(f"faces must be integers, not {faces.dtype}")
+        if not 0 <= vertex_count < 2**31:
+            raise ValueError(f"vertex_count must be in [0, 2^31), not {vertex_count}")
+        bad = np.flatnonzero(((faces < 0) | (faces >= vertex_count)).any(axis=1))
+        if len(bad):
+            raise ValueError(
+                f"face {bad[0]} is {faces[bad[0]].tolist()}, but the mesh has {vertex_count} vertices"
+                + (f" ({len(bad)} such faces)" if len(bad) > 1 else "")
+            )
+        self.faces = np.ascontiguousarray(faces, dtype=np.int32)
+        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges = np.unique(edges, axis=0)
+        # a face that names a vertex twice has an edge without length: its point belongs to the other edge
+        self.edges = edges[edges[:, 0] != edges[:, 1]]
+        self.vertices = np.unique(self.faces)
+        self.vertex_count = vertex_count
+        self.device = wp.get_device(device)
+        self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
+        self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
+        self.device_vertices = wp.array(self.vertices.reshape(-1, 1), dtype=int, device=self.device)
