@@ -8,7 +8,7 @@ from .classification import classify
 from .culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion, coplanarity
 from .signs import FREE, ROUNDOFF, UNSURE
-from .time_of_impact import Impact, first_contact, impact
+from .time_of_impact import Impact, impact
 
 _SMALLEST = wp.constant(wp.float64(1.0e-280))
 _LARGEST = wp.constant(wp.float64(1.0e300))
@@ -179,9 +179,9 @@ def impact_edge_edge(
 def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any) -> int:
     """Whether a moving vertex p meets a moving triangle a b c: FREE, HIT or UNSURE.
 
-    Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between. Time and
-    triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that are not finite
-    are UNSURE.
+    Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between.
+    Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points
+    that are not finite are UNSURE.
     """
     motion = vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF)
     if motion.finite and vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
@@ -193,9 +193,9 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
 def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> int:
     """Whether a moving edge a b meets a moving edge c d: FREE, HIT or UNSURE.
 
-    Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between. Time and
-    edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that are not finite are
-    UNSURE.
+    Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between.
+    Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that
+    are not finite are UNSURE.
     """
     motion = edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
     if motion.finite and edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):

@@ -40,9 +40,7 @@ def either(first: int, second: int) -> int:
 
 
 @wp.func
-def _classify_piece(
-    k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int
-) -> int:
+def _classify_piece(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int) -> int:
     """Status over a time in which the cubic has at most one extremum."""
     if certified_sign_cubic(k, bound) != 0:
         return FREE
@@ -73,11 +71,11 @@ def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
 def classify(motion: Motion, y: Coplanarity) -> int:
     """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
 
-    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests there;
-    where Y may have two extrema it is split at its inflection first, homogeneously.
+    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
+    there; where Y may have two extrema it is split at its inflection first, homogeneously.
 
-    Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of size s^3 k,
-    below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
+    Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of
+    size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
     """
     if certified_sign_cubic(y.k, y.bound) != 0:
         return FREE

@@ -14,7 +14,7 @@ _FLAT = wp.constant(wp.float64(1.0e-24))
 
 @wp.func
 def _ratio(x: wp.float64, y: wp.float64) -> wp.float64:
-    """x / y in [0, 1]; 0 where y is zero, the length of a point."""
+    """The quotient x / y in [0, 1]; 0 where y is zero, the length of a point."""
     if y > _ZERO:
         return wp.clamp(x / y, _ZERO, _ONE)
     return _ZERO
@@ -76,9 +76,9 @@ def contact_at(motion: Motion, time: wp.float64):
     """Where and in which direction the features touch at the time of a contact.
 
     Returns:
-        Coordinates (vertex-face: barycentric in the face; edge-edge: s along a b, r along c d, 0), and the unit normal, which
-        points against the velocity of the vertex or of edge a b relative to the other feature. Parallel edges and
-        collapsed triangles have no plane: their normal is the direction of that velocity.
+        Coordinates (vertex-face: barycentric in the face; edge-edge: s along a b, r along c d, 0), and the unit
+        normal, which points against the velocity of the vertex or of edge a b relative to the other feature.
+        Parallel edges and collapsed triangles have no plane: their normal is the direction of that velocity.
     """
     u = (_ONE - time) * motion.u0 + time * motion.u1
     v = (_ONE - time) * motion.v0 + time * motion.v1

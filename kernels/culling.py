@@ -55,9 +55,9 @@ def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
     The differences of the points of the two features are w, w - u, w - v (vertex-face) and w, w - u, w + v,
     w - u + v (edge-edge).
 
-    Bound: any direction will do, so it has no error. The products of a dot product have at most 4 roundings of the vector
-    (a motion restricted in time has been interpolated), 1 of the product, 2 of the sum, and 2 of the difference:
-    9r times the sum of the sizes of all products.
+    Bound: any direction will do, so it has no error. The products of a dot product have at most 4 roundings of the
+    vector (a motion restricted in time has been interpolated), 1 of the product, 2 of the sum, and 2 of the
+    difference: 9r times the sum of the sizes of all products.
     """
     u0 = wp.dot(direction, motion.u0)
     u1 = wp.dot(direction, motion.u1)

@@ -10,9 +10,10 @@ of u and v, and w x v, u x w, w x u are multiples of n:
 - vertex-face: p = a + beta u + gamma v with beta n = w x v and gamma n = u x w;
 - edge-edge: a + s u = c + r v with s n = w x v and r n = w x u.
 
-So for an axis i with n_i != 0, contact needs one weak sign of (w x v)_i, (u x w)_i and n_i - (w x v)_i - (u x w)_i; or of
-(w x v)_i, n_i - (w x v)_i, (w x u)_i and n_i - (w x u)_i. This is the paper's test m . n >= 0 without its degree four in t
-and without the factor k0^2 that its reduction to degree two costs, which vanishes for resting contact.
+So for an axis i with n_i != 0, contact needs one weak sign of (w x v)_i, (u x w)_i and n_i - (w x v)_i - (u x w)_i;
+or of (w x v)_i, n_i - (w x v)_i, (w x u)_i and n_i - (w x u)_i. This is the paper's test m . n >= 0 without its
+degree four in t and without the factor k0^2 that its reduction to degree two costs, which vanishes for resting
+contact.
 
 What certified signs say, for **any** axis and at any time at which Y = 0 (n = 0 included):
 
@@ -24,7 +25,7 @@ What certified signs say, for **any** axis and at any time at which Y = 0 (n = 0
 
 import warp as wp
 
-from .bernstein import THREE, TWO
+from .bernstein import TWO
 from .signs import UNDERFLOW
 
 VERTEX_FACE = wp.constant(0)
@@ -94,10 +95,10 @@ def _cross_size(x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
 def coplanarity(motion: Motion) -> Coplanarity:
     """Y(t) = w . n as a cubic in Bernstein form (paper, equation 11).
 
-    Bound, with r the roundoff and P the determinant of the sizes of u, v, w with all six terms added (their permanent), which
-    bounds every k: the components of u, v, w have one rounding each. A component of n sums at most four products,
-    halved, each with at most 2 + 1 + 2 roundings. Y's k1 sums nine products w n, over three, with 5 roundings of n, 1 of w,
-    1 of the product, 3 of the sums and 2 of the third: 12r P.
+    Bound, with r the roundoff and P the determinant of the sizes of u, v, w with all six terms added (their
+    permanent), which bounds every k: the components of u, v, w have one rounding each. A component of n sums at
+    most four products, halved, each with at most 2 + 1 + 2 roundings. Y's k1 sums nine products w n, over three,
+    with 5 roundings of n, 1 of w, 1 of the product, 3 of the sums and 2 of the third: 12r P.
     """
     y = Coplanarity()
     y.n0 = wp.cross(motion.u0, motion.v0)
@@ -158,8 +159,8 @@ def inside_tests(motion: Motion, y: Coplanarity, axis: int) -> InsideTests:
     Vertex-face: beta, gamma, n - beta - gamma, and n itself, which decides where one of the others changes sign.
     Edge-edge: s, n - s, r, n - r.
 
-    Bounds, as in :func:`coplanarity`, with P the sum of the sizes of a component's two products: 5r P for a cross product;
-    a difference of two adds their bounds and one rounding, one of three two.
+    Bounds, as in :func:`coplanarity`, with P the sum of the sizes of a component's two products: 5r P for a cross
+    product; a difference of two adds their bounds and one rounding, one of three two.
     """
     n = wp.vec3d(component(y.n0, axis), component(y.nh, axis), component(y.n1, axis))
     w_v = _cross_component(motion.w0, motion.w1, motion.v0, motion.v1, axis)

@@ -4,13 +4,13 @@ All functions take a cubic Y with the bound on the error of its coefficients, wh
 which has at most one extremum between them. They answer 0 where the sign is not certain.
 
 Bounds are in terms of E (of Y's coefficients, at most k in size) and F (of a quadratic's, at most q in size). Because
-E >= 13 r k and F >= 5 r q in :mod:`polynomials`, with r the roundoff, they swallow the roundings of what is computed here:
-rounding a number of size c k costs c r k <= c E / 13.
+E >= 13 r k and F >= 5 r q in :mod:`polynomials`, with r the roundoff, they swallow the roundings of what is
+computed here: rounding a number of size c k costs c r k <= c E / 13.
 """
 
 import warp as wp
 
-from .bernstein import THREE, divide_cubic, evaluate_cubic, evaluate_quadratic
+from .bernstein import divide_cubic, evaluate_cubic, evaluate_quadratic
 from .signs import UNDERFLOW, certified_sign, certified_sign_quadratic
 
 MONOTONE = wp.constant(0)
@@ -18,7 +18,8 @@ MONOTONE = wp.constant(0)
 ONE_EXTREMUM = wp.constant(1)
 """Curve with one extremum (the paper's case b)."""
 TWO_EXTREMA = wp.constant(2)
-"""Curve that may have two extrema, with its inflection between them (the paper's case a, as far as it needs splitting)."""
+"""Curve that may have two extrema, with its inflection between them (the paper's case a, as far as it needs
+splitting)."""
 UNKNOWN = wp.constant(-1)
 
 _QUARTER = wp.constant(wp.float64(0.25))
@@ -44,12 +45,12 @@ def largest(k: wp.vec4d) -> wp.float64:
 def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
     """How many extrema a cubic has in [0, 1]: MONOTONE, ONE_EXTREMUM, TWO_EXTREMA, or UNKNOWN.
 
-    The derivative is a quadratic with coefficients d. Its ends differ in sign: one root, with or without inflection (the
-    paper splits at every inflection, but only two extrema need it). They agree: none if d1 agrees too or the
+    The derivative is a quadratic with coefficients d. Its ends differ in sign: one root, with or without inflection
+    (the paper splits at every inflection, but only two extrema need it). They agree: none if d1 agrees too or the
     discriminant d1^2 - d0 d2 is negative.
 
-    Bounds: of a difference, 2E and a rounding of size 2k; of the discriminant, 4 * 2.5E d for d the largest difference, and
-    roundings of size d^2 <= 2kd: below 12E d.
+    Bounds: of a difference, 2E and a rounding of size 2k; of the discriminant, 4 * 2.5E d for d the largest
+    difference, and roundings of size d^2 <= 2kd: below 12E d.
     """
     d0 = k[1] - k[0]
     d1 = k[2] - k[1]
@@ -76,13 +77,13 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     The sign at the extremum t, the root of Y' = H with Bernstein coefficients d, decides between none and two. There Y
     is the quadratic G = (k0, k1, k2) as well, because Y(t) = (1 - t) G(t) + t (G + H)(t) and H(t) = 0. Eliminating the
     leading coefficient gives A Y = T with A = e1 - e0 and T linear: T_0 = A k0 - e0 d0, T_1 = A k3 - e1 d2; sign
-    determination for T against H then says the sign of T at t. Where A is small, T vanishes with it, but then H is nearly
-    its chord, which differs from H by |A| / 4 at most, and Y at the root t' of the chord is close: with s = |d0| + |d2|,
-    |t - t'| <= |A| / 4s, and |Y'| = 3 |H| <= 3 |A| / 2 between, so that |Y(t) - Y(t')| <= 3/8 A^2 / s.
+    determination for T against H then says the sign of T at t. Where A is small, T vanishes with it, but then H is
+    nearly its chord, which differs from H by |A| / 4 at most, and Y at the root t' of the chord is close: with s =
+    |d0| + |d2|, |t - t'| <= |A| / 4s, and |Y'| = 3 |H| <= 3 |A| / 2 between, so that |Y(t) - Y(t')| <= 3/8 A^2 / s.
 
     Bounds: the cubic with the computed coefficients is within E of Y on [0, 1], so it suffices that its sign at its own
-    extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of A, 9E; of T,
-    with E <= k: (9 + 8 + 9) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k.
+    extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of
+    A, 9E; of T, with E <= k: (9 + 8 + 9) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k.
     """
     end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)
     if end_signs < 0:
@@ -135,15 +136,16 @@ def linear_signs(
 ) -> wp.vec2i:
     """Signs of a linear polynomial at the roots of Y, first and last (paper, Sign Determination Theorems I and II).
 
-    With the line's ends of opposite sign, its root t' = a / (a + b), a = |l0|, b = |l1|, and which side of the roots of Y it
-    lies on follows from the sign of Y(t'), and, if Y has two roots outside which it lies, from the sign of Y'(t'). Any
-    function that stays within ``line_bound`` = F of the line will do for the line: it has the line's sign beyond the roots of
-    all lines with ends within F.
+    With the line's ends of opposite sign, its root t' = a / (a + b), a = |l0|, b = |l1|, and which side of the
+    roots of Y it lies on follows from the sign of Y(t'), and, if Y has two roots outside which it lies, from the
+    sign of Y'(t'). Any function that stays within ``line_bound`` = F of the line will do for the line: it has the
+    line's sign beyond the roots of all lines with ends within F.
 
-    Bound of Y(t') times (a + b)^3: E and roundings below E, times (a + b)^3; moving an end of the line by F moves it by at
-    most 3k (2 (a + b))^2 F, because a, b > F: 24k F (a + b)^2 for both. Of Y'(t') likewise: 2.5E and 2 (2k) 2 (a + b) 2F. If the sign of an
-    end is uncertain, at most 2F in truth, and the other end b > 2F, then the root of every such line lies at
-    2F / (F + b) <= 4F / (4F + b) at most: a = 4F is tried, and only the other end's sign can follow.
+    Bound of Y(t') times (a + b)^3: E and roundings below E, times (a + b)^3; moving an end of the line by F moves
+    it by at most 3k (2 (a + b))^2 F, because a, b > F: 24k F (a + b)^2 for both. Of Y'(t') likewise: 2.5E and 2
+    (2k) 2 (a + b) 2F. If the sign of an end is uncertain, at most 2F in truth, and the other end b > 2F, then the
+    root of every such line lies at 2F / (F + b) <= 4F / (4F + b) at most: a = 4F is tried, and only the other end's
+    sign can follow.
     """
     s0 = certified_sign(line[0], line_bound)
     s1 = certified_sign(line[1], line_bound)
@@ -180,14 +182,14 @@ def quadratic_signs(
 ) -> wp.vec2i:
     """Signs of a quadratic at the roots of Y, first and last (paper, 4.2).
 
-    Three attempts: the sign of all its coefficients; its chord, from which it differs by D t (1 - t), at most |D| / 4, with
-    D = q0 - 2 q1 + q2; and the division D^2 Y = L q + K, by which q = -K / L at a root of Y.
+    Three attempts: the sign of all its coefficients; its chord, from which it differs by D t (1 - t), at most |D| /
+    4, with D = q0 - 2 q1 + q2; and the division D^2 Y = L q + K, by which q = -K / L at a root of Y.
 
-    Bounds, of the differences d, e and the leading coefficients D, A of q and Y: 2.5F, 5E, 6F, 11E, with |d| <= 2q, |e| <= 4k,
-    |D| <= 4q, |A| <= 8k and, where a sign is certain at all, E <= k and F <= q. Of L = 3 e D - 2 d A, of size 80kq:
-    3 (4k 6F + 4q 5E + 30EF) + 2 (2q 11E + 8k 2.5F + 28EF) = 112kF + 104qE + 146EF and roundings: 288 (kF + qE). Of
-    K = D^2 Y - L q, of size 96q^2 k: 84qF k + 16q^2 E + 84qF E for the first term, (258kF + 104qE) (q + F) + 80kq F for the second,
-    and roundings: 896 q (kF + qE).
+    Bounds, of the differences d, e and the leading coefficients D, A of q and Y: 2.5F, 5E, 6F, 11E, with |d| <= 2q,
+    |e| <= 4k, |D| <= 4q, |A| <= 8k and, where a sign is certain at all, E <= k and F <= q. Of L = 3 e D - 2 d A, of
+    size 80kq: 3 (4k 6F + 4q 5E + 30EF) + 2 (2q 11E + 8k 2.5F + 28EF) = 112kF + 104qE + 146EF and roundings: 288 (kF
+    + qE). Of K = D^2 Y - L q, of size 96q^2 k: 84qF k + 16q^2 E + 84qF E for the first term, (258kF + 104qE) (q +
+    F) + 80kq F for the second, and roundings: 896 q (kF + qE).
     """
     constant = certified_sign_quadratic(q, q_bound)
     if constant != 0:
@@ -197,14 +199,14 @@ def quadratic_signs(
     signs = linear_signs(wp.vec2d(q[0], q[2]), chord_bound, k, bound, size, roots)
     if signs[0] != 0 and signs[1] != 0:
         return signs
-    l, r = divide_cubic(k, q)
+    factor, remainder = divide_cubic(k, q)
     q_size = wp.max(wp.abs(q[0]), wp.max(wp.abs(q[1]), wp.abs(q[2])))
     unit = size * q_bound + q_size * bound
-    l_bound = _DIVISION_L * unit + UNDERFLOW * bound
-    r_bound = _DIVISION_K * q_size * unit + UNDERFLOW * bound
-    l_signs = linear_signs(l, l_bound, k, bound, size, roots)
-    r_signs = linear_signs(r, r_bound, k, bound, size, roots)
+    factor_bound = _DIVISION_L * unit + UNDERFLOW * bound
+    remainder_bound = _DIVISION_K * q_size * unit + UNDERFLOW * bound
+    factor_signs = linear_signs(factor, factor_bound, k, bound, size, roots)
+    remainder_signs = linear_signs(remainder, remainder_bound, k, bound, size, roots)
     return wp.vec2i(
-        wp.where(signs[0] != 0, signs[0], -l_signs[0] * r_signs[0]),
-        wp.where(signs[1] != 0, signs[1], -l_signs[1] * r_signs[1]),
+        wp.where(signs[0] != 0, signs[0], -factor_signs[0] * remainder_signs[0]),
+        wp.where(signs[1] != 0, signs[1], -factor_signs[1] * remainder_signs[1]),
     )

@@ -25,7 +25,8 @@ UNSURE = wp.constant(2)
 ROUNDOFF = wp.constant(wp.float64(2.0**-53))
 """Unit roundoff of double precision, with which signs are certified."""
 UNDERFLOW = wp.constant(wp.float64(1.0e-140))
-"""What every bound adds, times the roundoff, or times a bound: far above what products lose to underflow, 2^-1074 each."""
+"""What every bound adds, times the roundoff, or times a bound: far above what products lose to underflow, 2^-1074
+each."""
 
 
 @wp.func

@@ -1,8 +1,16 @@
 """Continuous collision detection for deforming triangle meshes: no missed collision, no dropped pair."""
 
-from .detector import CollisionDetector, Collisions, DetectionStats
-from .mesh import CollisionMesh
-from .query import QueryResult, query_edge_edge, query_vertex_face
+import importlib
+
+_MODULES = {
+    "CollisionDetector": "detector",
+    "CollisionMesh": "mesh",
+    "Collisions": "detector",
+    "DetectionStats": "detector",
+    "QueryResult": "query",
+    "query_edge_edge": "query",
+    "query_vertex_face": "query",
+}
 
 __all__ = [
     "CollisionDetector",
@@ -10,6 +18,16 @@ __all__ = [
     "Collisions",
     "DetectionStats",
     "QueryResult",
+    "checker",
     "query_edge_edge",
     "query_vertex_face",
 ]
+
+
+def __getattr__(name):
+    """Imports a name when it is first used, so that the exact checker needs no Warp."""
+    if name == "checker":
+        return importlib.import_module(".checker", __name__)
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)

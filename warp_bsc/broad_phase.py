@@ -164,9 +164,7 @@ class BroadPhase:
         """Candidate pairs (vertex, face) of a motion from x0 to x1, Warp array of vec2i, valid until the next call."""
         self._vertices.update(x0, x1)
         self._faces.update(x0, x1)
-        return self._find(
-            _pair_vertices_with_faces, self._faces, self._vertices, [self._mesh.device_faces]
-        )
+        return self._find(_pair_vertices_with_faces, self._faces, self._vertices, [self._mesh.device_faces])
 
     def edge_edge(self, x0, x1):
         """Candidate pairs (edge, edge) of a motion from x0 to x1, smaller first, valid until the next call."""

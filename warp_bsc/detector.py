@@ -1,5 +1,6 @@
 """The collision detector: every collision of a mesh that moves from one configuration to another."""
 
+import functools
 import time
 from dataclasses import dataclass
 
@@ -7,10 +8,35 @@ import numpy as np
 import warp as wp
 
 from . import checker
+from .arrays import checked_coordinates
 from .broad_phase import BroadPhase
+from .kernels.crossing import edge_crosses_face
+from .kernels.signs import HIT, UNSURE
 from .narrow_phase import TOLERANCE, StageCounts, check_method, check_tolerance, find_contacts
 
 __all__ = ["CollisionDetector", "Collisions", "DetectionStats"]
+
+
+@functools.cache
+def _classify_crossings(dtype):
+    """The kernel that says which edges meet which faces at rest, for one type of position."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def classify_crossings(
+        x: wp.array[dtype],
+        edges: wp.array2d[int],
+        faces: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        status: wp.array[int],
+    ):
+        i = wp.tid()
+        edge = pairs[i][0]
+        face = pairs[i][1]
+        status[i] = edge_crosses_face(
+            x[edges[edge, 0]], x[edges[edge, 1]], x[faces[face, 0]], x[faces[face, 1]], x[faces[face, 2]]
+        )
+
+    return classify_crossings
 
 
 @dataclass(frozen=True)
@@ -35,14 +61,16 @@ class Collisions:
     Attributes:
         vertex_face: (vertex, face), int32, shape [n, 2].
         edge_edge: (edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2].
-        vertex_face_toi: Times of impact as a share of the step, float64, shape [n]: no contact of the pair comes earlier.
-            The first contact comes at most the tolerance later, but for what floating point could not certify and
-            method "exact" was not asked to decide.
+        vertex_face_toi: Times of impact as a share of the step, float64, shape [n]: no contact of the pair comes
+            earlier. The first contact comes at most the tolerance later, but for what floating point could not
+            certify and method "exact" was not asked to decide.
         edge_edge_toi: The same for the edges, float64, shape [m].
         vertex_face_coordinates: Barycentric coordinates of the contact in the face, float64, shape [n, 3].
         edge_edge_coordinates: (s, r, 0) along the two edges, float64, shape [m, 3].
-        vertex_face_normal: Unit normals, against the velocity of the vertex relative to the face, float64, shape [n, 3].
-        edge_edge_normal: Unit normals, against the velocity of the first edge relative to the second, float64, shape [m, 3].
+        vertex_face_normal: Unit normals, against the velocity of the vertex relative to the face, float64, shape
+            [n, 3].
+        edge_edge_normal: Unit normals, against the velocity of the first edge relative to the second, float64,
+            shape [m, 3].
         certified: Whether no collision of the motion can be missing. False for method "float".
         stats: Counts and times of every stage.
     """
@@ -65,7 +93,7 @@ class Collisions:
 
 
 class CollisionDetector:
-    """Finds all collisions of a mesh: vertices against faces and edges against edges, pairs that share a vertex aside."""
+    """Finds all collisions of a moving mesh: vertices with faces and edges with edges that share no vertex."""
 
     def __init__(self, mesh, *, method="conservative", tolerance=TOLERANCE):
         """Prepares detection for a mesh, on its device.
@@ -144,30 +172,36 @@ class CollisionDetector:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
 
         Returns:
-            (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in ``mesh.edges``,
-            sorted, int32, shape [n, 2].
+            (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in
+            ``mesh.edges``, sorted, int32, shape [n, 2].
 
         Raises:
             ValueError: If the positions have another shape or type, or are not finite.
         """
         x = self._positions(x, "x")
-        pairs = self._broad_phase.edge_face(x).numpy().reshape(-1, 2)
+        mesh = self.mesh
+        candidates = self._broad_phase.edge_face(x)
+        status = wp.empty(len(candidates), dtype=int, device=mesh.device)
+        wp.launch(
+            _classify_crossings(x.dtype),
+            len(candidates),
+            inputs=[x, mesh.device_edges, mesh.device_faces, candidates],
+            outputs=[status],
+            device=mesh.device,
+        )
+        status = status.numpy()
+        pairs = candidates.numpy().reshape(-1, 2)
+        unsure = pairs[status == UNSURE]
         positions = x.numpy()
-        edges = positions[self.mesh.edges[pairs[:, 0]]]
-        faces = positions[self.mesh.faces[pairs[:, 1]]]
-        pairs = pairs[checker.edge_face_crossings(edges, faces)]
+        crossing = checker.edge_face_crossings(positions[mesh.edges[unsure[:, 0]]], positions[mesh.faces[unsure[:, 1]]])
+        pairs = np.concatenate([pairs[status == HIT], unsure[crossing]])
         return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
     def _positions(self, x, name):
         """Positions on the mesh's device as an array of vec3 or vec3d, checked."""
-        values = x.numpy() if isinstance(x, wp.array) else np.asarray(x)
-        if values.dtype not in (np.float32, np.float64):
-            raise ValueError(f"{name} must be float32 or float64, not {values.dtype}")
-        if values.shape != (self.mesh.vertex_count, 3):
-            raise ValueError(f"{name} must have shape ({self.mesh.vertex_count}, 3), not {values.shape}")
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
-            raise ValueError(f"{name} must be finite: vertex {np.argmin(finite)} is at {values[np.argmin(finite)]}")
+        values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
+        if len(values) != self.mesh.vertex_count:
+            raise ValueError(f"{name} must have {self.mesh.vertex_count} rows, one a vertex, got {len(values)}")
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
         if isinstance(x, wp.array) and x.device == self.mesh.device and x.dtype == dtype:
             return x

@@ -9,8 +9,8 @@ __all__ = ["CollisionMesh"]
 class CollisionMesh:
     """The faces, edges and vertices of a triangle mesh whose positions change and whose faces do not.
 
-    Vertices that no face uses (the inner particles of a soft body, say) take no part. Several bodies make one mesh: their
-    faces index one array of positions.
+    Vertices that no face uses (the inner particles of a soft body, say) take no part. Several bodies make one mesh:
+    their faces index one array of positions.
 
     Attributes:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].

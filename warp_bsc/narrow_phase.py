@@ -230,8 +230,8 @@ def find_contacts(kind, x0, x1, elements, candidates, *, method, localize, timed
         elements: Vertex indices of the faces (vertex_face) or edges (edge_edge), Warp array of int, two-dimensional.
         candidates: Pairs (vertex, face) or (edge, edge), Warp array of vec2i.
         method: One of :data:`METHODS`.
-        localize: Whether the times of certified hits that floating point could not place to within the tolerance are found by
-            exact arithmetic on the host; without it they are lower bounds.
+        localize: Whether the times of certified hits that floating point could not place to within the tolerance
+            are found by exact arithmetic on the host; without it they are lower bounds.
         timed: Whether to find times of impact, coordinates and normals.
         tolerance: Of the times of impact, as a share of the step.
 
@@ -246,9 +246,7 @@ def find_contacts(kind, x0, x1, elements, candidates, *, method, localize, timed
 
     counts = wp.zeros(2, dtype=int, device=device)
     survivors = wp.empty(len(candidates), dtype=wp.vec2i, device=device)
-    wp.launch(
-        cull, len(candidates), inputs=[*motion, roundoff, candidates], outputs=[survivors, counts], device=device
-    )
+    wp.launch(cull, len(candidates), inputs=[*motion, roundoff, candidates], outputs=[survivors, counts], device=device)
     survivor_count = int(counts.numpy()[0])
     clock.lap("cull")
 

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .arrays import checked_coordinates
 from .narrow_phase import TOLERANCE, check_method, check_tolerance, find_contacts
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
+
 
 @dataclass(frozen=True)
 class QueryResult:
@@ -18,10 +20,10 @@ class QueryResult:
         status: What floating point could certify, whatever the method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
         toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
             if not asked for.
-        coordinates: Where they touch, float64, shape [n, 3]: barycentric coordinates in the face, or (s, r, 0) along the
-            edges; NaN where there is no hit. None if no times were asked for.
-        normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other feature,
-            float64, shape [n, 3]; NaN where there is no hit. None if no times were asked for.
+        coordinates: Where they touch, float64, shape [n, 3]: barycentric coordinates in the face, or (s, r, 0)
+            along the edges; NaN where there is no hit. None if no times were asked for.
+        normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other
+            feature, float64, shape [n, 3]; NaN where there is no hit. None if no times were asked for.
     """
 
     hit: np.ndarray
@@ -35,8 +37,8 @@ def query_vertex_face(points, *, method="exact", toi=True, tolerance=TOLERANCE, 
     """Asks which moving vertices meet which moving triangles.
 
     Args:
-        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1: vertex p
-            and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1:
+            vertex p and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in (0, 1].
@@ -55,8 +57,8 @@ def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, de
     """Asks which moving edges meet.
 
     Args:
-        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1: edges a b
-            and c d at the start (0) and at the end (1) of the step. Any unit of length.
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
+            edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in (0, 1].
@@ -74,7 +76,11 @@ def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, de
 def _query(kind, points, method, timed, tolerance, device):
     check_method(method)
     check_tolerance(tolerance)
-    points, device = _checked_points(points, device)
+    if isinstance(points, wp.array):
+        device = points.device if device is None else device
+        points = points.numpy()
+    points = checked_coordinates(points, (8, 3), "points")
+    device = wp.get_device(device)
     n = len(points)
     # a mesh in which each query has four vertices of its own
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
@@ -119,19 +125,3 @@ def _query(kind, points, method, timed, tolerance, device):
     coordinates[answer_rows] = answers.coordinates[answers.hit]
     normal[answer_rows] = answers.normal[answers.hit]
     return QueryResult(hit, status, toi, coordinates, normal)
-
-
-def _checked_points(points, device):
-    """The points as a NumPy array of shape [n, 8, 3], and the device to compute on."""
-    if isinstance(points, wp.array):
-        device = points.device if device is None else wp.get_device(device)
-        points = points.numpy()
-    points = np.asarray(points)
-    if points.dtype not in (np.float32, np.float64):
-        raise ValueError(f"points must be float32 or float64, not {points.dtype}")
-    if points.ndim != 3 or points.shape[1:] != (8, 3):
-        raise ValueError(f"points must have shape (n, 8, 3), not {points.shape}")
-    finite = np.isfinite(points).all(axis=(1, 2))
-    if not finite.all():
-        raise ValueError(f"points must be finite: query {np.flatnonzero(~finite)[0]} is not")
-    return np.ascontiguousarray(points), wp.get_device(device)

@@ -1,0 +1,217 @@
+"""Meshes and the collision detector: all pairs by brute force, known scenes, the same answer always, bad input."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from benchmark_data import data_folder
+
+import warp_bsc as bsc
+from warp_bsc import checker
+
+METHODS = ("float", "conservative", "exact")
+
+
+def grid(n, dtype=np.float32):
+    """A flat sheet of n x n quads of 1 cm: positions and faces."""
+    x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
+    positions = 0.01 * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    a, b, c, d = corner, corner + 1, corner + n + 2, corner + n + 1
+    return positions.astype(dtype), np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def all_collisions(mesh, x0, x1):
+    """Every colliding pair of a small mesh, by asking the checker about all pairs that share no vertex."""
+    vertices, faces = np.meshgrid(mesh.vertices, np.arange(len(mesh.faces)), indexing="ij")
+    pairs = np.stack([vertices.ravel(), faces.ravel()], axis=1)
+    corners = np.concatenate([pairs[:, :1], mesh.faces[pairs[:, 1]]], axis=1)
+    keep = (corners[:, :1] != corners[:, 1:]).all(axis=1)
+    vertex_face = pairs[keep][checker.vertex_face(np.concatenate([x0[corners[keep]], x1[corners[keep]]], axis=1))]
+    first, second = np.triu_indices(len(mesh.edges), 1)
+    pairs = np.stack([first, second], axis=1)
+    corners = mesh.edges[pairs].reshape(-1, 4)
+    keep = (corners[:, :2, None] != corners[:, None, 2:]).all(axis=(1, 2))
+    edge_edge = pairs[keep][checker.edge_edge(np.concatenate([x0[corners[keep]], x1[corners[keep]]], axis=1))]
+    return vertex_face, edge_edge
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("seed", range(3))
+def test_exactly_the_colliding_pairs_are_found(seed, dtype):
+    rng = np.random.default_rng(seed)
+    x0 = rng.integers(-2, 3, (14, 3)).astype(dtype) if seed == 0 else rng.uniform(-1, 1, (14, 3)).astype(dtype)
+    x1 = x0 + (rng.integers(-2, 3, (14, 3)) if seed == 0 else rng.uniform(-0.5, 0.5, (14, 3))).astype(dtype)
+    mesh = bsc.CollisionMesh(rng.permuted(np.tile(np.arange(14), (10, 1)), axis=1)[:, :3], 14)
+    vertex_face, edge_edge = all_collisions(mesh, x0, x1)
+    assert len(vertex_face) and len(edge_edge)
+    c = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1)
+    np.testing.assert_array_equal(c.vertex_face, vertex_face)
+    np.testing.assert_array_equal(c.edge_edge, edge_edge)
+    assert c.vertex_face.dtype == c.edge_edge.dtype == np.int32
+    conservative = bsc.CollisionDetector(mesh).detect(x0, x1)
+    assert {*map(tuple, vertex_face)} <= {*map(tuple, conservative.vertex_face)}
+    assert {*map(tuple, edge_edge)} <= {*map(tuple, conservative.edge_edge)}
+
+
+def test_times_and_counts_belong_to_the_pairs():
+    positions, faces = grid(1)
+    positions = np.concatenate([positions, [[0.004, 0.006, 0.01], [0.02, 0.02, 0.01], [0.02, 0.0, 0.01]]])
+    mesh = bsc.CollisionMesh(np.concatenate([faces, [[4, 5, 6]]]), 7)
+    end = positions.copy()
+    end[4:, 2] = -0.03
+    c = bsc.CollisionDetector(mesh, method="exact").detect(positions, end)
+    assert (4, 0) in {*map(tuple, c.vertex_face)}
+    np.testing.assert_allclose(c.vertex_face_toi, 0.25, atol=2.0**-20)
+    assert (c.vertex_face_toi <= 0.25).all()
+    assert c.earliest_toi == min(c.vertex_face_toi.min(), c.edge_edge_toi.min())
+    np.testing.assert_allclose(np.abs(c.vertex_face_normal), [[0.0, 0.0, 1.0]] * len(c.vertex_face), atol=1e-12)
+    np.testing.assert_allclose(c.vertex_face_coordinates.sum(axis=1), 1.0)
+    for counts in (c.stats.vertex_face, c.stats.edge_edge):
+        assert counts.candidates == counts.free + counts.hits + counts.unsure
+        assert counts.survivors <= counts.candidates
+    assert set(c.stats.milliseconds) == {"broad phase", "cull", "classify", "time of impact", "exact"}
+
+
+def turned(positions, angle):
+    """Positions turned in their plane."""
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    return (positions.astype(np.float64) @ turn.T).astype(positions.dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "motion",
+    [
+        lambda x: (x, x),
+        lambda x: (x, x + np.array([0.003, -0.0071, 0.0], dtype=x.dtype)),
+        lambda x: (x, x + np.array([0.0031, 0.002, 0.017], dtype=x.dtype)),
+        lambda x: (x, turned(x, 0.05)),
+        lambda x: (turned(x, 0.7), turned(x, 0.8)),
+    ],
+    ids=["at rest", "translating in its plane", "translating", "turning", "turning from an angle"],
+)
+def test_flat_cloth_does_not_hit_itself(motion, dtype):
+    positions, faces = grid(64, dtype)
+    x0, x1 = motion(positions)
+    mesh = bsc.CollisionMesh(faces, len(positions))
+    for method in METHODS:
+        c = bsc.CollisionDetector(mesh, method=method).detect(x0, x1)
+        assert len(c.vertex_face) == len(c.edge_edge) == 0
+        candidates = c.stats.vertex_face.candidates + c.stats.edge_edge.candidates
+        unsure = c.stats.vertex_face.unsure + c.stats.edge_edge.unsure
+        assert candidates > 30_000
+        assert unsure <= 0.001 * candidates
+
+
+@pytest.fixture(scope="module")
+def cloth_funnel():
+    if data_folder() is None:
+        pytest.skip("no test data beside the project")
+    first, second = (
+        trimesh.load(data_folder() / "frames" / "cloth-funnel" / f"{frame}.ply", process=False) for frame in (227, 228)
+    )
+    return np.array(first.vertices), np.array(second.vertices), np.array(first.faces)
+
+
+def test_cloth_funnel_has_the_known_collisions(cloth_funnel):
+    x0, x1, faces = cloth_funnel
+    c = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)), method="exact").detect(x0, x1)
+    assert x0.dtype == np.float64
+    assert (len(c.vertex_face), len(c.edge_edge), c.certified) == (27, 107, True)
+
+
+def test_answers_are_the_same_on_every_run_and_device(cloth_funnel):
+    x0, x1, faces = cloth_funnel
+    devices = ["cpu", *(device.alias for device in wp.get_cuda_devices()[:1])]
+    results = []
+    for device in [*devices, *devices]:
+        detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device))
+        results.append(detector.detect(x0, x1))
+        results.append(detector.detect(x0, x1))
+    for other in results[1:]:
+        for field in ("vertex_face", "edge_edge", "vertex_face_toi", "edge_edge_toi", "vertex_face_normal"):
+            assert getattr(other, field).tobytes() == getattr(results[0], field).tobytes()
+
+
+def test_candidates_that_do_not_fit_at_first_are_not_lost():
+    rng = np.random.default_rng(0)
+    x0 = rng.uniform(-1, 1, (300, 3))  # long triangles: nearly every pair of boxes overlaps
+    faces = np.arange(300).reshape(100, 3)
+    mesh = bsc.CollisionMesh(faces, 300)
+    c = bsc.CollisionDetector(mesh).detect(x0, -x0)
+    assert c.stats.vertex_face.candidates == 300 * 99
+    assert c.stats.edge_edge.candidates == 300 * 297 // 2
+
+
+def test_intersections_are_exactly_those_of_all_pairs():
+    rng = np.random.default_rng(4)
+    x = rng.integers(-4, 5, (18, 3)).astype(np.float32)
+    mesh = bsc.CollisionMesh(np.arange(18).reshape(6, 3), 18)
+    edges, faces = np.meshgrid(np.arange(len(mesh.edges)), np.arange(6), indexing="ij")
+    pairs = np.stack([edges.ravel(), faces.ravel()], axis=1)
+    pairs = pairs[mesh.edges[pairs[:, 0], 0] // 3 != pairs[:, 1]]
+    expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[mesh.faces[pairs[:, 1]]])]
+    assert len(expected)
+    np.testing.assert_array_equal(bsc.CollisionDetector(mesh).find_intersections(x), expected)
+
+
+def test_touching_configurations_intersect_and_flat_ones_do_not():
+    positions, faces = grid(8)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(positions)))
+    assert len(detector.find_intersections(positions)) == 0
+    folded = positions.copy()
+    folded[-1] = positions[0]
+    assert len(detector.find_intersections(folded))
+
+
+def test_degenerate_meshes_are_handled():
+    x = np.zeros((4, 3), dtype=np.float32)
+    for faces in (np.zeros((0, 3), dtype=int), [[0, 1, 2]], [[0, 0, 1], [2, 2, 3]]):
+        c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 4), method="exact").detect(x, x)
+        assert c.certified
+        assert len(c.edge_edge) == (1 if len(faces) == 2 else 0)
+        assert c.earliest_toi == (0.0 if len(faces) == 2 else 2.0)
+
+
+def test_huge_double_positions_keep_their_pairs():
+    """Positions beyond the range of float still get candidates."""
+    x0 = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 1], [0.3, 0.2, 2], [0.2, 0.3, 2]]) * 1e60
+    x1 = x0.copy()
+    x1[3:, 2] -= 3e60
+    c = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)).detect(x0, x1)
+    assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]]
+
+
+def test_bad_meshes_are_refused():
+    for faces, message in [
+        ([[0, 1, 9]], r"face 0 is \[0, 1, 9\], but the mesh has 4 vertices"),
+        ([[0, 1, -1]], "face 0"),
+        ([[0, 1]], r"shape \(n, 3\)"),
+        ([[0.0, 1.0, 2.0]], "integers"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            bsc.CollisionMesh(faces, 4)
+    with pytest.raises(ValueError, match="vertex_count"):
+        bsc.CollisionMesh([[0, 1, 2]], -1)
+
+
+def test_bad_positions_are_refused():
+    detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2]], 4))
+    x = np.zeros((4, 3))
+    with pytest.raises(ValueError, match="x1 must have 4 rows"):
+        detector.detect(x, np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="x0 must have shape"):
+        detector.detect(np.zeros((4, 2)), x)
+    with pytest.raises(ValueError, match="float32 or float64"):
+        detector.detect(x.astype(int), x)
+    with pytest.raises(ValueError, match="same type"):
+        detector.detect(x, x.astype(np.float32))
+    bad = x.copy()
+    bad[2, 1] = np.nan
+    with pytest.raises(ValueError, match=r"x1\[2\]"):
+        detector.detect(x, bad)
+    with pytest.raises(ValueError, match=r"x\[2\]"):
+        detector.find_intersections(bad)
+    with pytest.raises(ValueError, match="method"):
+        bsc.CollisionDetector(detector.mesh, method="fast")

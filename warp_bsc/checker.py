@@ -1,0 +1,430 @@
+"""The true answer of any query, in exact rational arithmetic: Python integers and NumPy, no Warp, no Bernstein signs.
+
+What counts as a collision
+--------------------------
+Each point moves as x(t) = (1-t) x0 + t x1, its coordinates being exactly the floating-point numbers given. A
+vertex-face pair collides when some t in the closed [0, 1] puts the point in the closed triangle; an edge-edge pair when
+the closed segments meet at some t in the closed [0, 1]. Triangles and segments may degenerate.
+
+One question
+------------
+Every query asks whether a moving triangle with corners x(t), y(t), z(t) contains the origin:
+
+- vertex-face: p is in the triangle a b c when the origin is in the triangle a-p, b-p, c-p;
+- edge-edge: the differences of points of ab and of cd fill the parallelogram a-c, b-c, b-d, a-d. Its diagonal cuts it
+  into two triangles, and the segments meet when one of these contains the origin;
+- an edge meets a face when a vertex that runs along the edge meets the face at rest.
+
+The answer at one time
+----------------------
+Let X = y x z, Y = z x x, Z = x x y (cross products), n = X + Y + Z (the normal) and volume = x.X.
+
+- When the triangle contains the origin, volume = 0. Let it be so.
+- When n != 0, the origin is in the triangle's plane, as x.n = y.n = z.n = volume. Its barycentric coordinates are n.X,
+  n.Y and n.Z, each divided by n.n, which is their sum. It is in the triangle when none is negative.
+- All three are zero exactly when n = 0. The triangle is then the union of its edges, and the origin is on the segment
+  xy exactly when Z = 0 and x.y <= 0, for x = y and x = 0 too.
+
+All are polynomials in t with integer coefficients, once a power of two has made the coordinates integers.
+
+The times to look at
+--------------------
+The times of contact form a closed set, so there is a first one, t*. It is 0, or a root of
+
+- volume, when that is not identically zero;
+- else, when the origin always is in the plane, Z.Z of an edge xy, or x.y where Z is identically zero: were n(t*) != 0
+  and all three barycentric coordinates positive, they would be so just before t* too, where there is no contact yet.
+  So the origin is on an edge at t*: Z = 0 and x.y <= 0 there, and just before t* one of the two is not so.
+
+A root of f is held between two times that are not roots, and the sign of q there comes from the theorem of Sturm and
+Tarski: from the first time to the second, the sequence of signed remainders that starts with f and f' q loses as many
+changes of sign as f has distinct roots between them with q > 0, less those with q < 0. With q = 1 it counts the roots.
+"""
+
+import bisect
+import functools
+import itertools
+from fractions import Fraction
+
+import numpy as np
+
+from .arrays import checked_coordinates
+
+__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "vertex_face", "vertex_face_toi"]
+
+# The triangles of a query, each corner a difference of two of its four points (first minus second).
+_VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
+_EDGE_EDGE = np.array([[(0, 2), (1, 2), (1, 3)], [(0, 2), (1, 3), (0, 3)]])
+
+_BLOCK = 8192  # queries that go through the filter together: arrays of this length stay in the processor's cache
+_PIECES = 8  # into which the filter cuts the step
+_MARGIN = 1e-10  # more than the error of any value in the filter, see _may_touch
+
+
+def vertex_face(points):
+    """Says which vertex-face queries collide.
+
+    Args:
+        points: Positions, float32 or float64 array of shape (n, 8, 3), rows p0 a0 b0 c0 p1 a1 b1 c1.
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: If the shape or the type is another one, or a coordinate is not finite.
+    """
+    return _collides(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
+
+
+def edge_edge(points):
+    """Says which edge-edge queries collide.
+
+    Args:
+        points: Positions, float32 or float64 array of shape (n, 8, 3), rows a0 b0 c0 d0 a1 b1 c1 d1; edges ab and cd.
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: If the shape or the type is another one, or a coordinate is not finite.
+    """
+    return _collides(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
+
+
+def vertex_face_toi(points):
+    """Encloses the earliest contact time of vertex-face queries.
+
+    Args:
+        points: As in :func:`vertex_face`.
+
+    Returns:
+        Float64 array of shape (n, 2): the largest double that is not after the earliest contact, and the smallest one
+        that is not before it. They are equal when that time is a double, neighbours otherwise, NaN for no collision.
+
+    Raises:
+        ValueError: As in :func:`vertex_face`.
+    """
+    return _earliest(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
+
+
+def edge_edge_toi(points):
+    """Encloses the earliest contact time of edge-edge queries.
+
+    Args:
+        points: As in :func:`edge_edge`.
+
+    Returns:
+        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
+
+    Raises:
+        ValueError: As in :func:`edge_edge`.
+    """
+    return _earliest(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
+
+
+def edge_face_crossings(edges, faces):
+    """Says which edges meet which faces, pair by pair, in one configuration: closed segments, closed triangles.
+
+    Args:
+        edges: End points, float32 or float64 array of shape (n, 2, 3).
+        faces: Corners, float32 or float64 array of shape (n, 3, 3).
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: If a shape or a type is another one, the lengths differ, or a coordinate is not finite.
+    """
+    edges = checked_coordinates(edges, (2, 3), "edges")
+    faces = checked_coordinates(faces, (3, 3), "faces")
+    if len(edges) != len(faces):
+        raise ValueError(f"edges and faces must be as many, got {len(edges)} edges and {len(faces)} faces")
+    points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
+    return _collides(points, _VERTEX_FACE)
+
+
+def _collides(points, pairs):
+    """Returns which queries collide, bool (n,)."""
+    hit = np.zeros(len(points), dtype=bool)
+    for query, triangle in _undecided_triangles(points, pairs):
+        hit[query] = hit[query] or any(True for _ in _contacts(triangle))
+    return hit
+
+
+def _earliest(points, pairs):
+    """Returns the doubles around each query's earliest contact, float64 (n, 2)."""
+    toi = np.full((len(points), 2), np.nan)
+    for query, triangle in _undecided_triangles(points, pairs):
+        for contact in _contacts(triangle):
+            # Rounding is monotone, so the earlier of two times has the smaller bounds.
+            toi[query] = np.fmin(toi[query], _doubles_around(*contact))
+    return toi
+
+
+def _undecided_triangles(points, pairs):
+    """Yields (query, _Triangle) for every triangle that the filter leaves to exact arithmetic, query by query."""
+    for start in range(0, len(points), _BLOCK):
+        block = points[start : start + _BLOCK].astype(np.float64)
+        queries, triangles = np.nonzero(_may_touch(block, pairs))
+        corners = _corners(_integers(block[queries]), pairs)[np.arange(len(queries)), triangles]
+        for query, (x, y, z) in zip(queries, np.moveaxis(corners, 2, 3).tolist(), strict=True):
+            yield start + query, _Triangle(*([[a, b - a] for a, b in corner] for corner in (x, y, z)))
+
+
+def _corners(points, pairs):
+    """Returns the corners of the queries' triangles around the origin: shape (n, triangles, 3 corners, 2 ends, 3)."""
+    points = points.reshape(-1, 2, 4, 3)
+    return np.moveaxis(points[:, :, pairs[..., 0]] - points[:, :, pairs[..., 1]], 1, 3)
+
+
+def _integers(points):
+    """Scales each query by a power of two that makes its coordinates integers: an object array of Python integers."""
+    mantissa, exponent = np.frexp(points)
+    mantissa = (mantissa * 2.0**53).astype(np.int64)
+    zeros = np.where(mantissa == 0, 0, np.frexp((mantissa & -mantissa).astype(np.float64))[1] - 1)
+    mantissa >>= zeros  # Trailing zeros go to the exponent, which keeps the integers of coarse data small.
+    exponent = exponent + zeros
+    lowest = np.where(mantissa == 0, np.iinfo(exponent.dtype).max, exponent).min(axis=(1, 2), keepdims=True)
+    shift = np.where(mantissa == 0, 0, exponent - lowest)
+    return mantissa.astype(object) << shift.astype(object)
+
+
+# --- The filter: floating point with proven bounds ---
+
+
+def _may_touch(points, pairs):
+    """Says which triangles of which queries need exact arithmetic, bool (n, triangles): False is proven to be free.
+
+    A triangle stays clear of the origin when along some axis its corners have one strict sign at both ends, thus
+    always; or when in each piece of the step its volume has one strict sign, or one of n.X, n.Y and n.Z is negative.
+
+    The bound, u = 2^-53: coordinates are scaled to at most 1, and in a piece each is mid + half s, |s| <= 1, with mid
+    and half at most 1 and off by at most 4 u. Written out, the volume has 6 * 2^3 products of three such numbers, which
+    pass through less than 24 roundings: it is off by less than 48 (3 * 4 + 24) u < 1e-12. A weight has 3 * 24 * 8 = 576
+    products of four and less than 48 roundings: it is off by less than 576 (4 * 4 + 48) u < 1e-11. Both leave room
+    within _MARGIN for the rounding of the sums of absolute values.
+    """
+    # |points| <= 1 cannot overflow. What underflows here is off by less than 2^-1074, nothing beside a size of 2^-500.
+    largest = np.abs(points).max(axis=(1, 2), keepdims=True, initial=0.0)
+    corners = _corners(np.ldexp(points, -np.frexp(largest)[1]), pairs)
+    # Differences have the sign of the exact ones, or are 0.
+    sides = np.sign(corners).sum(axis=(2, 3))
+    may_touch = (np.abs(sides) < 6).all(axis=-1)
+
+    size = np.abs(corners).max(axis=(2, 3, 4), initial=0.0)
+    filtered = may_touch & (size > 2.0**-500)
+    corners = np.ldexp(corners[filtered], -np.frexp(size[filtered])[1][:, None, None, None])
+    # From here on a triangle is three corners of three coordinates, each a polynomial in s.
+    start, end = np.ascontiguousarray(corners.transpose(2, 1, 3, 0))
+    undecided = np.zeros(len(corners), dtype=bool)
+    half = (end - start) * (0.5 / _PIECES)
+    for piece in range(_PIECES):
+        time = (piece + 0.5) / _PIECES
+        mid = (1.0 - time) * start + time * end
+        x, y, z = ([[mid[i, j], half[i, j]] for j in range(3)] for i in range(3))
+        areas = _areas(x, y, z)
+        volume, *weights = _dot(x, areas[0]), *_weights(areas)
+        free = np.abs(volume[0]) > _variation(volume)
+        for weight in weights:
+            free |= -weight[0] > _variation(weight)
+        undecided |= ~free
+    may_touch[filtered] = undecided
+    return may_touch
+
+
+def _variation(f):
+    """Returns how far a polynomial can be from its value at 0 for |s| <= 1, rounding included."""
+    return sum(np.abs(coefficient) for coefficient in f[1:]) + _MARGIN
+
+
+# --- Polynomials: lists of coefficients, constant first, these integers (or arrays, in the filter) ---
+
+
+def _add(f, g):
+    return [a + b for a, b in itertools.zip_longest(f, g, fillvalue=0)]
+
+
+def _multiply(f, g):
+    product = [0] * (len(f) + len(g) - 1)
+    for i, a in enumerate(f):
+        for j, b in enumerate(g):
+            product[i + j] = product[i + j] + a * b
+    return product
+
+
+def _dot(x, y):
+    return functools.reduce(_add, map(_multiply, x, y))
+
+
+def _cross(x, y):
+    minus_y = [[-a for a in f] for f in y]
+    return [_add(_multiply(x[i], y[j]), _multiply(x[j], minus_y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def _areas(x, y, z):
+    """Returns the vectors X, Y, Z of the module docstring."""
+    return _cross(y, z), _cross(z, x), _cross(x, y)
+
+
+def _weights(areas):
+    """Returns n.X, n.Y and n.Z, the barycentric coordinates of the origin times n.n."""
+    normal = [functools.reduce(_add, components) for components in zip(*areas, strict=True)]
+    return [_dot(normal, area) for area in areas]
+
+
+def _trimmed(f):
+    """Returns the polynomial without leading zeros; the zero polynomial is the empty list."""
+    degree = len(f)
+    while degree and f[degree - 1] == 0:
+        degree -= 1
+    return f[:degree]
+
+
+def _derivative(f):
+    return [i * a for i, a in enumerate(f)][1:]
+
+
+def _sign_at(f, time):
+    """Returns the sign of f at a time: an int, a Fraction or a float, taken exactly."""
+    numerator, denominator = time.as_integer_ratio()
+    value, power = 0, 1
+    for a in reversed(f):  # Horner's rule, times denominator^degree
+        value = value * numerator + a * power
+        power *= denominator
+    return (value > 0) - (value < 0)
+
+
+# --- Real roots: the theorem of Sturm and Tarski ---
+
+
+def _signed_remainders(f, g):
+    """Returns f, g and their signed remainders, each times some positive number that keeps its coefficients integer."""
+    sequence = [f]
+    while g:
+        sequence.append(g)
+        remainder, scale = sequence[-2], abs(g[-1])
+        while len(remainder) >= len(g):
+            factor = remainder[-1] if g[-1] > 0 else -remainder[-1]
+            rest = [scale * a for a in remainder[:-1]]
+            for i, a in enumerate(g[:-1], start=len(remainder) - len(g)):
+                rest[i] -= factor * a
+            remainder = rest
+        g = [-a for a in _trimmed(remainder)]
+    return sequence
+
+
+def _changes(sequence, time):
+    """Counts the changes of sign along a sequence of polynomials at a time, zeros left out."""
+    signs = [sign for f in sequence if (sign := _sign_at(f, time))]
+    return sum(a != b for a, b in itertools.pairwise(signs))
+
+
+def _sign_at_root(q, f, lower, upper):
+    """Returns the sign of q at the only root of f between two times that are not roots of f."""
+    sequence = _signed_remainders(f, _trimmed(_multiply(_derivative(f), q)) if q else [])
+    return _changes(sequence, lower) - _changes(sequence, upper)
+
+
+def _inner_part(f):
+    """Returns f divided by t and by t - 1 as often as it goes, so that neither 0 nor 1 is a root."""
+    while f[0] == 0:
+        f = f[1:]
+    while sum(f) == 0:
+        f = list(itertools.accumulate(reversed(f)))[-2::-1]
+    return f
+
+
+def _isolated_roots(f):
+    """Yields (lower, upper) around each root of f inside (0, 1), in order; these times are no roots, nor 0 and 1."""
+    sturm = _signed_remainders(f, _derivative(f))
+    intervals = [(0, 1)]
+    while intervals:
+        lower, upper = intervals.pop()
+        roots = _changes(sturm, lower) - _changes(sturm, upper)
+        if roots == 1:
+            yield lower, upper
+        elif roots > 1:
+            middle = Fraction(lower + upper, 2)
+            while _sign_at(f, middle) == 0:
+                middle = (lower + middle) / 2
+            intervals += [(middle, upper), (lower, middle)]
+
+
+def _doubles_around(f, lower, upper):
+    """Returns the doubles around the only root of f between two times: equal when it is one, neighbours otherwise."""
+    if f is None:
+        return float(lower), float(upper)
+    sturm = _signed_remainders(f, _derivative(f))
+    changes = _changes(sturm, lower)
+
+    def double(bits):
+        return float(np.int64(bits).view(np.float64))
+
+    def reached(bits):
+        time = double(bits)
+        if time <= lower or time >= upper:
+            return time >= upper
+        return _sign_at(f, time) == 0 or _changes(sturm, time) != changes
+
+    # The bits of doubles that are not negative, read as integers, are in the same order.
+    one = int(np.float64(1.0).view(np.int64))
+    after = double(bisect.bisect_left(range(one + 1), True, key=reached))
+    exact = lower < after < upper and _sign_at(f, after) == 0
+    return after if exact else float(np.nextafter(after, 0.0)), after
+
+
+# --- Contact ---
+
+
+class _Triangle:
+    """The polynomials of the module docstring for one moving triangle; each corner is three polynomials."""
+
+    def __init__(self, x, y, z):
+        areas = _areas(x, y, z)
+        self.volume = _trimmed(_dot(x, areas[0]))
+        self.weights = [_trimmed(weight) for weight in _weights(areas)]
+        self._corners = x, y, z
+        self._areas = areas
+
+    @functools.cached_property
+    def edges(self):
+        """For each edge xy the polynomials Z.Z and x.y."""
+        x, y, z = self._corners
+        pairs = (y, z), (z, x), (x, y)
+        return [
+            (_trimmed(_dot(area, area)), _trimmed(_dot(*pair))) for area, pair in zip(self._areas, pairs, strict=True)
+        ]
+
+    def touches(self, sign):
+        """Says whether the origin is in the triangle at the time at which sign(polynomial) gives the signs."""
+        if sign(self.volume) != 0:
+            return False
+        signs = [sign(weight) for weight in self.weights]
+        if any(signs):
+            return min(signs) >= 0
+        return any(sign(square) == 0 and sign(dot) <= 0 for square, dot in self.edges)
+
+    def critical(self):
+        """Returns the polynomials among whose roots the first time of contact is, unless it is 0."""
+        if self.volume:
+            return [self.volume]
+        return [critical for square, dot in self.edges if (critical := square or dot)]
+
+
+def _contacts(triangle):
+    """Yields times of contact, the earliest one among them.
+
+    Yields:
+        (f, lower, upper): the only root of f between two times; or (None, time, time).
+    """
+    if triangle.touches(lambda q: _sign_at(q, 0)):
+        yield None, 0, 0
+        return
+    for critical in triangle.critical():
+        f = _inner_part(critical)
+        for lower, upper in _isolated_roots(f):
+            if triangle.touches(lambda q, f=f, lower=lower, upper=upper: _sign_at_root(q, f, lower, upper)):
+                yield f, lower, upper
+                break
+    if triangle.touches(lambda q: _sign_at(q, 1)):
+        yield None, 1, 1
