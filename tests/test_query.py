@@ -31,7 +31,7 @@ def query(kind, points, **options):
 
 
 @pytest.fixture(scope="module")
-def benchmark():
+def benchmark_queries():
     """Points and truth of all benchmark queries, by kind."""
     sets = [*load_queries(), *load_cloth_funnel_queries()]
     return {
@@ -45,15 +45,15 @@ def benchmark():
 
 @needs_data
 @pytest.mark.parametrize("kind", KINDS)
-def test_exact_is_right_on_the_benchmark(benchmark, kind):
-    points, truth = benchmark[kind]
+def test_exact_is_right_on_the_benchmark(benchmark_queries, kind):
+    points, truth = benchmark_queries[kind]
     assert np.array_equal(query(kind, points, method="exact").hit, truth)
 
 
 @needs_data
 @pytest.mark.parametrize("kind", KINDS)
-def test_benchmark_certificates_and_times_are_right(benchmark, kind):
-    points, truth = benchmark[kind]
+def test_benchmark_certificates_and_times_are_right(benchmark_queries, kind):
+    points, truth = benchmark_queries[kind]
     verdict = judge(kind, points)
     assert verdict.colliding == truth.sum()
     assert (verdict.wrong, verdict.missed, verdict.exact_wrong, verdict.late, verdict.early) == (0, 0, 0, 0, 0)

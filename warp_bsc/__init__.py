@@ -1,6 +1,11 @@
 """Continuous collision detection for deforming triangle meshes: no missed collision, no dropped pair."""
 
 import importlib
+from pathlib import Path
+
+if not (Path(__file__).parent / "kernels").is_dir():
+    # in a checkout the device code stands beside this package, not in it
+    __path__.append(str(Path(__file__).parents[1]))
 
 _MODULES = {
     "CollisionDetector": "detector",

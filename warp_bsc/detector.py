@@ -102,7 +102,7 @@ class CollisionDetector:
             mesh: The :class:`CollisionMesh`.
             method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it computes,
                 "conservative" counts them as hits, "exact" decides them exactly.
-            tolerance: Of the times of impact, as a share of the step, in (0, 1].
+            tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
 
         Raises:
             ValueError: If there is no such method, or the tolerance is out of range.

@@ -45,9 +45,9 @@ def check_method(method):
 
 
 def check_tolerance(tolerance):
-    """Raises ValueError if the tolerance is not in (0, 1]."""
-    if not 0.0 < tolerance <= 1.0:
-        raise ValueError(f"tolerance must be in (0, 1], not {tolerance!r}")
+    """Raises ValueError if the tolerance is out of the range that halving the step reaches."""
+    if not 2.0**-38 <= tolerance <= 1.0:
+        raise ValueError(f"tolerance must be in [2^-38, 1], not {tolerance!r}")
 
 
 @dataclass(frozen=True)

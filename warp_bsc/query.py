@@ -41,7 +41,7 @@ def query_vertex_face(points, *, method="exact", toi=True, tolerance=TOLERANCE, 
             vertex p and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
-        tolerance: Of the times of impact, as a share of the step, in (0, 1].
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
 
     Returns:
@@ -61,7 +61,7 @@ def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, de
             edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
-        tolerance: Of the times of impact, as a share of the step, in (0, 1].
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
 
     Returns:

@@ -1,0 +1,50 @@
+"""The README: its Python code runs as printed, its commands are those that the project runs."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_bsc.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_python_code_runs_as_printed(tmp_path, capsys):
+    path = tmp_path / "readme.py"  # Warp reads the source of kernels from a file
+    path.write_text("\n".join(blocks("python")))
+    names = {"__name__": "readme", "__file__": str(path)}
+    exec(compile(path.read_text(), str(path), "exec"), names)
+    assert names["c"].vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]]
+    np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
+    assert names["c"].certified
+    assert names["r"].hit.tolist() == [True]
+    assert names["count"].numpy().tolist() == [1]
+    assert "[[3, 0], [4, 0], [5, 0]]" in capsys.readouterr().out
+
+
+def test_the_scene_of_the_readme_replays_with_its_figures(capsys):
+    scene = re.search(r"warp-bsc replay (assets/\S+)", README).group(1)
+    assert main(["replay", str(ROOT / scene), "--device", "cpu"]) == 0
+    output = capsys.readouterr().out
+    assert "Collisions in 12 of 14 intervals" in output and "33 collisions in 12 of" in README.replace("\n", " ")
+    assert "33 of" in output
+
+
+@pytest.mark.skipif(not (ROOT / ".ci" / "run").exists(), reason="not a checkout")
+def test_continuous_integration_runs_the_command_of_the_readme():
+    command = next(block.strip() for block in blocks("sh") if "pytest" in block)
+    assert command in (ROOT / ".ci" / "run").read_text()
+
+
+def test_files_that_the_readme_names_exist():
+    for name in re.findall(r"`((?:kernels|warp_bsc|assets)/[\w./]+)`", README) + re.findall(
+        r"\]\((\w[\w./]+)\)", README
+    ):
+        assert (ROOT / name).exists(), name

@@ -1,0 +1,228 @@
+"""The command line, ``warp-bsc``."""
+
+import argparse
+import json
+import os
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from importlib.metadata import version
+
+import numpy as np
+import warp as wp
+from rich.console import Console
+from rich.progress import track
+
+from .detector import CollisionDetector
+from .mesh import CollisionMesh
+from .narrow_phase import METHODS
+from .query import query_edge_edge, query_vertex_face
+from .query_file import KINDS, find_query_files, read_query_file
+from .replay import replay
+from .report import QueryAnswers, print_queries, print_replay, queries_to_dict, replay_to_dict
+from .scene import Scene
+
+__all__ = ["main"]
+
+_EXIT_STATUS = """\
+exit status:
+  0  done, whether or not anything collides
+  1  collisions found, with --fail-on-collision
+  2  wrong use or bad input; a line on standard error says what and where"""
+
+_EXAMPLES = f"""\
+examples:
+  warp-bsc replay cloth.usd
+  warp-bsc query 227vf.csv 227ee.csv
+  warp-bsc replay --help
+
+{_EXIT_STATUS}"""
+
+_REPLAY = """\
+Find the collisions between each two consecutive time samples of a USD scene:
+of its meshes with themselves and with each other, every vertex moving straight
+from sample to sample. Meshes that never move are obstacles; where these touch
+one another is not counted."""
+
+_REPLAY_EXAMPLES = f"""\
+examples:
+  warp-bsc replay cloth.usd
+  warp-bsc replay cloth.usd --device cpu --method conservative
+  warp-bsc replay cloth.usd --json > collisions.json
+  warp-bsc replay cloth.usd --fail-on-collision || echo "it collides"
+
+  a recording of one of Newton's examples:
+  python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
+      --output-path twist.usd
+  warp-bsc replay twist.usd
+
+{_EXIT_STATUS}"""
+
+_QUERY = """\
+Answer elementary queries and compare the answers with the truth, if it is
+known. Eight rows of a CSV file are a query, each the numerators and
+denominators of x, y and z, and the true answer (0 or 1) if known; it may also
+stand in NAME_mma_bool.json."""
+
+_QUERY_EXAMPLES = f"""\
+examples:
+  warp-bsc query 227vf.csv 227ee.csv
+  warp-bsc query unit-tests --method float
+  warp-bsc query pairs.csv --kind edge-edge --json > answers.json
+
+{_EXIT_STATUS}"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        # So that wrong use ends as bad input does, in one line.
+        raise ValueError(f"{message}; see {self.prog} --help")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: The arguments, those of the process by default.
+
+    Returns:
+        The exit status, see ``warp-bsc --help``.
+    """
+    try:
+        arguments = _build_parser().parse_args(argv)
+        return arguments.run(arguments)
+    except (OSError, ValueError) as error:
+        message = " ".join(str(error).split())
+        print(f"warp-bsc: error: {message}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("warp-bsc: interrupted", file=sys.stderr)
+        return 130
+
+
+def _build_parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="warp-bsc",
+        description="Continuous collision detection for deforming triangle meshes.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"warp-bsc {version('warp-bsc')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add_command(name, run, summary, description, examples):
+        command = commands.add_parser(
+            name,
+            help=summary,
+            description=description,
+            epilog=examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.set_defaults(run=run)
+        command.add_argument(
+            "--method",
+            choices=METHODS,
+            default="exact",
+            help="float: the signs as floating point computes them; conservative: what it cannot certify counts as a "
+            "collision; exact: the true answer (default)",
+        )
+        command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+        command.add_argument("--json", action="store_true", help="print JSON only, with everything found")
+        command.add_argument("--fail-on-collision", action="store_true", help="exit with status 1 if anything collides")
+        return command
+
+    command = add_command("replay", _run_replay, "find the collisions in a USD scene", _REPLAY, _REPLAY_EXAMPLES)
+    command.add_argument("scene", metavar="SCENE", help="a .usd, .usda, .usdc or .usdz file")
+
+    command = add_command("query", _run_query, "answer queries of CSV files", _QUERY, _QUERY_EXAMPLES)
+    command.add_argument("paths", metavar="FILE", nargs="+", help="a CSV file, or a folder for all that are in it")
+    command.add_argument(
+        "--kind",
+        choices=KINDS,
+        help="what the queries are (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
+    )
+    return parser
+
+
+def _run_replay(arguments) -> int:
+    scene = Scene(arguments.scene)
+    device = _find_device(arguments.device)
+    console, progress = Console(), Console(stderr=True)
+    with _loading_kernels(progress, device):
+        triangles = CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+        points = np.zeros((6, 3), scene.dtype)
+        CollisionDetector(triangles, method=arguments.method).detect(points, points)
+    intervals = list(
+        track(
+            replay(scene, method=arguments.method, device=device),
+            description="Replaying",
+            total=len(scene.times) - 1,
+            console=progress,
+            transient=True,
+            disable=not progress.is_terminal,
+        )
+    )
+    if arguments.json:
+        print(json.dumps(replay_to_dict(scene, intervals, method=arguments.method, device=str(device))))
+    else:
+        print_replay(console, scene, intervals, method=arguments.method, device=str(device))
+    return 1 if arguments.fail_on_collision and any(interval.hits for interval in intervals) else 0
+
+
+def _run_query(arguments) -> int:
+    files = [read_query_file(path, kind=arguments.kind) for path in find_query_files(arguments.paths)]
+    device = _find_device(arguments.device)
+    console, progress = Console(), Console(stderr=True)
+    functions = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
+    options = {"method": arguments.method, "toi": arguments.json, "device": device}
+    with _loading_kernels(progress, device):
+        for kind in {file.kind for file in files}:
+            functions[kind](np.zeros((1, 8, 3)), **options)
+    answers = []
+    for file in files:
+        start = time.perf_counter()
+        result = functions[file.kind](file.points, **options)
+        answers.append(QueryAnswers(file, result, 1e3 * (time.perf_counter() - start)))
+    if arguments.json:
+        print(json.dumps(queries_to_dict(answers, method=arguments.method, device=str(device))))
+    else:
+        print_queries(console, answers, method=arguments.method, device=str(device))
+    return 1 if arguments.fail_on_collision and any(answer.hits for answer in answers) else 0
+
+
+def _find_device(name: str | None):
+    """The Warp device of that name, the preferred one for None."""
+    _start_warp()
+    if name is None:
+        return wp.get_preferred_device()
+    known = [device.alias for device in wp.get_devices()] + ["cuda"] * wp.is_cuda_available()
+    if name not in known:
+        raise ValueError(f"--device {name}: there is no such device here, only {', '.join(known)}")
+    return wp.get_device(name)
+
+
+def _start_warp():
+    """Initialise Warp, without its native library's line on standard error where there is no CUDA driver."""
+    wp.config.log_level = wp.LOG_WARNING
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+@contextmanager
+def _loading_kernels(console: Console, device):
+    """Tell the user what takes so long, should the kernels have to be compiled."""
+    message = f"Compiling kernels for {device}, once for each version: up to a few minutes."
+    timer = threading.Timer(2.0, console.print, [message])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

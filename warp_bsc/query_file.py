@@ -1,0 +1,164 @@
+"""Reads the query files of the CCD benchmark: elementary queries in exact rational numbers, with their true answers.
+
+A file holds eight rows for each query, the points in the order of :func:`warp_bsc.query_vertex_face` or
+:func:`warp_bsc.query_edge_edge`. A row holds six integers, the numerator and denominator of x, y and z; or seven, the
+last being the query's true answer, 0 or 1, the same on all of its rows. Where rows have six, the true answers may stand
+next to ``NAME.csv`` in ``NAME_mma_bool.json``, as a list of true and false.
+
+Files of vertex-face and of edge-edge queries look the same. Which they are is told by the folder that they are in,
+``vertex-face`` or ``edge-edge``, or by a name that ends in ``vf`` or ``ee``.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["KINDS", "QueryFile", "find_query_files", "read_query_file"]
+
+KINDS = ("vertex-face", "edge-edge")
+
+
+@dataclass(frozen=True)
+class QueryFile:
+    """The queries of a file.
+
+    Attributes:
+        path: The file.
+        kind: ``"vertex-face"`` or ``"edge-edge"``.
+        points: Exactly the numbers of the file, shape [query_count, 8, 3], float64.
+        truth: The true answers, shape [query_count], bool; None where they are not known.
+        truth_path: The file that the true answers are from; None where they are not known.
+    """
+
+    path: Path
+    kind: str
+    points: np.ndarray
+    truth: np.ndarray | None
+    truth_path: Path | None
+
+
+def find_query_files(paths) -> list[Path]:
+    """The given files, and in the place of a folder all ``.csv`` files below it.
+
+    Raises:
+        FileNotFoundError: If a path does not exist, or there is no such file below a folder.
+    """
+    files = []
+    for path in map(Path, paths):
+        if path.is_dir():
+            below = sorted(path.rglob("*.csv"))
+            if not below:
+                raise FileNotFoundError(f"{path}: no .csv file in this folder")
+            files += below
+        elif path.exists():
+            files.append(path)
+        else:
+            raise FileNotFoundError(f"{path}: no such file")
+    return files
+
+
+def read_query_file(path, *, kind: str | None = None) -> QueryFile:
+    """Read a file of queries.
+
+    Args:
+        path: The file.
+        kind: ``"vertex-face"`` or ``"edge-edge"``; None to tell it by the path.
+
+    Raises:
+        ValueError: If the kind cannot be told, the file is not as described above, or a number in it is not exactly a
+            double: the answer would be that of another query. The message names the file and the line.
+    """
+    path = Path(path)
+    kind = kind or _kind_of(path)
+    rows = _read_rows(path)
+    points = _divide(path, rows[:, 0:6:2], rows[:, 1:6:2]).reshape(-1, 8, 3)
+    if rows.shape[1] == 7:
+        truth, truth_path = _truth_of_rows(path, rows[:, 6]), path
+    else:
+        truth, truth_path = _truth_beside(path, len(points))
+    return QueryFile(path, kind, points, truth, truth_path)
+
+
+def _kind_of(path: Path) -> str:
+    for folder in path.absolute().parts[-2::-1]:  # the innermost first
+        if folder in KINDS:
+            return folder
+    for ending, kind in zip(("vf", "ee"), KINDS, strict=True):
+        if path.stem.lower().endswith(ending):
+            return kind
+    raise ValueError(f"{path}: vertex-face or edge-edge queries? Say so with --kind")
+
+
+def _read_rows(path: Path) -> np.ndarray:
+    """The integers of a file, shape [row_count, 6 or 7], int64 where all fit and Python's own otherwise."""
+    lines = path.read_text(encoding="ascii", errors="replace").rstrip().splitlines()
+    if not lines:
+        raise ValueError(f"{path}: the file is empty")
+    width = lines[0].count(",") + 1
+    if width not in {6, 7}:
+        raise ValueError(f"{path}:1: {width} columns; a row has 6, or 7 with the true answer")
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = [int(field) for field in line.split(",")]
+        except ValueError:
+            raise ValueError(f"{path}:{number}: not integers with commas between them: {line[:60]!r}") from None
+        if len(row) != width:
+            raise ValueError(f"{path}:{number}: {len(row)} columns, but {width} on the lines before")
+        rows.append(row)
+    if len(rows) % 8:
+        raise ValueError(f"{path}:{len(rows)}: the file ends within a query: {len(rows)} rows are no multiple of 8")
+    try:
+        return np.array(rows, dtype=np.int64)
+    except OverflowError:
+        return np.array(rows, dtype=object)
+
+
+def _divide(path: Path, numerators, denominators) -> np.ndarray:
+    """The quotients as doubles, shape [row_count, 3], all exact."""
+    quotients = np.zeros(numerators.shape)
+    exact = np.zeros(numerators.shape, bool)
+    if numerators.dtype != object:
+        # A double divided by a power of two stays one.
+        exact = (abs(numerators) <= 2**53) & (denominators > 0) & (denominators & (denominators - 1) == 0)
+        np.divide(numerators, denominators, out=quotients, where=exact)
+    for row, column in np.argwhere(~exact):
+        where = f"{path}:{row + 1}: {'xyz'[column]}"
+        numerator, denominator = int(numerators[row, column]), int(denominators[row, column])
+        if denominator == 0:
+            raise ValueError(f"{where} has the denominator 0")
+        try:
+            quotient = numerator / denominator
+        except OverflowError:
+            raise ValueError(f"{where} is larger than any double: {numerator}/{denominator}") from None
+        p, q = quotient.as_integer_ratio()
+        if p * denominator != q * numerator:
+            raise ValueError(f"{where} is not exactly a double: {numerator}/{denominator}")
+        quotients[row, column] = quotient
+    return quotients
+
+
+def _truth_of_rows(path: Path, column) -> np.ndarray:
+    truth = column.reshape(-1, 8)
+    wrong = (truth != truth[:, :1]) | ((truth != 0) & (truth != 1))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise ValueError(f"{path}:{row + 1}: the true answer must be 0 or 1, and the same on the 8 rows of a query")
+    return truth[:, 0].astype(bool)
+
+
+def _truth_beside(path: Path, query_count: int) -> tuple[np.ndarray | None, Path | None]:
+    truth_path = path.with_name(f"{path.stem}_mma_bool.json")
+    if not truth_path.exists():
+        return None, None
+    try:
+        truth = json.loads(truth_path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{truth_path}: not JSON: {error}") from None
+    if not isinstance(truth, list) or not all(isinstance(answer, bool) for answer in truth):
+        raise ValueError(f"{truth_path}: not a list of true and false")
+    if len(truth) != query_count:
+        raise ValueError(f"{truth_path}: {len(truth)} true answers for the {query_count} queries of {path}")
+    return np.array(truth), truth_path

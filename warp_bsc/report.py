@@ -1,0 +1,257 @@
+"""Shows what a replay, or the queries of a file, found: tables for people, plain data for programs."""
+
+import os
+from collections import Counter
+from dataclasses import asdict, dataclass
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from .query import QueryResult
+from .query_file import QueryFile
+from .replay import Interval
+from .scene import Scene
+
+__all__ = ["QueryAnswers", "print_queries", "print_replay", "queries_to_dict", "replay_to_dict"]
+
+_LONGEST = 30  # rows in a table, or lines in a list
+_STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
+
+
+@dataclass(frozen=True)
+class QueryAnswers:
+    """The answers to the queries of a file.
+
+    Attributes:
+        file: The queries.
+        result: Their answers.
+        milliseconds: Time that these took [ms].
+    """
+
+    file: QueryFile
+    result: QueryResult
+    milliseconds: float
+
+    @property
+    def hits(self) -> int:
+        """Number of queries answered with a collision."""
+        return int(self.result.hit.sum())
+
+    @property
+    def certified(self) -> dict[str, int]:
+        """How many queries floating point could certify to be free, to be hits, and neither."""
+        return {name: int((self.result.status == code).sum()) for code, name in enumerate(_STATUS)}
+
+    @property
+    def confusion(self) -> dict[str, int]:
+        """How many answers are true and false, positives and negatives, where the truth is known."""
+        hit, truth = self.result.hit, self.file.truth
+        return {
+            "true_positives": int((hit & truth).sum()),
+            "false_positives": int((hit & ~truth).sum()),
+            "true_negatives": int((~hit & ~truth).sum()),
+            "false_negatives": int((~hit & truth).sum()),
+        }
+
+
+def print_replay(console: Console, scene: Scene, intervals: list[Interval], *, method: str, device: str) -> None:
+    """Print a table of the intervals and a summary.
+
+    Args:
+        console: Where to.
+        scene: The scene.
+        intervals: All of its intervals.
+        method: The method that was used.
+        device: The device that was used.
+    """
+    _say(
+        console,
+        f"{scene.path}: {_count(len(scene.meshes), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
+        f"{len(scene.faces):,} faces, {_count(len(intervals), 'interval')}; method {method} on {device}",
+    )
+    for warning in scene.warnings:
+        _say(console, f"note: {warning}")
+
+    # Of a long replay the collisions matter.
+    colliding = [interval for interval in intervals if interval.hits]
+    listed = (intervals if len(intervals) <= _LONGEST else colliding)[:_LONGEST]
+    if listed:
+        stages = listed[0].stats.milliseconds
+        headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
+        table = _table("Interval", *headers, caption="Times of the stages in milliseconds.")
+        for interval in listed:
+            table.add_row(
+                f"{interval.start:g} → {interval.end:g}",
+                f"{interval.pairs_tested:,}",
+                f"{interval.hits:,}",
+                f"{round(interval.earliest.time, 6):.6g}" if interval.earliest else "",
+                *(f"{milliseconds:,.1f}" for milliseconds in interval.stats.milliseconds.values()),
+            )
+        console.print(table)
+    if len(listed) < len(intervals):
+        _say(
+            console,
+            f"{_count(len(intervals) - len(listed), 'interval')} not listed, "
+            f"{len(colliding) - sum(interval.hits > 0 for interval in listed)} with collisions; --json has all.",
+        )
+
+    if colliding:
+        vertex_face = sum(interval.vertex_face_hits for interval in colliding)
+        edge_edge = sum(interval.edge_edge_hits for interval in colliding)
+        _say(
+            console,
+            f"Collisions in {len(colliding)} of {_count(len(intervals), 'interval')}: "
+            f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
+        )
+        mesh_pairs = _sum_mesh_pairs(intervals)
+        for (first, second), count in mesh_pairs[:_LONGEST]:
+            _say(console, f"  {count:,} of {first} with {'itself' if first == second else second}")
+        if len(mesh_pairs) > _LONGEST:
+            _say(console, f"  and {len(mesh_pairs) - _LONGEST} more pairs of meshes; --json has all.")
+        contact = colliding[0].earliest
+        (first, second), (first_element, second_element) = contact.meshes, contact.elements
+        other = "its" if first == second else f"{second},"
+        _say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
+        worst = max(colliding, key=lambda interval: interval.hits)
+        _say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
+    else:
+        _say(console, f"No collision in {_count(len(intervals), 'interval')}.")
+
+    uncertain = sum(not interval.certified for interval in intervals)
+    if uncertain:
+        _say(console, f"Not certified, collisions may be missing: {uncertain} of {_count(len(intervals), 'interval')}.")
+    else:
+        _say(console, "Every answer is certified.")
+    total = sum(interval.milliseconds for interval in intervals)
+    _say(console, f"Detection took {total:,.0f} ms, {total / len(intervals):,.1f} ms an interval.")
+
+
+def replay_to_dict(scene: Scene, intervals: list[Interval], *, method: str, device: str) -> dict:
+    """Everything that a replay found, to be written as JSON. Arguments as of :func:`print_replay`."""
+    return {
+        "scene": scene.path,
+        "method": method,
+        "device": device,
+        "time_codes_per_second": scene.time_codes_per_second,
+        "vertices": scene.vertex_count,
+        "faces": len(scene.faces),
+        "meshes": [mesh.path for mesh in scene.meshes],
+        "warnings": scene.warnings,
+        "hits": sum(interval.hits for interval in intervals),
+        "certified": all(interval.certified for interval in intervals),
+        "mesh_pairs": _mesh_pairs_to_list(_sum_mesh_pairs(intervals)),
+        "intervals": [
+            {
+                "index": interval.index,
+                "start": interval.start,
+                "end": interval.end,
+                "pairs_tested": interval.pairs_tested,
+                "hits": interval.hits,
+                "vertex_face_hits": interval.vertex_face_hits,
+                "edge_edge_hits": interval.edge_edge_hits,
+                "earliest": asdict(interval.earliest) if interval.earliest else None,
+                "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
+                "certified": interval.certified,
+                "stages": asdict(interval.stats),
+            }
+            for interval in intervals
+        ],
+    }
+
+
+def print_queries(console: Console, answers: list[QueryAnswers], *, method: str, device: str) -> None:
+    """Print the answers to query files, and how they compare with the truth where it is known.
+
+    Args:
+        console: Where to.
+        answers: Those to each file.
+        method: The method that was used.
+        device: The device that was used.
+    """
+    folder = os.path.commonpath([answer.file.path.absolute().parent for answer in answers])
+    _say(console, f"{_count(len(answers), 'file')} in {folder}; method {method} on {device}")
+    _say(console, "Free, hit and unsure: what floating point could certify, whatever the method.")
+    table = _table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
+    _add_files(
+        table,
+        folder,
+        [(a.file, [len(a.file.points), a.hits, *a.certified.values(), a.milliseconds]) for a in answers],
+    )
+    console.print(table)
+
+    known = [answer for answer in answers if answer.file.truth is not None]
+    if known:
+        table = _table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
+        _add_files(table, folder, [(answer.file, list(answer.confusion.values())) for answer in known])
+        console.print()
+        console.print(table)
+    for answer in known:
+        if answer.file.truth_path != answer.file.path:
+            _say(console, f"Truth of {answer.file.path.name} from {answer.file.truth_path.name}.")
+
+
+def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) -> dict:
+    """Every answer, to be written as JSON. Arguments as of :func:`print_queries`."""
+    return {
+        "method": method,
+        "device": device,
+        "files": [
+            {
+                "path": str(answer.file.path),
+                "kind": answer.file.kind,
+                "queries": len(answer.file.points),
+                "hits": answer.hits,
+                "certified": answer.certified,
+                "truth_path": str(answer.file.truth_path) if answer.file.truth_path else None,
+                "confusion": answer.confusion if answer.file.truth is not None else None,
+                "milliseconds": answer.milliseconds,
+                "hit": answer.result.hit.tolist(),
+                "status": [_STATUS[status] for status in answer.result.status],
+                "toi": [toi if toi <= 1.0 else None for toi in answer.result.toi.tolist()],
+            }
+            for answer in answers
+        ],
+    }
+
+
+def _say(console: Console, line: str):
+    console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+
+
+def _table(first: str, *others: str, caption: str | None = None) -> Table:
+    """A table whose first column is text and may wrap, the others numbers that may not."""
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
+    table.add_column(first, overflow="fold")
+    for header in others:
+        table.add_column(header, justify="right", no_wrap=True)
+    return table
+
+
+def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int | float]]]):
+    """Add a row for each file, and the total of many."""
+
+    def format_all(numbers):
+        return [f"{number:,.1f}" if isinstance(number, float) else f"{number:,}" for number in numbers]
+
+    for file, numbers in rows:
+        table.add_row(os.path.relpath(file.path.with_suffix(""), folder), *format_all(numbers))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row("all", *format_all(map(sum, zip(*(numbers for _, numbers in rows), strict=True))))
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def _sum_mesh_pairs(intervals) -> list[tuple[tuple[str, str], int]]:
+    """Pairs of meshes and the number of pairs that collide, the most first."""
+    total = Counter()
+    for interval in intervals:
+        total.update(interval.mesh_pairs)
+    return total.most_common()
+
+
+def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:
+    return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]
