@@ -27,10 +27,12 @@ _TWO = wp.constant(wp.float64(2.0))
 _FOUR = wp.constant(wp.float64(4.0))
 _SIX = wp.constant(wp.float64(6.0))
 _SEVEN = wp.constant(wp.float64(7.0))
+_EIGHT = wp.constant(wp.float64(8.0))
 _DIFFERENCE = wp.constant(wp.float64(2.5))
 _DISCRIMINANT = wp.constant(wp.float64(24.0))
 _TURNING = wp.constant(wp.float64(64.0))
-_CROSSING = wp.constant(wp.float64(24.0))
+_CROSSING = wp.constant(wp.float64(8.0))
+_SLOPE_CROSSING = wp.constant(wp.float64(16.0))
 _DIVISION_L = wp.constant(wp.float64(288.0))
 _DIVISION_K = wp.constant(wp.float64(896.0))
 
@@ -50,7 +52,7 @@ def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
     discriminant d1^2 - d0 d2 is negative.
 
     Bounds: of a difference, 2E and a rounding of size 2k; of the discriminant, 4 * 2.5E d for d the largest
-    difference, and roundings of size d^2 <= 2kd: below 12E d.
+    difference, 10E^2 <= 4E d, and roundings of size d^2 <= 2kd: below 24E d.
     """
     d0 = k[1] - k[0]
     d1 = k[2] - k[1]
@@ -83,7 +85,8 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
 
     Bounds: the cubic with the computed coefficients is within E of Y on [0, 1], so it suffices that its sign at its own
     extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of
-    A, 9E; of T, with E <= k: (9 + 8 + 9) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k.
+    A, 9E; of T, with E <= k: (9 + 8 + 9) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k. Of H at the
+    root of T, as in :func:`linear_signs`.
     """
     end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)
     if end_signs < 0:
@@ -104,8 +107,8 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     leading = (d2 - d1) - (d1 - d0)
     spread = wp.abs(leading) + _TURNING * bound
     value = evaluate_cubic(k, a, b)
-    rounding = _TWO * bound * sum * sum * sum
-    deviation = _SEVEN * (_QUARTER * spread) * (_QUARTER * spread) * sum * sum + UNDERFLOW * bound
+    rounding = _TWO * bound * sum * sum * sum + UNDERFLOW * bound
+    deviation = _SEVEN * (_QUARTER * spread) * (_QUARTER * spread) * sum * sum
     if certified_sign(value, rounding) == -start:
         return 2  # a witness between the ends
     if certified_sign(value, rounding + deviation) == start:
@@ -116,14 +119,15 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     t_bound = _TURNING * bound * size
     s0 = certified_sign(t0, t_bound)
     s1 = certified_sign(t1, t_bound)
-    at_extremum = s0
-    if s0 != s1:
-        # H = d changes sign once; on which side of its root the root of T lies, H says there
-        side = certified_sign(
-            evaluate_quadratic(wp.vec3d(d0, d1, d2), wp.abs(t0), wp.abs(t1)),
-            (wp.abs(t0) + wp.abs(t1)) * (_SIX * bound * (wp.abs(t0) + wp.abs(t1)) + _CROSSING * size * t_bound),
-        )
-        at_extremum = wp.where(side * certified_sign(d0, bound) > 0, s1, wp.where(side == 0, 0, s0))
+    at_extremum = wp.where(s0 == s1, s0, 0)
+    if s0 * s1 < 0:
+        # H changes sign once: its sign at the root of T says on which side of its own root that lies
+        ta = wp.abs(t0)
+        tb = wp.abs(t1)
+        side_bound = (ta + tb) * (_SIX * bound * (ta + tb) + _SLOPE_CROSSING * size * t_bound) + UNDERFLOW * bound
+        side = certified_sign(evaluate_quadratic(wp.vec3d(d0, d1, d2), ta, tb), side_bound)
+        if side != 0:
+            at_extremum = wp.where(side == certified_sign(d0, bound), s1, s0)
     at_extremum = at_extremum * certified_sign(leading, _TURNING * bound)
     if at_extremum == start:
         return 0
@@ -141,11 +145,12 @@ def linear_signs(
     sign of Y'(t'). Any function that stays within ``line_bound`` = F of the line will do for the line: it has the
     line's sign beyond the roots of all lines with ends within F.
 
-    Bound of Y(t') times (a + b)^3: E and roundings below E, times (a + b)^3; moving an end of the line by F moves
-    it by at most 3k (2 (a + b))^2 F, because a, b > F: 24k F (a + b)^2 for both. Of Y'(t') likewise: 2.5E and 2
-    (2k) 2 (a + b) 2F. If the sign of an end is uncertain, at most 2F in truth, and the other end b > 2F, then the
-    root of every such line lies at 2F / (F + b) <= 4F / (4F + b) at most: a = 4F is tried, and only the other end's
-    sign can follow.
+    Bound of Y(t') times (a + b)^3: Y is known to within E, with roundings 2E; moving the ends by F moves t' by at most
+    F / (a + b - 2F), along a cubic whose computed coefficients give it a slope of at most 6k, and a sign that is
+    certain in spite of 8k F / (a + b) implies 8F < a + b, which makes 8k F / (a + b) enough. Of Y'(t') / 3
+    likewise: 5E, and for a slope of at most 8k, 16k F / (a + b). If one end's sign is uncertain, it is at most 2F in
+    truth. With the other end b >= 8F, the root of every such line lies at 2F / (F + b) <= 4F / (4F + b) at most: a =
+    4F is tried, and only the other end's sign can follow.
     """
     s0 = certified_sign(line[0], line_bound)
     s1 = certified_sign(line[1], line_bound)
@@ -153,7 +158,7 @@ def linear_signs(
         return wp.vec2i(s0, s0)
     a = wp.where(s0 == 0, _FOUR * line_bound, wp.abs(line[0]))
     b = wp.where(s1 == 0, _FOUR * line_bound, wp.abs(line[1]))
-    if s0 * s1 == 0 and wp.max(a, b) < _FOUR * line_bound + wp.min(a, b):
+    if s0 * s1 == 0 and wp.max(a, b) < _EIGHT * line_bound:
         return wp.vec2i(0, 0)
     sum = a + b
     square = sum * sum
@@ -167,7 +172,7 @@ def linear_signs(
     if side < 0:
         return wp.vec2i(s0, s1)
     d = wp.vec3d(k[1] - k[0], k[2] - k[1], k[3] - k[2])
-    slope_bound = sum * (_TWO * _DIFFERENCE * bound * sum + _CROSSING * size * line_bound) + UNDERFLOW * bound
+    slope_bound = sum * (_TWO * _DIFFERENCE * bound * sum + _SLOPE_CROSSING * size * line_bound) + UNDERFLOW * bound
     slope = certified_sign(evaluate_quadratic(d, a, b), slope_bound)
     # Y returns towards zero between its ends: before the extremum its slope has the sign opposite to its own
     before = slope * start

@@ -154,6 +154,10 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
     """
     result = Impact()
     found, toi = first_contact(motion, y, tolerance)
+    if status == HIT and found == FREE:
+        # cannot be, unless signs are those that floating point computes: then all that is known is that it starts at 0
+        found = UNSURE
+        toi = _ZERO
     result.status = wp.where(found == UNSURE, status, found)
     result.localized = wp.where(found == HIT, 1, 0)
     result.toi = toi

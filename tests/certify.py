@@ -1,7 +1,7 @@
-"""Holds certified answers against exact arithmetic on queries that aim at trouble: ``python tests/certify.py --count 4000``.
+"""Holds certified answers against exact arithmetic on queries that aim at trouble.
 
-Prints the share of queries that floating point could not certify, generator by generator, and exits with status 1 if a certified
-answer or a time of impact is wrong.
+``python tests/certify.py --count 4000`` prints the share of queries that floating point could not certify, generator
+by generator, and exits with status 1 if a certified answer or a time of impact is wrong.
 """
 
 import argparse
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 from generators import GENERATORS
+from rich import box
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -79,12 +80,14 @@ def judge(kind, points):
 
 def main():
     """Judges every generator and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=1000, help="queries for each generator, kind and type")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    table = Table("Generator", "Type", "Queries", "Colliding", "Unsure", "Wrong", "Late", "Early", "Float wrong")
+    table = Table("Generator", box=box.SIMPLE_HEAD, padding=0, show_edge=False)
+    for column in ("Type", "Queries", "Colliding", "Unsure", "Wrong", "Late", "Early", "Float wrong"):
+        table.add_column(column, justify="right", no_wrap=True)
     total = 0
     failures = 0
     console = Console()

@@ -291,27 +291,20 @@ def find_contacts(kind, x0, x1, elements, candidates, *, method, localize, timed
     if ask.any():
         corners = _four_vertices(kind, elements.numpy(), pairs[ask])
         points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
-        if timed:
+        if not timed:
+            hit[ask] = getattr(checker, kind)(points)
+        else:
             toi[ask] = getattr(checker, f"{kind}_toi")(points)[:, 0]
             hit[ask] = ~np.isnan(toi[ask])
             toi[~hit] = 2.0
-            again = ask & hit
-            at = wp.empty(int(again.sum()), dtype=wp.vec3d, device=device)
+            again = np.flatnonzero(ask & hit)
+            at = wp.empty(len(again), dtype=wp.vec3d, device=device)
             direction = wp.empty_like(at)
-            wp.launch(
-                find_contact_points,
-                len(at),
-                inputs=[
-                    *motion,
-                    wp.array(pairs[again], dtype=wp.vec2i, device=device),
-                    wp.array(toi[again], dtype=wp.float64, device=device),
-                ],
-                outputs=[at, direction],
-                device=device,
-            )
+            times = wp.array(toi[again], dtype=wp.float64, device=device)
+            contacts = wp.array(pairs[again], dtype=wp.vec2i, device=device)
+            inputs = [*motion, contacts, times]
+            wp.launch(find_contact_points, len(again), inputs=inputs, outputs=[at, direction], device=device)
             coordinates[again], normal[again] = at.numpy(), direction.numpy()
-        else:
-            hit[ask] = getattr(checker, kind)(points)
     clock.lap("exact")
 
     hits, unsure = int((status == HIT).sum()), int((status == UNSURE).sum())
