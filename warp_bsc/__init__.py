@@ -7,6 +7,8 @@ if not (Path(__file__).parent / "kernels").is_dir():
     # in a checkout the device code stands beside this package, not in it
     __path__.append(str(Path(__file__).parents[1]))
 
+__version__ = "0.1.0"
+
 _MODULES = {
     "CollisionDetector": "detector",
     "CollisionMesh": "mesh",

@@ -7,13 +7,13 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
-from importlib.metadata import version
 
 import numpy as np
 import warp as wp
 from rich.console import Console
 from rich.progress import track
 
+from . import __version__
 from .detector import CollisionDetector
 from .mesh import CollisionMesh
 from .narrow_phase import METHODS
@@ -108,7 +108,7 @@ def _build_parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"warp-bsc {version('warp-bsc')}")
+    parser.add_argument("--version", action="version", version=f"warp-bsc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def add_command(name, run, summary, description, examples):
