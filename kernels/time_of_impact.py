@@ -14,10 +14,11 @@ from .culling import direction_separates
 from .polynomials import Coplanarity, Motion, inside_tests, largest_axis
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 
-MAX_DEPTH = wp.constant(40)
-"""Halvings of the step after which an undecided interval is given up."""
 MAX_VISITS = wp.constant(256)
 """Intervals visited after which a query is given up."""
+
+FINEST = wp.constant(wp.float64(2.0**-8))
+"""Length of the intervals that are given up if they stay undecided, as a share of the tolerance."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -77,11 +78,8 @@ def status_between(motion: Motion, y: Coplanarity, start: wp.float64, end: wp.fl
     u = _HALF * (part.u0 + part.u1)
     v = _HALF * (part.v0 + part.v1)
     w = _HALF * (part.w0 + part.w1)
-    coordinates = closest_coordinates(motion.kind, u, v, w)
-    if direction_separates(part, between(motion.kind, coordinates, u, v, w)):
-        return FREE
     axis = largest_axis(wp.cross(u, v))
-    for _attempt in range(3):
+    for attempt in range(3):
         tests = inside_tests(motion, y, axis)
         tests.q0 = restrict_quadratic(tests.q0, start, end)
         tests.q1 = restrict_quadratic(tests.q1, start, end)
@@ -93,6 +91,10 @@ def status_between(motion: Motion, y: Coplanarity, start: wp.float64, end: wp.fl
             return FREE
         if status == HIT:
             return wp.where(certified_sign(k[0], k_bound) * certified_sign(k[3], k_bound) < 0, HIT, UNSURE)
+        if attempt == 0:
+            coordinates = closest_coordinates(motion.kind, u, v, w)
+            if direction_separates(part, between(motion.kind, coordinates, u, v, w)):
+                return FREE
         axis = wp.where(axis == 2, 0, axis + 1)
     return UNSURE
 
@@ -112,7 +114,6 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
     start = _ZERO
     width = _ONE
     index = wp.int64(0)
-    depth = int(0)
     stretched = bool(False)
     for _visit in range(MAX_VISITS):
         end = wp.where(stretched, wp.min(start + tolerance, _ONE), start + width)
@@ -123,21 +124,19 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
             stretched = False
         elif status == FREE:
             index += wp.int64(1)
-            while depth > 0 and index % wp.int64(2) == wp.int64(0):
+            while width < _ONE and index % wp.int64(2) == wp.int64(0):
                 index /= wp.int64(2)
-                depth -= 1
                 width += width
-            if depth == 0 and index == wp.int64(1):
+            if index == wp.int64(1) and width == _ONE:
                 return FREE, wp.float64(2.0)
             start = wp.float64(index) * width
             continue
         elif width + width <= tolerance:
             stretched = True
             continue
-        if depth == MAX_DEPTH:
+        if width <= FINEST * tolerance:
             return UNSURE, start
         index *= wp.int64(2)
-        depth += 1
         width *= _HALF
     return UNSURE, start
 

@@ -70,7 +70,7 @@ def test_times_and_counts_belong_to_the_pairs():
     for counts in (c.stats.vertex_face, c.stats.edge_edge):
         assert counts.candidates == counts.free + counts.hits + counts.unsure
         assert counts.survivors <= counts.candidates
-    assert set(c.stats.milliseconds) == {"broad phase", "cull", "classify", "time of impact", "exact"}
+    assert set(c.stats.milliseconds) == {"broad phase", "cull", "classify", "time of impact", "sort", "exact"}
 
 
 def turned(positions, angle):

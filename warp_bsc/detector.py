@@ -2,6 +2,7 @@
 
 import functools
 import time
+import weakref
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,14 +13,25 @@ from .arrays import checked_coordinates
 from .broad_phase import BroadPhase
 from .kernels.crossing import edge_crosses_face
 from .kernels.signs import HIT, UNSURE
-from .narrow_phase import TOLERANCE, StageCounts, check_method, check_tolerance, find_contacts
+from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly, roomy
 
-__all__ = ["CollisionDetector", "Collisions", "DetectionStats"]
+__all__ = ["CollisionDetector", "Collisions", "DetectionStats", "StageCounts"]
+
+_NOT_FINITE, _FACE_PAIRS, _CROSSINGS, _VERTEX_FACE = range(4)
+_EDGE_EDGE = _VERTEX_FACE + len(Count)
+_COUNTS = _EDGE_EDGE + len(Count)
+"""Places of the counts in one array; those of a kind of pair are by :class:`Count` from its place on."""
 
 
 @functools.cache
-def _classify_crossings(dtype):
-    """The kernel that says which edges meet which faces at rest, for one type of position."""
+def _kernels(dtype):
+    """The kernels for one type of position, each in a module of its own."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def count_not_finite(x0: wp.array[dtype], x1: wp.array[dtype], counts: wp.array[wp.int64]):
+        vertex = wp.tid()
+        if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
+            wp.atomic_add(counts, _NOT_FINITE, wp.int64(1))
 
     @wp.kernel(enable_backward=False, module="unique")
     def classify_crossings(
@@ -36,7 +48,26 @@ def _classify_crossings(dtype):
             x[edges[edge, 0]], x[edges[edge, 1]], x[faces[face, 0]], x[faces[face, 1]], x[faces[face, 2]]
         )
 
-    return classify_crossings
+    return count_not_finite, classify_crossings
+
+
+@dataclass(frozen=True)
+class StageCounts:
+    """How many pairs of one kind entered or left each stage.
+
+    Attributes:
+        candidates: Pairs that share no vertex and whose swept boxes overlap.
+        survivors: Candidates that the culls leave.
+        free: Candidates certified free, by the culls or later.
+        hits: Candidates certified to collide.
+        unsure: Candidates that floating point could not certify either way.
+    """
+
+    candidates: int
+    survivors: int
+    free: int
+    hits: int
+    unsure: int
 
 
 @dataclass(frozen=True)
@@ -46,7 +77,8 @@ class DetectionStats:
     Attributes:
         vertex_face: How many vertex-face pairs entered or left each stage.
         edge_edge: How many edge-edge pairs entered or left each stage.
-        milliseconds: Wall time by stage: "broad phase", "cull", "classify", "time of impact", "exact".
+        milliseconds: Time by stage: "broad phase", "cull", "classify", "time of impact", "sort", "exact". Empty for a
+            detection in a CUDA graph.
     """
 
     vertex_face: StageCounts
@@ -54,9 +86,35 @@ class DetectionStats:
     milliseconds: dict[str, float]
 
 
-@dataclass(frozen=True)
+class _StageClock:
+    """Time between the ends of stages: by events on a GPU, which nobody waits for, else by the wall."""
+
+    def __init__(self, device):
+        self._device = device
+        self._laps = []
+        self.lap(None)
+
+    def lap(self, stage):
+        if self._device.is_cuda:
+            event = wp.Event(self._device, enable_timing=True)
+            wp.get_stream(self._device).record_event(event)
+            self._laps.append((stage, event))
+        else:
+            self._laps.append((stage, time.perf_counter()))
+
+    def read(self):
+        milliseconds = {}
+        for (_, start), (stage, end) in zip(self._laps, self._laps[1:], strict=False):
+            passed = wp.get_event_elapsed_time(start, end) if self._device.is_cuda else 1000.0 * (end - start)
+            milliseconds[stage] = milliseconds.get(stage, 0.0) + passed
+        return milliseconds
+
+
 class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
+
+    They stay on the device until an attribute is asked for, or until the next detection would overwrite them. Those of
+    a detection in a CUDA graph are read anew each time, and say what the last replay found.
 
     Attributes:
         vertex_face: (vertex, face), int32, shape [n, 2].
@@ -69,39 +127,58 @@ class Collisions:
         edge_edge_coordinates: (s, r, 0) along the two edges, float64, shape [m, 3].
         vertex_face_normal: Unit normals, against the velocity of the vertex relative to the face, float64, shape
             [n, 3].
-        edge_edge_normal: Unit normals, against the velocity of the first edge relative to the second, float64,
-            shape [m, 3].
-        certified: Whether no collision of the motion can be missing. False for method "float".
+        edge_edge_normal: Unit normals, against the velocity of the first edge relative to the second, float64, shape
+            [m, 3].
+        earliest_toi: The earliest time of impact, 2.0 if there is none.
+        overflowed: Whether a queue was too small, so that collisions are missing. Only a detection in a CUDA graph can
+            overflow: detect once outside a graph, which makes the queues larger, and capture again.
+        certified: Whether no collision of the motion can be missing. False for method "float", and if a queue
+            overflowed or a position was not finite in a CUDA graph.
         stats: Counts and times of every stage.
     """
 
-    vertex_face: np.ndarray
-    edge_edge: np.ndarray
-    vertex_face_toi: np.ndarray
-    edge_edge_toi: np.ndarray
-    vertex_face_coordinates: np.ndarray
-    edge_edge_coordinates: np.ndarray
-    vertex_face_normal: np.ndarray
-    edge_edge_normal: np.ndarray
-    certified: bool
-    stats: DetectionStats
+    def __init__(self, detector, captured, milliseconds):
+        self._detector = detector
+        self._captured = captured
+        self._milliseconds = milliseconds
+        self._run = detector._run
+        self._read = None
 
-    @property
-    def earliest_toi(self):
-        """The earliest time of impact, 2.0 if there is none."""
-        return float(min(self.vertex_face_toi.min(initial=2.0), self.edge_edge_toi.min(initial=2.0)))
+    def _results(self):
+        """The results by name, from the device if need be."""
+        if self._read is not None:
+            return self._read
+        if self._run != self._detector._run:
+            raise RuntimeError("these collisions were not read before another detection was captured, and are gone")
+        results = self._detector._read(self._milliseconds)
+        if not self._captured:
+            self._read = results
+        return results
+
+    def __getattr__(self, name):
+        """Reads the results from the device."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        results = self._results()
+        if name not in results:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return results[name]
 
 
 class CollisionDetector:
-    """Finds all collisions of a moving mesh: vertices with faces and edges with edges that share no vertex."""
+    """Finds all collisions of a moving mesh: vertices with faces and edges with edges that share no vertex.
+
+    Once its queues are large enough, which a detection sees to that is not captured, a detection allocates nothing and
+    asks the device nothing, and can be captured in a CUDA graph and replayed on new positions in the same arrays.
+    """
 
     def __init__(self, mesh, *, method="conservative", tolerance=TOLERANCE):
         """Prepares detection for a mesh, on its device.
 
         Args:
             mesh: The :class:`CollisionMesh`.
-            method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it computes,
-                "conservative" counts them as hits, "exact" decides them exactly.
+            method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it
+                computes, "conservative" counts them as hits, "exact" decides them exactly, outside CUDA graphs.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
 
         Raises:
@@ -112,14 +189,25 @@ class CollisionDetector:
         self.mesh = mesh
         self.method = method
         self.tolerance = tolerance
+        self._run = 0
+        self._last = lambda: None  # the last results, as long as someone holds them
         self._broad_phase = BroadPhase(mesh)
+        self._counts = wp.zeros(_COUNTS, dtype=wp.int64, device=mesh.device)
+        faces = len(mesh.faces)
+        self._face_pairs = wp.empty(8 * faces, dtype=wp.vec2i, device=mesh.device)
+        self._vertex_face = NarrowPhase(
+            "vertex_face", self._counts[_VERTEX_FACE:_EDGE_EDGE], 2 * faces, (mesh.vertex_count, faces)
+        )
+        self._edge_edge = NarrowPhase(
+            "edge_edge", self._counts[_EDGE_EDGE:_COUNTS], 4 * faces, (len(mesh.edges), len(mesh.edges))
+        )
 
     def detect(self, x0, x1):
         """Finds the collisions of a motion.
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
-                array. They are taken as exact.
+                array. They are taken as exact. In a CUDA graph, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
 
         Returns:
@@ -127,43 +215,34 @@ class CollisionDetector:
 
         Raises:
             ValueError: If the positions have another shape or type, differ in type, or are not finite.
+            RuntimeError: If the first detection is captured in a CUDA graph.
         """
-        x0 = self._positions(x0, "x0")
-        x1 = self._positions(x1, "x1")
+        capturing = self.mesh.device.is_cuda and self.mesh.device.is_capturing
+        x0 = self._positions(x0, "x0", capturing)
+        x1 = self._positions(x1, "x1", capturing)
         if x0.dtype != x1.dtype:
             raise ValueError("x0 and x1 must have the same type")
-        milliseconds = {"broad phase": 0.0}
-        found = {}
-        for kind, elements in (("vertex_face", self.mesh.device_faces), ("edge_edge", self.mesh.device_edges)):
-            start = time.perf_counter()
-            candidates = getattr(self._broad_phase, kind)(x0, x1)
-            milliseconds["broad phase"] += 1000.0 * (time.perf_counter() - start)
-            contacts = find_contacts(
-                kind,
-                x0,
-                x1,
-                elements,
-                candidates,
-                method=self.method,
-                localize=self.method == "exact",
-                tolerance=self.tolerance,
-            )
-            for stage, duration in contacts.milliseconds.items():
-                milliseconds[stage] = milliseconds.get(stage, 0.0) + duration
-            found[kind] = contacts
-        vf, ee = found["vertex_face"], found["edge_edge"]
-        return Collisions(
-            vertex_face=vf.pairs[vf.hit],
-            edge_edge=ee.pairs[ee.hit],
-            vertex_face_toi=vf.toi[vf.hit],
-            edge_edge_toi=ee.toi[ee.hit],
-            vertex_face_coordinates=vf.coordinates[vf.hit],
-            edge_edge_coordinates=ee.coordinates[ee.hit],
-            vertex_face_normal=vf.normal[vf.hit],
-            edge_edge_normal=ee.normal[ee.hit],
-            certified=self.method != "float",
-            stats=DetectionStats(vf.counts, ee.counts, milliseconds),
-        )
+        if capturing and self._run == 0:
+            raise RuntimeError("detect once before capturing, so that kernels are loaded and queues are large enough")
+        if capturing:
+            self._run += 1
+            self._launch(x0, x1, lambda stage: None)
+            return Collisions(self, True, dict)
+        self._start_run()
+        self._positions_detected = x0, x1
+        while True:
+            clock = _StageClock(self.mesh.device)
+            self._launch(x0, x1, clock.lap)
+            counts = self._counts.numpy()
+            if counts[_NOT_FINITE]:
+                for name, x in (("x0", x0), ("x1", x1)):
+                    checked_coordinates(x.numpy(), (3,), name)
+            if not self._overflowed(counts):
+                break
+            self._grow(counts)
+        collisions = Collisions(self, False, clock.read)
+        self._last = weakref.ref(collisions)
+        return collisions
 
     def find_intersections(self, x):
         """Finds the edges that meet faces in one configuration, exactly.
@@ -178,31 +257,123 @@ class CollisionDetector:
         Raises:
             ValueError: If the positions have another shape or type, or are not finite.
         """
-        x = self._positions(x, "x")
+        x = self._positions(x, "x", False)
+        checked_coordinates(x.numpy(), (3,), "x")
         mesh = self.mesh
-        candidates = self._broad_phase.edge_face(x)
-        status = wp.empty(len(candidates), dtype=int, device=mesh.device)
-        wp.launch(
-            _classify_crossings(x.dtype),
-            len(candidates),
-            inputs=[x, mesh.device_edges, mesh.device_faces, candidates],
-            outputs=[status],
-            device=mesh.device,
-        )
+        self._start_run()
+        candidates = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
+        while True:
+            self._counts.zero_()
+            self._broad_phase.pair_faces(x, x, self._counts, _FACE_PAIRS, self._face_pairs)
+            self._broad_phase.pair_edges_with_faces(self._face_pairs, self._counts, _FACE_PAIRS, _CROSSINGS, candidates)
+            counts = self._counts.numpy()
+            found = int(counts[_CROSSINGS])
+            if counts[_FACE_PAIRS] <= len(self._face_pairs) and found <= len(candidates):
+                break
+            self._grow(counts)
+            if found > len(candidates):
+                candidates = wp.empty(roomy(found), dtype=wp.vec2i, device=mesh.device)
+        status = wp.empty(found, dtype=int, device=mesh.device)
+        inputs = [x, mesh.device_edges, mesh.device_faces, candidates]
+        wp.launch(_kernels(x.dtype)[1], found, inputs=inputs, outputs=[status], device=mesh.device)
         status = status.numpy()
-        pairs = candidates.numpy().reshape(-1, 2)
+        pairs = candidates.numpy()[:found]
         unsure = pairs[status == UNSURE]
         positions = x.numpy()
         crossing = checker.edge_face_crossings(positions[mesh.edges[unsure[:, 0]]], positions[mesh.faces[unsure[:, 1]]])
         pairs = np.concatenate([pairs[status == HIT], unsure[crossing]])
         return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
-    def _positions(self, x, name):
-        """Positions on the mesh's device as an array of vec3 or vec3d, checked."""
-        values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
-        if len(values) != self.mesh.vertex_count:
-            raise ValueError(f"{name} must have {self.mesh.vertex_count} rows, one a vertex, got {len(values)}")
-        dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
-        if isinstance(x, wp.array) and x.device == self.mesh.device and x.dtype == dtype:
+    def _positions(self, x, name, capturing):
+        """Positions on the mesh's device as an array of vec3 or vec3d; whether they are finite is seen to there."""
+        mesh = self.mesh
+        if isinstance(x, wp.array) and x.device == mesh.device and x.dtype in (wp.vec3, wp.vec3d):
+            if x.shape != (mesh.vertex_count,):
+                raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {x.shape}")
             return x
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.mesh.device)
+        if capturing:
+            raise ValueError(f"in a CUDA graph {name} must be a Warp array of vec3 or vec3d on {mesh.device}")
+        values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
+        if len(values) != mesh.vertex_count:
+            raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {len(values)}")
+        dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=mesh.device)
+
+    def _start_run(self):
+        """Sees to it that results that someone still holds are read before they are overwritten."""
+        last = self._last()
+        if last is not None and last._run == self._run:
+            last._results()
+        self._run += 1
+
+    def _launch(self, x0, x1, lap):
+        """Launches the whole pipeline, without asking the device anything."""
+        mesh, counts = self.mesh, self._counts
+        counts.zero_()
+        count_not_finite, _ = _kernels(x0.dtype)
+        wp.launch(count_not_finite, mesh.vertex_count, inputs=[x0, x1], outputs=[counts], device=mesh.device)
+        self._broad_phase.pair_faces(x0, x1, counts, _FACE_PAIRS, self._face_pairs)
+        queues = [self._vertex_face.candidates, self._edge_edge.candidates]
+        places = [_FACE_PAIRS, _VERTEX_FACE + Count.CANDIDATES, _EDGE_EDGE + Count.CANDIDATES]
+        self._broad_phase.pair_elements(self._face_pairs, counts, *places, queues)
+        lap("broad phase")
+        for narrow_phase, elements in (
+            (self._vertex_face, mesh.device_faces),
+            (self._edge_edge, mesh.device_edges),
+        ):
+            narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance, lap=lap)
+
+    def _overflowed(self, counts):
+        return bool(
+            counts[_FACE_PAIRS] > len(self._face_pairs)
+            or self._vertex_face.overflowed(counts[_VERTEX_FACE:_EDGE_EDGE])
+            or self._edge_edge.overflowed(counts[_EDGE_EDGE:_COUNTS])
+        )
+
+    def _grow(self, counts):
+        if counts[_FACE_PAIRS] > len(self._face_pairs):
+            self._face_pairs = wp.empty(roomy(counts[_FACE_PAIRS]), dtype=wp.vec2i, device=self.mesh.device)
+        self._vertex_face.grow(counts[_VERTEX_FACE:_EDGE_EDGE])
+        self._edge_edge.grow(counts[_EDGE_EDGE:_COUNTS])
+
+    def _read(self, read_milliseconds):
+        """The results of the last detection, by the names of the attributes of Collisions."""
+        counts = self._counts.numpy()
+        overflowed = self._overflowed(counts)
+        results = {
+            "overflowed": overflowed,
+            "certified": self.method != "float" and not overflowed and not counts[_NOT_FINITE],
+        }
+        captured = read_milliseconds is dict
+        milliseconds = read_milliseconds()
+        start = time.perf_counter()
+        stage_counts = {}
+        earliest = 2.0
+        for narrow_phase, place, elements in (
+            (self._vertex_face, _VERTEX_FACE, self.mesh.device_faces),
+            (self._edge_edge, _EDGE_EDGE, self.mesh.device_edges),
+        ):
+            kind = narrow_phase.kind
+            kind_counts = counts[place : place + len(Count)]
+            contacts = narrow_phase.contacts.read(kind_counts[Count.FOUND])
+            if self.method == "exact" and not captured:
+                ask = (contacts["status"] == UNSURE) | ~contacts["localized"]
+                decide_exactly(kind, *self._positions_detected, elements, contacts, ask)
+            hit = contacts["hit"]
+            results[kind] = contacts["pairs"][hit]
+            for name in ("toi", "coordinates", "normal"):
+                results[f"{kind}_{name}"] = contacts[name][hit]
+            earliest = min(earliest, float(results[f"{kind}_toi"].min(initial=2.0)))
+            unsure = int(kind_counts[Count.UNSURE])
+            stage_counts[kind] = StageCounts(
+                candidates=int(kind_counts[Count.CANDIDATES]),
+                survivors=int(kind_counts[Count.SURVIVORS]),
+                free=int(kind_counts[Count.CANDIDATES] - kind_counts[Count.FOUND]),
+                hits=int(kind_counts[Count.FOUND]) - unsure,
+                unsure=unsure,
+            )
+        if not captured:
+            milliseconds["exact"] = 1000.0 * (time.perf_counter() - start)
+        results["earliest_toi"] = earliest
+        results["stats"] = DetectionStats(**stage_counts, milliseconds=milliseconds)
+        return results

@@ -47,13 +47,22 @@ class CollisionMesh:
                 + (f" ({len(bad)} such faces)" if len(bad) > 1 else "")
             )
         self.faces = np.ascontiguousarray(faces, dtype=np.int32)
-        edges = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges = np.unique(edges, axis=0)
+        sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edges, first_sides, edge_of_side = np.unique(sides, axis=0, return_index=True, return_inverse=True)
         # a face that names a vertex twice has an edge without length: its point belongs to the other edge
-        self.edges = edges[edges[:, 0] != edges[:, 1]]
-        self.vertices = np.unique(self.faces)
+        proper = edges[:, 0] != edges[:, 1]
+        self.edges = edges[proper]
+        face_edges = np.where(proper, np.cumsum(proper) - 1, -1)[edge_of_side].reshape(-1, 3)
+        self.vertices, first_corners = np.unique(self.faces, return_index=True)
+        # the representative of an element is the first face that has it: bits 0 to 2 corners, 3 to 5 edges
+        owned = np.zeros(len(self.faces), dtype=np.int32)
+        np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
+        first_sides = first_sides[proper]
+        np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
         self.vertex_count = vertex_count
         self.device = wp.get_device(device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.device_vertices = wp.array(self.vertices.reshape(-1, 1), dtype=int, device=self.device)
+        self.device_vertices = wp.array(np.arange(vertex_count).reshape(-1, 1), dtype=int, device=self.device)
+        self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
+        self.device_owned = wp.array(owned, dtype=int, device=self.device)

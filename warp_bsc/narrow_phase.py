@@ -1,12 +1,11 @@
-"""The narrow phase: candidate pairs -> culls -> certified classification -> times of impact -> exact answers.
+"""The narrow phase: candidate pairs -> culls -> certified classification -> times of impact, sorted.
 
-Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. A queue holds as
-many entries as the one before it, so none can overflow.
+Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
+the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels.queues`.
 """
 
+import enum
 import functools
-import time
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -22,10 +21,22 @@ from .kernels.culling import (
     vertex_face_boxes_apart,
 )
 from .kernels.polynomials import coplanarity
+from .kernels.queues import append, is_filled, take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
+from .launching import launch_over_queue
 
-__all__ = ["METHODS", "TOLERANCE", "Contacts", "StageCounts", "check_method", "check_tolerance", "find_contacts"]
+__all__ = [
+    "METHODS",
+    "TOLERANCE",
+    "Contacts",
+    "Count",
+    "NarrowPhase",
+    "check_method",
+    "check_tolerance",
+    "decide_exactly",
+    "roomy",
+]
 
 METHODS = ("float", "conservative", "exact")
 """What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
@@ -50,61 +61,21 @@ def check_tolerance(tolerance):
         raise ValueError(f"tolerance must be in [2^-38, 1], not {tolerance!r}")
 
 
-@dataclass(frozen=True)
-class StageCounts:
-    """How many pairs of one kind entered or left each stage.
+class Count(enum.IntEnum):
+    """Counts of one kind of pair, from an offset on in the array of all counts."""
 
-    Attributes:
-        candidates: Pairs whose swept boxes overlap.
-        survivors: Candidates that the culls leave.
-        free: Candidates certified free, by the culls or by classification.
-        hits: Candidates certified to collide.
-        unsure: Candidates that floating point could not certify either way.
-    """
-
-    candidates: int
-    survivors: int
-    free: int
-    hits: int
-    unsure: int
+    CANDIDATES = 0
+    SURVIVORS = 1
+    CONTACTS = 2
+    FOUND = 3
+    UNSURE = 4
 
 
-@dataclass(frozen=True)
-class Contacts:
-    """The pairs that were not certified free, sorted.
-
-    Attributes:
-        pairs: (vertex, face) or (edge, edge), int32, shape [n, 2].
-        status: What floating point could certify, HIT or UNSURE, int8, shape [n].
-        hit: The answer by the method asked for, bool, shape [n].
-        toi: Time of impact as a share of the step, float64, shape [n]; 2.0 where there is no hit.
-        coordinates: Contact coordinates, float64, shape [n, 3].
-        normal: Unit contact normals, float64, shape [n, 3].
-        counts: How many pairs entered or left each stage.
-        milliseconds: Wall time of every stage.
-    """
-
-    pairs: np.ndarray
-    status: np.ndarray
-    hit: np.ndarray
-    toi: np.ndarray
-    coordinates: np.ndarray
-    normal: np.ndarray
-    counts: StageCounts
-    milliseconds: dict[str, float]
-
-
-class _StageClock:
-    """Wall time between the ends of stages, each of which has read its results back and so has finished."""
-
-    def __init__(self):
-        self.milliseconds = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage):
-        now = time.perf_counter()
-        self.milliseconds[stage] = 1000.0 * (now - self._last)
-        self._last = now
+_CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+_UNSURE = wp.constant(int(Count.UNSURE))
 
 
 @functools.cache
@@ -129,15 +100,19 @@ def _kernels(kind, dtype):
 
     @wp.kernel(**_KERNEL)
     def cull(
+        first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         roundoff: wp.float64,
         candidates: wp.array[wp.vec2i],
+        counts: wp.array[wp.int64],
         survivors: wp.array[wp.vec2i],
-        count: wp.array[int],
     ):
-        pair = candidates[wp.tid()]
+        i = first + wp.tid()
+        if not is_filled(i, candidates, counts, _CANDIDATES):
+            return
+        pair = candidates[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -148,31 +123,37 @@ def _kernels(kind, dtype):
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
             return
-        survivors[wp.atomic_add(count, 0, 1)] = pair
+        append(pair, survivors, counts, _SURVIVORS)
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
+        first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         roundoff: wp.float64,
         survivors: wp.array[wp.vec2i],
+        counts: wp.array[wp.int64],
         contacts: wp.array[wp.vec2i],
-        status: wp.array[int],
-        count: wp.array[int],
+        status: wp.array[wp.int8],
     ):
-        pair = survivors[wp.tid()]
+        i = first + wp.tid()
+        if not is_filled(i, survivors, counts, _SURVIVORS):
+            return
+        pair = survivors[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         answer = classify(motion, coplanarity(motion))
         if answer != FREE:
-            slot = wp.atomic_add(count, 1, 1)
-            contacts[slot] = pair
-            status[slot] = answer
+            slot = take_slot(counts, _CONTACTS)
+            if slot < wp.int64(contacts.shape[0]):
+                contacts[wp.int32(slot)] = pair
+                status[wp.int32(slot)] = wp.int8(answer)
 
     @wp.kernel(**_KERNEL)
     def find_impacts(
+        first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
@@ -180,24 +161,43 @@ def _kernels(kind, dtype):
         timed: bool,
         tolerance: wp.float64,
         contacts: wp.array[wp.vec2i],
-        status: wp.array[int],
-        localized: wp.array[int],
+        counts: wp.array[wp.int64],
+        status: wp.array[wp.int8],
+        localized: wp.array[wp.bool],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
         normal: wp.array[wp.vec3d],
+        keys: wp.array[wp.int64],
+        order: wp.array[int],
+        first_bits: int,
+        second_bits: int,
     ):
-        i = wp.tid()
-        if not timed and status[i] == HIT:
+        i = first + wp.tid()
+        if i >= contacts.shape[0]:
             return
-        a0, b0, c0, d0 = four_points(x0, elements, contacts[i])
-        a1, b1, c1, d1 = four_points(x1, elements, contacts[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        result = impact(motion, coplanarity(motion), status[i], tolerance)
-        status[i] = result.status
-        localized[i] = result.localized
-        toi[i] = result.toi
-        coordinates[i] = result.coordinates
-        normal[i] = result.normal
+        order[i] = i
+        # stays so where there is no contact, which sorts it behind the others
+        keys[i] = wp.int64(1) << wp.int64(first_bits + second_bits)
+        if not is_filled(i, contacts, counts, _CONTACTS):
+            return
+        pair = contacts[i]
+        answer = int(status[i])
+        if timed or answer != HIT:
+            a0, b0, c0, d0 = four_points(x0, elements, pair)
+            a1, b1, c1, d1 = four_points(x1, elements, pair)
+            motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            result = impact(motion, coplanarity(motion), answer, tolerance)
+            answer = result.status
+            status[i] = wp.int8(answer)
+            localized[i] = result.localized == 1
+            toi[i] = result.toi
+            coordinates[i] = result.coordinates
+            normal[i] = result.normal
+        if answer != FREE:
+            keys[i] = (wp.int64(pair[0]) << wp.int64(second_bits)) | wp.int64(pair[1])
+            take_slot(counts, _FOUND)
+            if answer == UNSURE:
+                take_slot(counts, _UNSURE)
 
     @wp.kernel(**_KERNEL)
     def find_contact_points(
@@ -220,106 +220,207 @@ def _kernels(kind, dtype):
     return cull, classify_survivors, find_impacts, find_contact_points
 
 
-def find_contacts(kind, x0, x1, elements, candidates, *, method, localize, timed=True, tolerance=TOLERANCE):
-    """Finds which candidate pairs collide, and when and where.
+@wp.kernel(**_KERNEL)
+def _sort_contacts(
+    first: int,
+    contacts: wp.array[wp.vec2i],
+    counts: wp.array[wp.int64],
+    order: wp.array[int],
+    status: wp.array[wp.int8],
+    localized: wp.array[wp.bool],
+    toi: wp.array[wp.float64],
+    coordinates: wp.array[wp.vec3d],
+    normal: wp.array[wp.vec3d],
+    sorted_pairs: wp.array[wp.vec2i],
+    sorted_status: wp.array[wp.int8],
+    sorted_localized: wp.array[wp.bool],
+    sorted_toi: wp.array[wp.float64],
+    sorted_coordinates: wp.array[wp.vec3d],
+    sorted_normal: wp.array[wp.vec3d],
+):
+    i = first + wp.tid()
+    if not is_filled(i, contacts, counts, _FOUND):
+        return
+    source = order[i]
+    sorted_pairs[i] = contacts[source]
+    sorted_status[i] = status[source]
+    sorted_localized[i] = localized[source]
+    sorted_toi[i] = toi[source]
+    sorted_coordinates[i] = coordinates[source]
+    sorted_normal[i] = normal[source]
+
+
+class Contacts:
+    """Pairs that were not certified free, with what is known of them, in arrays on the device.
+
+    Attributes:
+        pairs: (vertex, face) or (edge, edge), array of vec2i.
+        status: What floating point could certify, HIT or UNSURE, array of int8.
+        localized: Whether the time is within the tolerance, array of bool.
+        toi: Time of impact as a share of the step, array of float64.
+        coordinates: Contact coordinates, array of vec3d.
+        normal: Unit contact normals, array of vec3d.
+    """
+
+    def __init__(self, capacity, device):
+        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
+        self.status = wp.empty(capacity, dtype=wp.int8, device=device)
+        self.localized = wp.zeros(capacity, dtype=wp.bool, device=device)
+        self.toi = wp.empty(capacity, dtype=wp.float64, device=device)
+        self.coordinates = wp.empty(capacity, dtype=wp.vec3d, device=device)
+        self.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
+
+    @property
+    def arrays(self):
+        """All arrays, in the order of the attributes."""
+        return [self.pairs, self.status, self.localized, self.toi, self.coordinates, self.normal]
+
+    def read(self, count):
+        """The first ``count`` contacts as NumPy arrays by name, all of them hits until shown otherwise."""
+        names = ["pairs", "status", "localized", "toi", "coordinates", "normal"]
+        contacts = {name: array[: int(count)].numpy().copy() for name, array in zip(names, self.arrays, strict=True)}
+        contacts["hit"] = np.ones(int(count), dtype=bool)
+        return contacts
+
+
+class NarrowPhase:
+    """Decides candidate pairs of one kind, on the device.
+
+    Attributes:
+        candidates: Queue of the candidates, to be filled by whoever finds them, array of vec2i.
+        counts: Counts by :class:`Count`, array of int64.
+        contacts: The contacts, sorted, as many as ``counts[Count.FOUND]`` says.
+    """
+
+    def __init__(self, kind, counts, candidates, elements):
+        """Makes queues.
+
+        Args:
+            kind: "vertex_face" or "edge_edge".
+            counts: Array of int64 with room for :class:`Count`, zero before each run.
+            candidates: Room for candidates.
+            elements: How many first and second elements there are to pair.
+        """
+        self.kind = kind
+        self._bits = [max(1, int(count - 1).bit_length()) for count in elements]
+        self.counts = counts
+        self.candidates = wp.empty(candidates, dtype=wp.vec2i, device=counts.device)
+        self._reserve_survivors(candidates // 8 + 64)
+        self._reserve_contacts(candidates // 32 + 64)
+
+    def _reserve_survivors(self, capacity):
+        self._survivors = wp.empty(capacity, dtype=wp.vec2i, device=self.counts.device)
+
+    def _reserve_contacts(self, capacity):
+        device = self.counts.device
+        self._unsorted = Contacts(capacity, device)
+        self.contacts = Contacts(capacity, device)
+        self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
+        self._order = wp.empty(2 * capacity, dtype=int, device=device)
+
+    def overflowed(self, counts):
+        """Whether a queue was too small for the counts, NumPy array."""
+        return (
+            counts[Count.CANDIDATES] > len(self.candidates)
+            or counts[Count.SURVIVORS] > len(self._survivors)
+            or counts[Count.CONTACTS] > len(self.contacts.pairs)
+        )
+
+    def grow(self, counts):
+        """Makes the queues large enough for the counts, with a quarter to spare."""
+        needed = {count: roomy(counts[count]) for count in (Count.CANDIDATES, Count.SURVIVORS, Count.CONTACTS)}
+        if counts[Count.CANDIDATES] > len(self.candidates):
+            self.candidates = wp.empty(needed[Count.CANDIDATES], dtype=wp.vec2i, device=self.counts.device)
+        if counts[Count.SURVIVORS] > len(self._survivors):
+            self._reserve_survivors(needed[Count.SURVIVORS])
+        if counts[Count.CONTACTS] > len(self.contacts.pairs):
+            self._reserve_contacts(needed[Count.CONTACTS])
+
+    def run(self, x0, x1, elements, *, method, timed=True, tolerance=TOLERANCE, lap=lambda stage: None):
+        """Launches all stages over the candidates, without asking the device anything.
+
+        Args:
+            x0: Positions at the start of the step, Warp array of vec3 or vec3d.
+            x1: Positions at its end, of the same type.
+            elements: Vertex indices of the faces (vertex_face) or edges (edge_edge), Warp array of int,
+                two-dimensional.
+            method: One of :data:`METHODS`; "exact" is left to :func:`decide_exactly`.
+            timed: Whether to find times of impact, coordinates and normals.
+            tolerance: Of the times of impact, as a share of the step.
+            lap: Called with the name of each stage at its end.
+        """
+        cull, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
+        roundoff = 0.0 if method == "float" else ROUNDOFF
+        motion = [x0, x1, elements, roundoff]
+        counts, found = self.counts, self._unsorted
+
+        inputs = [*motion, self.candidates, counts]
+        launch_over_queue(cull, self.candidates, counts, Count.CANDIDATES, inputs=inputs, outputs=[self._survivors])
+        lap("cull")
+
+        inputs = [*motion, self._survivors, counts]
+        outputs = [found.pairs, found.status]
+        launch_over_queue(classify_survivors, self._survivors, counts, Count.SURVIVORS, inputs=inputs, outputs=outputs)
+        lap("classify")
+
+        inputs = [*motion, timed, tolerance, found.pairs, counts]
+        outputs = [*found.arrays[1:], self._keys, self._order, *self._bits]
+        launch_over_queue(find_impacts, found.pairs, counts, Count.CONTACTS, inputs=inputs, outputs=outputs)
+        lap("time of impact")
+
+        entries = len(found.pairs)
+        if counts.device.is_cpu:
+            entries = min(entries, int(counts.numpy()[Count.CONTACTS]))
+        wp.utils.radix_sort_pairs(self._keys, self._order, entries, end_bit=sum(self._bits) + 1)
+        inputs = [found.pairs, counts, self._order, *found.arrays[1:]]
+        launch_over_queue(_sort_contacts, found.pairs, counts, Count.FOUND, inputs=inputs, outputs=self.contacts.arrays)
+        lap("sort")
+
+
+def roomy(count):
+    """A capacity for so many entries, with a quarter to spare.
+
+    Raises:
+        ValueError: If the entries are more than a queue can have.
+    """
+    capacity = int(count) + int(count) // 4
+    if capacity >= 2**31:
+        raise ValueError(f"{count} pairs are more than one call can handle")
+    return capacity
+
+
+def decide_exactly(kind, x0, x1, elements, contacts, ask, *, timed=True):
+    """Asks the exact checker about some contacts, on the host, and changes their entries.
 
     Args:
         kind: "vertex_face" or "edge_edge".
-        x0: Positions at the start of the step, Warp array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        elements: Vertex indices of the faces (vertex_face) or edges (edge_edge), Warp array of int, two-dimensional.
-        candidates: Pairs (vertex, face) or (edge, edge), Warp array of vec2i.
-        method: One of :data:`METHODS`.
-        localize: Whether the times of certified hits that floating point could not place to within the tolerance
-            are found by exact arithmetic on the host; without it they are lower bounds.
+        x0: Positions at the start of the step, Warp array.
+        x1: Positions at its end.
+        elements: Vertex indices of faces or edges, Warp array.
+        contacts: NumPy arrays by name: pairs, hit, and, if timed, toi, coordinates, normal.
+        ask: Which contacts, bool, shape [n].
         timed: Whether to find times of impact, coordinates and normals.
-        tolerance: Of the times of impact, as a share of the step.
-
-    Returns:
-        Contacts: The pairs that were not certified free.
     """
-    device = x0.device
-    cull, classify_survivors, find_impacts, find_contact_points = _kernels(kind, x0.dtype)
-    roundoff = 0.0 if method == "float" else ROUNDOFF
-    motion = [x0, x1, elements]
-    clock = _StageClock()
-
-    counts = wp.zeros(2, dtype=int, device=device)
-    survivors = wp.empty(len(candidates), dtype=wp.vec2i, device=device)
-    wp.launch(cull, len(candidates), inputs=[*motion, roundoff, candidates], outputs=[survivors, counts], device=device)
-    survivor_count = int(counts.numpy()[0])
-    clock.lap("cull")
-
-    queue = wp.empty(survivor_count, dtype=wp.vec2i, device=device)
-    queue_status = wp.empty(survivor_count, dtype=int, device=device)
-    wp.launch(
-        classify_survivors,
-        survivor_count,
-        inputs=[*motion, roundoff, survivors],
-        outputs=[queue, queue_status, counts],
-        device=device,
-    )
-    queue_count = int(counts.numpy()[1])
-    clock.lap("classify")
-
-    localized = wp.zeros(queue_count, dtype=int, device=device)
-    toi = wp.full(queue_count, 2.0, dtype=wp.float64, device=device)
-    coordinates = wp.zeros(queue_count, dtype=wp.vec3d, device=device)
-    normal = wp.zeros(queue_count, dtype=wp.vec3d, device=device)
-    wp.launch(
-        find_impacts,
-        queue_count,
-        inputs=[*motion, roundoff, timed, tolerance, queue],
-        outputs=[queue_status, localized, toi, coordinates, normal],
-        device=device,
-    )
-    status = queue_status.numpy()[:queue_count].astype(np.int8)
-    pairs = queue.numpy()[:queue_count]
-    # threads fill a queue in any order
-    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    order = order[status[order] != FREE]
-    pairs, status, localized = pairs[order], status[order], localized.numpy()[order] == 1
-    toi, coordinates, normal = toi.numpy()[order], coordinates.numpy()[order], normal.numpy()[order]
-    hit = np.ones(len(pairs), dtype=bool)
-    clock.lap("time of impact")
-
-    ask = np.zeros(len(pairs), dtype=bool)
-    if method == "exact":
-        ask |= status == UNSURE
-    if localize and timed:
-        ask |= (status == HIT) & ~localized
-    if ask.any():
-        corners = _four_vertices(kind, elements.numpy(), pairs[ask])
-        points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
-        if not timed:
-            hit[ask] = getattr(checker, kind)(points)
-        else:
-            toi[ask] = getattr(checker, f"{kind}_toi")(points)[:, 0]
-            hit[ask] = ~np.isnan(toi[ask])
-            toi[~hit] = 2.0
-            again = np.flatnonzero(ask & hit)
-            at = wp.empty(len(again), dtype=wp.vec3d, device=device)
-            direction = wp.empty_like(at)
-            times = wp.array(toi[again], dtype=wp.float64, device=device)
-            contacts = wp.array(pairs[again], dtype=wp.vec2i, device=device)
-            inputs = [*motion, contacts, times]
-            wp.launch(find_contact_points, len(again), inputs=inputs, outputs=[at, direction], device=device)
-            coordinates[again], normal[again] = at.numpy(), direction.numpy()
-    clock.lap("exact")
-
-    hits, unsure = int((status == HIT).sum()), int((status == UNSURE).sum())
-    counts = StageCounts(
-        candidates=len(candidates),
-        survivors=survivor_count,
-        free=len(candidates) - hits - unsure,
-        hits=hits,
-        unsure=unsure,
-    )
-    return Contacts(pairs, status, hit, toi, coordinates, normal, counts, clock.milliseconds)
-
-
-def _four_vertices(kind, elements, pairs):
-    """The vertices of pairs in the order of a query's points, int, shape [n, 4]."""
-    if kind == "vertex_face":
-        return np.concatenate([pairs[:, :1], elements[pairs[:, 1]]], axis=1)
-    return np.concatenate([elements[pairs[:, 0]], elements[pairs[:, 1]]], axis=1)
+    if not ask.any():
+        return
+    pairs, hit = contacts["pairs"], contacts["hit"]
+    corners = elements.numpy()[pairs[ask, 1]]
+    first = pairs[ask, :1] if kind == "vertex_face" else elements.numpy()[pairs[ask, 0]]
+    corners = np.concatenate([first, corners], axis=1)
+    points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
+    if not timed:
+        hit[ask] = getattr(checker, kind)(points)
+        return
+    toi = contacts["toi"]
+    toi[ask] = getattr(checker, f"{kind}_toi")(points)[:, 0]
+    hit[ask] = ~np.isnan(toi[ask])
+    toi[~hit] = 2.0
+    again = np.flatnonzero(ask & hit)
+    *_, find_contact_points = _kernels(kind, x0.dtype)
+    at = wp.empty(len(again), dtype=wp.vec3d, device=x0.device)
+    direction = wp.empty_like(at)
+    times = wp.array(toi[again], dtype=wp.float64, device=x0.device)
+    asked = wp.array(pairs[again], dtype=wp.vec2i, device=x0.device)
+    inputs = [x0, x1, elements, asked, times]
+    wp.launch(find_contact_points, len(again), inputs=inputs, outputs=[at, direction], device=x0.device)
+    contacts["coordinates"][again], contacts["normal"][again] = at.numpy(), direction.numpy()

@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 
 from .arrays import checked_coordinates
-from .narrow_phase import TOLERANCE, check_method, check_tolerance, find_contacts
+from .kernels.signs import HIT, UNSURE
+from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
 
@@ -93,27 +94,33 @@ def _query(kind, points, method, timed, tolerance, device):
     else:
         elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
     elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
-    pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
+    counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
+    narrow_phase.candidates.assign(pairs)
 
     def solve(method):
-        contacts = find_contacts(
-            kind,
-            x0,
-            x1,
-            elements,
-            pairs,
-            method=method,
-            localize=method != "float",
-            timed=timed,
-            tolerance=tolerance,
-        )
-        return contacts, contacts.pairs[:, 1] if kind == "vertex_face" else contacts.pairs[:, 0] // 2
+        while True:
+            counts.assign([n] + [0] * (len(Count) - 1))
+            narrow_phase.run(x0, x1, elements, method=method, timed=timed, tolerance=tolerance)
+            if not narrow_phase.overflowed(counts.numpy()):
+                break
+            narrow_phase.grow(counts.numpy())
+        contacts = narrow_phase.contacts.read(counts.numpy()[Count.FOUND])
+        if method != "float":
+            # the times of certified hits that floating point could not place are found exactly as well
+            ask = (contacts["status"] == HIT) & ~contacts["localized"] & timed
+            if method == "exact":
+                ask |= contacts["status"] == UNSURE
+            decide_exactly(kind, x0, x1, elements, contacts, ask, timed=timed)
+        rows = contacts["pairs"][:, 1] if kind == "vertex_face" else contacts["pairs"][:, 0] // 2
+        return contacts, rows
 
     certified, certified_rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)
-    status[certified_rows] = certified.status
+    status[certified_rows] = certified["status"]
     answers, answer_rows = solve("float") if method == "float" else (certified, certified_rows)
-    answer_rows = answer_rows[answers.hit]
+    found = answers["hit"]
+    answer_rows = answer_rows[found]
     hit = np.zeros(n, dtype=bool)
     hit[answer_rows] = True
     if not timed:
@@ -121,7 +128,7 @@ def _query(kind, points, method, timed, tolerance, device):
     toi = np.full(n, 2.0)
     coordinates = np.full((n, 3), np.nan)
     normal = np.full((n, 3), np.nan)
-    toi[answer_rows] = answers.toi[answers.hit]
-    coordinates[answer_rows] = answers.coordinates[answers.hit]
-    normal[answer_rows] = answers.normal[answers.hit]
+    toi[answer_rows] = answers["toi"][found]
+    coordinates[answer_rows] = answers["coordinates"][found]
+    normal[answer_rows] = answers["normal"][found]
     return QueryResult(hit, status, toi, coordinates, normal)

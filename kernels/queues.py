@@ -1,0 +1,78 @@
+"""Queues between the stages of a pipeline: an array of entries, and a count on the device that any thread may raise.
+
+A count goes on where a queue is full, so that whoever reads it sees how much did not fit: nothing is dropped in
+silence.
+"""
+
+import warp as wp
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here
+    const unsigned mask = __activemask();
+    const int lane = threadIdx.x & 31;
+    const int leader = __ffs(mask) - 1;
+    unsigned long long base = 0;
+    if (lane == leader)
+        base = atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)__popc(mask));
+    base = __shfl_sync(mask, base, leader);
+    return (wp::int64)base + __popc(mask & ((1u << lane) - 1u));
+#else
+    return __atomic_fetch_add(&counts.data[queue], (wp::int64)1, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
+    """Raises the count of a queue by one, and returns what it was."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here; the sum over lower lanes, bit by bit
+    const unsigned mask = __activemask();
+    const int lane = threadIdx.x & 31;
+    const unsigned lower = (1u << lane) - 1u;
+    int before = 0;
+    int total = 0;
+    for (int bit = 0; bit < 5; ++bit) {
+        const unsigned with_bit = __ballot_sync(mask, (amount >> bit) & 1);
+        before += __popc(with_bit & lower) << bit;
+        total += __popc(with_bit) << bit;
+    }
+    const int leader = __ffs(mask) - 1;
+    unsigned long long base = 0;
+    if (lane == leader && total > 0)
+        base = atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)total);
+    base = __shfl_sync(mask, base, leader);
+    return (wp::int64)base + before;
+#else
+    return amount == 0 ? 0 : __atomic_fetch_add(&counts.data[queue], (wp::int64)amount, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
+    """Raises the count of a queue by an amount below 32, and returns what it was: the first of the slots taken."""
+    ...
+
+
+@wp.func
+def write(pair: wp.vec2i, queue: wp.array[wp.vec2i], slot: wp.int64):
+    """Writes a pair to a slot of a queue, if there is room."""
+    if slot < wp.int64(queue.shape[0]):
+        queue[wp.int32(slot)] = pair
+
+
+@wp.func
+def append(pair: wp.vec2i, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int):
+    """Writes a pair to the end of a queue, if there is room."""
+    write(pair, queue, take_slot(counts, count))
+
+
+@wp.func
+def is_filled(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int) -> bool:
+    """Whether entry i of a queue has been written."""
+    return i < queue.shape[0] and wp.int64(i) < counts[count]

@@ -1,0 +1,50 @@
+"""Launches over the entries of a queue, of which only the device knows how many there are."""
+
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import warp as wp
+
+__all__ = ["launch_over", "launch_over_queue"]
+
+_SMALLEST_CHUNK = 1024
+
+
+@functools.cache
+def _pool():
+    """Threads for the CPU: Warp runs a kernel on one, but lets others run meanwhile."""
+    return ThreadPoolExecutor(os.cpu_count())
+
+
+def launch_over(kernel, count, *, inputs, outputs, device):
+    """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
+
+    The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``.
+    """
+    if device.is_cuda:
+        wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device)
+        return
+    threads = _pool()._max_workers
+    chunk = max(_SMALLEST_CHUNK, -(-count // (8 * threads)))
+
+    def launch(first):
+        dim = min(chunk, count - first)
+        wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device)
+
+    starts = range(0, count, chunk)
+    if threads == 1 or len(starts) < 2:
+        for first in starts:
+            launch(first)
+    else:
+        launch(0)  # compiles the kernel, once
+        list(_pool().map(launch, starts[1:]))
+
+
+def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs):
+    """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU, without asking."""
+    device = queue.device
+    entries = len(queue)
+    if device.is_cpu:
+        entries = min(entries, int(counts.numpy()[count]))
+    launch_over(kernel, entries, inputs=inputs, outputs=outputs, device=device)
