@@ -215,3 +215,153 @@ def test_bad_positions_are_refused():
         detector.find_intersections(bad)
     with pytest.raises(ValueError, match="method"):
         bsc.CollisionDetector(detector.mesh, method="fast")
+
+
+def crumpled(seed, n=24):
+    """A folded sheet whose upper half passes through the lower one: start and end positions, and faces."""
+    positions, faces = grid(n, np.float64)
+    offset = positions[:, 0] - positions[:, 0].mean()
+    upper = offset > 0.0
+    start = positions.copy()
+    start[:, 0] = -np.abs(offset)
+    start[:, 2] = np.where(upper, 0.002 + 0.1 * offset, 0.0)
+    end = start + 0.0005 * np.random.default_rng(seed).standard_normal(start.shape)
+    end[:, 2] -= np.where(upper, 0.2 * offset, 0.0)
+    return start.astype(np.float32), end.astype(np.float32), faces
+
+
+FIELDS = [
+    f"{kind}{field}" for kind in ("vertex_face", "edge_edge") for field in ("", "_toi", "_coordinates", "_normal")
+]
+
+
+def assert_same(collisions, others):
+    for field in FIELDS:
+        assert getattr(collisions, field).tobytes() == getattr(others, field).tobytes(), field
+
+
+def test_queues_with_room_for_one_entry_grow():
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    expected = bsc.CollisionDetector(mesh).detect(x0, x1)
+    assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
+    detector = bsc.CollisionDetector(mesh)
+    detector._face_pairs = wp.empty(1, dtype=wp.vec2i)
+    for narrow_phase in (detector._vertex_face, detector._edge_edge):
+        narrow_phase.candidates = wp.empty(1, dtype=wp.vec2i)
+        narrow_phase._reserve_survivors(1)
+        narrow_phase._reserve_contacts(1)
+    c = detector.detect(x0, x1)
+    assert_same(c, expected)
+    assert c.certified and not c.overflowed
+
+
+def test_every_pair_a_candidate():
+    """2,000 triangles through one point: a tree that separates nothing must still find all pairs."""
+    rng = np.random.default_rng(1)
+    x0 = rng.uniform(-1, 1, (3, 2000, 3))
+    x0[0] *= -1.0
+    x0 = np.concatenate([x0, -x0.sum(axis=0)[None]])[:3].transpose(1, 0, 2).reshape(-1, 3)
+    mesh = bsc.CollisionMesh(np.arange(6000).reshape(2000, 3), 6000)
+    c = bsc.CollisionDetector(mesh, method="float").detect(x0 - 10.0, x0 + 10.0)
+    assert c.stats.vertex_face.candidates == 6000 * 1999
+    assert c.stats.edge_edge.candidates == 6000 * 5997 // 2
+
+
+def test_results_that_someone_holds_outlive_the_next_detection():
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
+    held = [detector.detect(x0, x1), detector.detect(x0, x0), detector.detect(x0, x1)]
+    detector.find_intersections(x1)
+    assert len(held[1].edge_edge) == 0
+    assert_same(held[0], held[2])
+
+
+def test_detectors_side_by_side_do_not_disturb_one_another():
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    first, second = bsc.CollisionDetector(mesh), bsc.CollisionDetector(mesh)
+    a, b = first.detect(x0, x1), second.detect(x1, x0)
+    assert_same(a, bsc.CollisionDetector(mesh).detect(x0, x1))
+    assert_same(b, bsc.CollisionDetector(mesh).detect(x1, x0))
+
+
+needs_gpu = pytest.mark.skipif(not wp.is_cuda_available(), reason="CUDA graphs need a GPU")
+
+
+@pytest.fixture
+def captured():
+    """A captured detection: detector, its results, positions on the device, and a function that replays it."""
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
+    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
+    detector.detect(start, end)
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    return detector, c, start, end, lambda: wp.capture_launch(capture.graph)
+
+
+@needs_gpu
+def test_a_graph_finds_what_a_detection_finds(captured):
+    detector, c, start, end, replay = captured
+    on_cpu = bsc.CollisionDetector(bsc.CollisionMesh(detector.mesh.faces, detector.mesh.vertex_count, device="cpu"))
+    for seed in (0, 1, 2):
+        x0, x1, _ = crumpled(seed)
+        start.assign(x0)
+        end.assign(x1)
+        expected = on_cpu.detect(x0, x1)
+        for _ in range(34):
+            replay()
+            assert_same(c, expected)
+        assert c.certified and not c.overflowed
+
+
+@needs_gpu
+def test_a_graph_says_that_a_queue_was_too_small(captured):
+    detector, _, start, end, _ = captured
+    detector._edge_edge._reserve_contacts(1)
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    wp.capture_launch(capture.graph)
+    assert c.overflowed and not c.certified
+    assert detector.detect(start, end).certified  # grows
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    wp.capture_launch(capture.graph)
+    assert c.certified and not c.overflowed
+
+
+@needs_gpu
+def test_a_graph_says_that_a_position_is_not_finite(captured):
+    _, c, _, end, replay = captured
+    positions = end.numpy()
+    positions[7, 1] = np.nan
+    end.assign(positions)
+    replay()
+    assert not c.certified
+
+
+@needs_gpu
+def test_capturing_first_is_refused():
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
+    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
+    with pytest.raises(RuntimeError, match="detect once"), wp.ScopedCapture(device="cuda:0"):
+        detector.detect(start, end)
+
+
+@needs_gpu
+def test_two_detectors_on_two_streams(captured):
+    _, c, start, end, replay = captured
+    x0, _, faces = crumpled(3)
+    replay()
+    expected = c.vertex_face.tolist()
+    streams = [wp.Stream("cuda:0"), wp.Stream("cuda:0")]
+    detectors = [bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")) for _ in streams]
+    results = []
+    for detector, stream, positions in zip(detectors, streams, ((start, end), (end, start)), strict=True):
+        with wp.ScopedStream(stream):
+            results.append(detector.detect(*positions))
+    assert results[0].vertex_face.tolist() == expected
+    alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")).detect(end, start)
+    assert_same(results[1], alone)

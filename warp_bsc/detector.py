@@ -192,6 +192,7 @@ class CollisionDetector:
         self._run = 0
         self._last = lambda: None  # the last results, as long as someone holds them
         self._broad_phase = BroadPhase(mesh)
+        self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._counts = wp.zeros(_COUNTS, dtype=wp.int64, device=mesh.device)
         faces = len(mesh.faces)
         self._face_pairs = wp.empty(8 * faces, dtype=wp.vec2i, device=mesh.device)
@@ -226,13 +227,13 @@ class CollisionDetector:
             raise RuntimeError("detect once before capturing, so that kernels are loaded and queues are large enough")
         if capturing:
             self._run += 1
-            self._launch(x0, x1, lambda stage: None)
+            self._launch(x0, x1)
             return Collisions(self, True, dict)
         self._start_run()
         self._positions_detected = x0, x1
         while True:
             clock = _StageClock(self.mesh.device)
-            self._launch(x0, x1, clock.lap)
+            self._launch(x0, x1, clock)
             counts = self._counts.numpy()
             if counts[_NOT_FINITE]:
                 for name, x in (("x0", x0), ("x1", x1)):
@@ -306,8 +307,11 @@ class CollisionDetector:
             last._results()
         self._run += 1
 
-    def _launch(self, x0, x1, lap):
-        """Launches the whole pipeline, without asking the device anything."""
+    def _launch(self, x0, x1, clock=None):
+        """Launches the whole pipeline, without asking the device anything.
+
+        With a clock one stage runs after the other; without, in a CUDA graph, the two kinds of pair side by side.
+        """
         mesh, counts = self.mesh, self._counts
         counts.zero_()
         count_not_finite, _ = _kernels(x0.dtype)
@@ -316,12 +320,16 @@ class CollisionDetector:
         queues = [self._vertex_face.candidates, self._edge_edge.candidates]
         places = [_FACE_PAIRS, _VERTEX_FACE + Count.CANDIDATES, _EDGE_EDGE + Count.CANDIDATES]
         self._broad_phase.pair_elements(self._face_pairs, counts, *places, queues)
-        lap("broad phase")
-        for narrow_phase, elements in (
-            (self._vertex_face, mesh.device_faces),
-            (self._edge_edge, mesh.device_edges),
-        ):
-            narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance, lap=lap)
+        options = {"method": self.method, "tolerance": self.tolerance}
+        if clock:
+            clock.lap("broad phase")
+            self._vertex_face.run(x0, x1, mesh.device_faces, **options, lap=clock.lap)
+            self._edge_edge.run(x0, x1, mesh.device_edges, **options, lap=clock.lap)
+            return
+        with wp.ScopedStream(self._side_stream):
+            self._vertex_face.run(x0, x1, mesh.device_faces, **options)
+        self._edge_edge.run(x0, x1, mesh.device_edges, **options)
+        wp.wait_stream(self._side_stream)
 
     def _overflowed(self, counts):
         return bool(
