@@ -72,6 +72,15 @@ def between(kind: int, coordinates: wp.vec2d, u: wp.vec3d, v: wp.vec3d, w: wp.ve
 
 
 @wp.func
+def _to_unit_scale(x: wp.vec3d) -> wp.vec3d:
+    """A vector divided by its max-norm, so that squares do not underflow; zero stays zero."""
+    size = wp.max(wp.abs(x))
+    if size > _ZERO:
+        return x / size
+    return x
+
+
+@wp.func
 def contact_at(motion: Motion, time: wp.float64):
     """Where and in which direction the features touch at the time of a contact.
 
@@ -84,9 +93,13 @@ def contact_at(motion: Motion, time: wp.float64):
     v = (_ONE - time) * motion.v0 + time * motion.v1
     w = (_ONE - time) * motion.w0 + time * motion.w1
     closest = closest_coordinates(motion.kind, u, v, w)
-    velocity = between(motion.kind, closest, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
-    normal = wp.cross(u, v)
-    if wp.length_sq(normal) <= _FLAT * wp.length_sq(u) * wp.length_sq(v):
+    velocity = _to_unit_scale(
+        between(motion.kind, closest, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+    )
+    unit_u = _to_unit_scale(u)
+    unit_v = _to_unit_scale(v)
+    normal = wp.cross(unit_u, unit_v)
+    if wp.length_sq(normal) <= _FLAT * wp.length_sq(unit_u) * wp.length_sq(unit_v):
         normal = velocity
     if wp.length_sq(normal) == _ZERO:
         normal = wp.vec3d(_ZERO, _ZERO, _ONE)

@@ -7,6 +7,7 @@ import warp as wp
 from .signs import FREE, HIT, ROUNDOFF, UNDERFLOW, UNSURE, certified_sign
 
 _ERROR = wp.constant(wp.float64(9.0))
+_LONGEST = wp.constant(wp.float64(1.0e100))
 
 
 @wp.func
@@ -25,11 +26,13 @@ def _orientation(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d) -> int:
 
     Bound, with P the sum of the sizes of its six products: 3 roundings of the vectors, 2 of the products, 3 of the
     sums, 8r P to first order. Products of three lose less to underflow than the UNDERFLOW added as long as the
-    vectors are not longer than 1e100.
+    vectors are not longer than 1e100; of longer ones no sign is certain.
     """
     ax = wp.abs(x)
     ay = wp.abs(y)
     az = wp.abs(z)
+    if wp.max(wp.max(ax), wp.max(wp.max(ay), wp.max(az))) > _LONGEST:
+        return 0
     size = (
         ax[0] * (ay[1] * az[2] + ay[2] * az[1])
         + ax[1] * (ay[2] * az[0] + ay[0] * az[2])

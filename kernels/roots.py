@@ -85,7 +85,7 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
 
     Bounds: the cubic with the computed coefficients is within E of Y on [0, 1], so it suffices that its sign at its own
     extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of
-    A, 9E; of T, with E <= k: (9 + 8 + 9) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k. Of H at the
+    A, 10E; of T, with E <= k: (10 + 8 + 10) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k. Of H at the
     root of T, as in :func:`linear_signs`.
     """
     end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)

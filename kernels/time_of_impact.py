@@ -109,7 +109,8 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
     are therefore tried again stretched to the whole of it.
 
     Returns:
-        Status (FREE, HIT, UNSURE) and time, exact in double precision; 2 if FREE.
+        Status (FREE, HIT, UNSURE), time, exact in double precision, 2 if FREE, and the end of the interval that the
+        search ended at.
     """
     start = _ZERO
     width = _ONE
@@ -118,9 +119,9 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
     for _visit in range(MAX_VISITS):
         end = wp.where(stretched, wp.min(start + tolerance, _ONE), start + width)
         status = status_between(motion, y, start, end)
+        if status == HIT and (stretched or width <= tolerance):
+            return HIT, start, end
         if stretched:
-            if status == HIT:
-                return HIT, start
             stretched = False
         elif status == FREE:
             index += wp.int64(1)
@@ -128,17 +129,17 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
                 index /= wp.int64(2)
                 width += width
             if index == wp.int64(1) and width == _ONE:
-                return FREE, wp.float64(2.0)
+                return FREE, wp.float64(2.0), end
             start = wp.float64(index) * width
             continue
         elif width + width <= tolerance:
             stretched = True
             continue
         if width <= FINEST * tolerance:
-            return UNSURE, start
+            return UNSURE, start, end
         index *= wp.int64(2)
         width *= _HALF
-    return UNSURE, start
+    return UNSURE, start, start
 
 
 @wp.func
@@ -152,7 +153,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
         tolerance: Of the time of impact, as a share of the step.
     """
     result = Impact()
-    found, toi = first_contact(motion, y, tolerance)
+    found, toi, end = first_contact(motion, y, tolerance)
     if status == HIT and found == FREE:
         # cannot be, unless signs are those that floating point computes: then all that is known is that it starts at 0
         found = UNSURE
@@ -166,7 +167,6 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
     time = toi
     if found == HIT:
         # between the ends of so short an interval the cubic is all but linear
-        end = wp.min(toi + tolerance, _ONE)
         k = restrict_cubic(y.k, toi, end)
         time = mix(toi, end, k[0] / (k[0] - k[3]))
     coordinates, normal = contact_at(motion, time)

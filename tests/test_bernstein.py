@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+
 from warp_bsc.kernels import bernstein
 
 COUNT = 300
@@ -105,11 +106,12 @@ def batch():
 
 @pytest.fixture(scope="module")
 def rounded():
-    """Polynomials and intervals for which floating point has to round, of mixed sizes."""
+    """Polynomials, weights and intervals for which floating point has to round, of mixed sizes."""
     rng = np.random.default_rng(2)
     q, k = (rng.uniform(-1.0, 1.0, (COUNT, n)) * 10.0 ** rng.uniform(-8.0, 0.0, (COUNT, n)) for n in (3, 4))
+    weights = rng.uniform(0.0, 1.0, (COUNT, 2)) * 10.0 ** rng.uniform(-3.0, 0.0, (COUNT, 2))
     interval = np.sort(rng.uniform(0.0, 1.0, (COUNT, 2)) ** rng.choice([1, 8], (COUNT, 1)), axis=1)
-    return run(q, k, np.ones((COUNT, 2)), interval)
+    return run(q, k, weights, interval)
 
 
 def test_values_are_those_of_the_polynomials_times_a_power_of_the_weights(batch):
@@ -162,13 +164,26 @@ def test_rounding_of_an_interpolation_stays_within_three_roundoffs(rounded):
         assert abs(mixed - (1 - t) * k[0] - t * k[1]) <= 3 * ROUNDOFF * max(abs(k[0]), abs(k[1]))
 
 
+def blossom(coefficients, times):
+    """The polar form of a polynomial: its Bernstein coefficients on an interval, where the times are its ends."""
+    for t in times:
+        coefficients = [(1 - t) * x + t * y for x, y in itertools.pairwise(coefficients)]
+    return coefficients[0]
+
+
 def test_rounding_of_a_restriction_stays_within_three_roundoffs_a_degree(rounded):
-    """The blossom at the ends of the interval, expanded, is the exact coefficient."""
     for degree, wholes, parts in ((2, rounded.q, rounded.q_parts), (3, rounded.k, rounded.k_parts)):
         for whole, (*_, part), (start, end) in zip(wholes, parts, rounded.interval, strict=True):
             bound = 3 * degree * ROUNDOFF * max(map(abs, whole))
             for i, coefficient in enumerate(part):
-                blossom = whole
-                for t in [end] * i + [start] * (degree - i):
-                    blossom = [(1 - t) * x + t * y for x, y in itertools.pairwise(blossom)]
-                assert abs(coefficient - blossom[0]) <= bound
+                assert abs(coefficient - blossom(whole, [start] * (degree - i) + [end] * i)) <= bound
+
+
+def test_rounding_of_a_split_stays_within_ten_roundoffs(rounded):
+    for degree, wholes, parts in ((2, rounded.q, rounded.q_parts), (3, rounded.k, rounded.k_parts)):
+        for whole, (left, right, _), (a, b) in zip(wholes, parts, rounded.weights, strict=True):
+            t, scale = a / (a + b), (a + b) ** degree
+            bound = 10 * ROUNDOFF * scale * max(map(abs, whole))
+            for i in range(degree + 1):
+                assert abs(left[i] - scale * blossom(whole, [0] * (degree - i) + [t] * i)) <= bound
+                assert abs(right[i] - scale * blossom(whole, [t] * (degree - i) + [1] * i)) <= bound

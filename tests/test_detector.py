@@ -365,3 +365,30 @@ def test_two_detectors_on_two_streams(captured):
     assert results[0].vertex_face.tolist() == expected
     alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")).detect(end, start)
     assert_same(results[1], alone)
+
+
+def test_worlds_do_not_collide_with_one_another():
+    scenes = [crumpled(seed) for seed in range(3)]
+    faces = scenes[0][2]
+    n = len(scenes[0][0])
+    x0, x1 = (np.concatenate([scene[end] for scene in scenes]) for end in (0, 1))
+    mesh = bsc.CollisionMesh(np.concatenate([faces + n * i for i in range(3)]), 3 * n, world=np.repeat(np.arange(3), n))
+    c = bsc.CollisionDetector(mesh).detect(x0, x1)
+    for i, (start, end, _) in enumerate(scenes):
+        alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, n)).detect(start, end)
+        here = c.vertex_face[:, 0] // n == i
+        np.testing.assert_array_equal(c.vertex_face[here] - [n * i, len(faces) * i], alone.vertex_face)
+        np.testing.assert_array_equal(c.vertex_face_toi[here], alone.vertex_face_toi)
+        edges = len(mesh.edges) // 3
+        here = c.edge_edge[:, 0] // edges == i
+        np.testing.assert_array_equal(c.edge_edge[here] - edges * i, alone.edge_edge)
+
+
+def test_bad_worlds_are_refused():
+    for world, message in [
+        ([0, 0, 1], r"face 0 has vertices in worlds \[0, 0, 1\]"),
+        ([0, 0], "3 integers"),
+        ([0, -1, 0], "vertex 1"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            bsc.CollisionMesh([[0, 1, 2]], 3, world=world)

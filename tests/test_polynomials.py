@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS, integer_lattice, uniform
+
 from warp_bsc.kernels import ccd, polynomials, signs
 
 KINDS = ("vertex_face", "edge_edge")
@@ -297,7 +298,7 @@ def paper_tests(kind, points):
     """The paper's n, k and its three inside tests of one query, each with the test of ours that takes its place.
 
     Its edge-edge tests (supplement 3) leave n open. With n = u x v they are our n - s, s and n - r up to signs, and
-    the fourth, r >= 0, is missing; with the normal of a b c they suffice unless r = 0.
+    the fourth, r >= 0, is missing, so it comes last here; with the normal of a b c they suffice unless r = 0.
 
     Returns:
         (n, k, [(m, sign, index), ...]): m is parallel to sign times our test of that index.
@@ -325,7 +326,8 @@ def paper_tests(kind, points):
     return (
         n,
         paper_cubic(*difference(c, a), n),
-        [(product(difference(i, d), difference(j, d)), sign, index) for i, j, sign, index in corners],
+        [(product(difference(i, d), difference(j, d)), sign, index) for i, j, sign, index in corners]
+        + [(product(difference(a, c), difference(b, c)), -1, 2)],
     )
 
 

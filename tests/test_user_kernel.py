@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS
-from warp_bsc.kernels import ccd_edge_edge, ccd_vertex_face, impact_vertex_face
 
 from warp_bsc import query_edge_edge, query_vertex_face
+from warp_bsc.kernels import ccd_edge_edge, ccd_vertex_face, impact_vertex_face
 
 
 @wp.kernel

@@ -23,13 +23,17 @@ def _pair_faces(
     bvh: wp.uint64,
     lowers: wp.array[wp.vec3],
     uppers: wp.array[wp.vec3],
+    worlds: wp.array[int],
     counts: wp.array[wp.int64],
     count: int,
     pairs: wp.array[wp.vec2i],
 ):
     """Slots are taken by the chunk, because one atomic for each pair takes longer than the traversal."""
     face = first + wp.tid()
-    query = wp.bvh_query_aabb(bvh, lowers[face], uppers[face])
+    root = int(-1)
+    if worlds:
+        root = wp.bvh_get_group_root(bvh, worlds[face])
+    query = wp.bvh_query_aabb(bvh, lowers[face], uppers[face], root)
     other = int(0)
     slot = wp.int64(0)
     end = wp.int64(0)
@@ -265,6 +269,7 @@ class BroadPhase:
         self._mesh.edge_lowers, self._mesh.edge_uppers = boxes[2:4]
         self._mesh.face_lowers, self._mesh.face_uppers = boxes[4:6]
         self._boxes = boxes
+        self._worlds = mesh.device_world
         self._bvh = None
 
     def pair_faces(self, x0, x1, counts, count, pairs):
@@ -276,10 +281,10 @@ class BroadPhase:
             inputs = [x0, x1, elements]
             launch_over(_swept_boxes(x0.dtype), len(elements), inputs=inputs, outputs=boxes, device=self._device)
         if self._bvh is None:
-            self._bvh = wp.Bvh(*self._boxes[4:])
+            self._bvh = wp.Bvh(*self._boxes[4:], groups=self._worlds)
         else:
             self._bvh.rebuild()
-        inputs = [self._bvh.id, *self._boxes[4:], counts, count]
+        inputs = [self._bvh.id, *self._boxes[4:], self._worlds, counts, count]
         launch_over(_pair_faces, len(faces), inputs=inputs, outputs=[pairs], device=self._device)
 
     def pair_elements(self, face_pairs, counts, face_pair_count, vertex_face_count, edge_edge_count, queues):

@@ -20,16 +20,19 @@ class CollisionMesh:
         device: Warp device of the arrays that the detector uses.
     """
 
-    def __init__(self, faces, vertex_count, *, device=None):
+    def __init__(self, faces, vertex_count, *, world=None, device=None):
         """Finds the edges and puts the mesh on a device.
 
         Args:
             faces: Vertex indices, integers, shape [face_count, 3], NumPy or Warp array.
             vertex_count: Number of positions.
+            world: The world of each vertex, integers from 0 on, shape [vertex_count]: what is in
+                different worlds does not collide. Default: all are in one.
             device: Warp device; default: Warp's default.
 
         Raises:
-            ValueError: If the faces have another shape or type, or an index is not in [0, vertex_count).
+            ValueError: If the faces have another shape or type, an index is not in [0, vertex_count), or the worlds
+                have another shape or type, are negative, or differ within a face.
         """
         faces = faces.numpy() if isinstance(faces, wp.array) else np.asarray(faces)
         if faces.size == 0:
@@ -66,3 +69,21 @@ class CollisionMesh:
         self.device_vertices = wp.array(np.arange(vertex_count).reshape(-1, 1), dtype=int, device=self.device)
         self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
         self.device_owned = wp.array(owned, dtype=int, device=self.device)
+        self.device_world = None
+        if world is not None:
+            self.device_world = wp.array(self._face_worlds(world), dtype=int, device=self.device)
+
+    def _face_worlds(self, world):
+        """The world of each face, int32, shape [face_count]."""
+        world = world.numpy() if isinstance(world, wp.array) else np.asarray(world)
+        if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):
+            raise ValueError(
+                f"world must be {self.vertex_count} integers, one a vertex, got {world.dtype} {world.shape}"
+            )
+        if (world < 0).any():
+            raise ValueError(f"vertex {np.argmax(world < 0)} is in world {world[np.argmax(world < 0)]}; the first is 0")
+        worlds = world[self.faces]
+        mixed = np.flatnonzero((worlds != worlds[:, :1]).any(axis=1))
+        if len(mixed):
+            raise ValueError(f"face {mixed[0]} has vertices in worlds {worlds[mixed[0]].tolist()}")
+        return worlds[:, 0].astype(np.int32)

@@ -1,0 +1,202 @@
+"""Benchmarks: what is measured is what the detector finds, and the scenes are what they say."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from warp_bsc import CollisionDetector, CollisionMesh, bench
+from warp_bsc.bench import BenchmarkScene, benchmark_detector, limited_threads, load_scene
+from warp_bsc.cli import main
+
+FACES = np.array([[0, 1, 2], [3, 4, 5]])
+FLOOR = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
+ABOVE = np.array([*FLOOR, (1, 1, 1), (2, 1, 2), (1, 2, 2)], dtype=float)
+BELOW = ABOVE - np.repeat([[0, 0, 0], [0, 0, 4]], 3, axis=0)
+
+
+def write_mesh(path, points=ABOVE, faces=FACES):
+    trimesh.Trimesh(points, faces, process=False).export(path)
+    return path
+
+
+def measure(capsys, *arguments):
+    status = main(["bench", "detector", *map(str, arguments), "--device", "cpu", "--repeat", "2"])
+    output = capsys.readouterr()
+    assert status == 0, output.err
+    return output.out
+
+
+def fail(capsys, *arguments):
+    assert main(["bench", *map(str, arguments)]) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    (line,) = output.err.splitlines()
+    assert line.startswith("warp-bsc: error: ")
+    return line
+
+
+@pytest.mark.parametrize("method", ["float", "conservative", "exact"])
+def test_measures_what_the_detector_finds(capsys, method):
+    found = json.loads(measure(capsys, "cloth:2000", "--json", "--method", method))
+    (measured,) = found["scenes"]
+    scene = load_scene("cloth:2000")
+    mesh = CollisionMesh(scene.faces, len(scene.x0), device="cpu")
+    collisions = CollisionDetector(mesh, method=method).detect(scene.x0, scene.x1)
+    for kind in ("vertex_face", "edge_edge"):
+        assert measured[kind] == vars(getattr(collisions.stats, kind))
+    assert measured["candidates"] == sum(measured[kind]["candidates"] for kind in ("vertex_face", "edge_edge"))
+    assert measured["hits"] == len(collisions.vertex_face) + len(collisions.edge_edge)
+    assert measured["earliest_toi"] == collisions.earliest_toi
+    assert measured["certified"] == (method != "float")
+    assert (measured["triangles"], measured["vertices"]) == (len(scene.faces), len(scene.x0))
+    assert measured["precision"] == 32
+    assert (found["method"], found["device"], found["repeat"]) == (method, "cpu", 2)
+
+
+def test_times_are_consistent(capsys):
+    (measured,) = json.loads(measure(capsys, "cloth:2000", "--json"))["scenes"]
+    took = measured["milliseconds"]
+    assert 0 < took["detect"] <= took["detect_and_read"]
+    assert took["cuda_graph"] is None
+    assert list(took["stages"]) == ["broad phase", "cull", "classify", "time of impact", "sort", "exact"]
+    assert measured["candidates_per_second"] == pytest.approx(1e3 * measured["candidates"] / took["detect"])
+
+
+def test_on_the_default_device(device):
+    """With a GPU, also the CUDA graph, which must find the same."""
+    measured = benchmark_detector(load_scene("cloth:2000"), repeat=1)
+    assert (measured.graph_milliseconds is None) == device.is_cpu
+    assert measured.hits > 0
+
+
+def test_tables_fit_a_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    pytest.importorskip("ipctk")
+    lines = measure(capsys, "cloth:2000", "crash:2000", "--compare").splitlines()
+    assert max(map(len, lines)) <= 80
+    assert sum(line.startswith("cloth:2000") for line in lines) == 4
+    assert sum(line.startswith("crash:2000") for line in lines) == 4
+    assert lines[0].startswith("Method conservative on cpu, ")
+
+
+@pytest.mark.parametrize("name", ["cloth:2000", "crash:2000"])
+def test_agrees_with_the_ipc_toolkit(name):
+    pytest.importorskip("ipctk")
+    measured = benchmark_detector(load_scene(name), device="cpu", repeat=1, compare=True)
+    other = measured.ipc_toolkit
+    assert other.vertex_face_candidates == measured.vertex_face.candidates
+    assert other.edge_edge_candidates == measured.edge_edge.candidates
+    assert other.step_size == pytest.approx(measured.earliest_toi, abs=0.05)
+
+
+def test_comparison_needs_the_ipc_toolkit(capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert "warp-bsc[bench]" in fail(capsys, "detector", "cloth:1000", "--compare")
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+def test_pair_of_meshes(capsys, tmp_path, suffix):
+    first, second = write_mesh(tmp_path / f"a.{suffix}"), write_mesh(tmp_path / f"b.{suffix}", BELOW)
+    (measured,) = json.loads(measure(capsys, f"{first},{second}", "--json"))["scenes"]
+    assert (measured["triangles"], measured["vertices"], measured["hits"]) == (2, 6, 3)
+    assert measured["earliest_toi"] == pytest.approx(0.25, abs=2**-19)
+
+
+def test_pair_keeps_its_precision(tmp_path):
+    first, second = write_mesh(tmp_path / "a.obj"), write_mesh(tmp_path / "b.obj", BELOW)
+    assert load_scene(f"{first},{second}").x0.dtype == np.float32
+    second.write_text(second.read_text().replace("v 4.0", "v 4.1", 1))
+    scene = load_scene(f"{first},{second}")
+    assert scene.x0.dtype == scene.x1.dtype == np.float64
+    assert scene.x1[1, 0] == 4.1
+
+
+def test_usd_scene(capsys, request):
+    path = request.config.rootpath / "assets" / "cloth_twist.usd"
+    found = json.loads(measure(capsys, path, "--interval", 4, "--method", "exact", "--json"))
+    assert found["scenes"][0]["hits"] == 7
+    assert "no interval 14, they go from 0 to 13" in fail(capsys, "detector", path, "--interval", 14)
+
+
+def test_pairs_that_do_not_fit(capsys, tmp_path):
+    first = write_mesh(tmp_path / "a.ply")
+    fewer = write_mesh(tmp_path / "fewer.ply", ABOVE[:3], FACES[:1])
+    turned = write_mesh(tmp_path / "turned.ply", BELOW, FACES[::-1])
+    broken = tmp_path / "broken.ply"
+    broken.write_text("hello")
+    points = tmp_path / "points.ply"
+    trimesh.PointCloud(ABOVE).export(points)
+    assert "the first has 6 vertices, the second 3" in fail(capsys, "detector", f"{first},{fewer}")
+    assert "different faces" in fail(capsys, "detector", f"{first},{turned}")
+    assert "broken.ply: not a readable" in fail(capsys, "detector", f"{first},{broken}")
+    assert "points.ply: " in fail(capsys, "detector", f"{first},{points}")
+    assert "gone.ply: no such file" in fail(capsys, "detector", f"{first},gone.ply")
+    assert "got 3" in fail(capsys, "detector", f"{first},{first},{first}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        ([], "BENCHMARK"),
+        (["juggler"], "juggler"),
+        (["detector", "gone.usd"], "gone.usd: no such file"),
+        (["detector", "flood:5000"], "flood:5000: there is no generator flood, only cloth, crash"),
+        (["detector", "cloth:many"], "'many'"),
+        (["detector", "cloth:3"], "[1000, 20000000], not '3'"),
+        (["detector", "cloth:1000", "--repeat", "0"], "--repeat: must be at least 1"),
+        (["detector", "cloth:1000", "--threads", "100000"], "threads must be in [1, "),
+        (["detector", "cloth:1000", "--device", "cuda:99"], "--device cuda:99"),
+    ],
+)
+def test_wrong_use(capsys, arguments, part):
+    assert part in fail(capsys, *arguments)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot limit threads")
+def test_threads(capsys):
+    before = os.sched_getaffinity(0)
+    with limited_threads(1):
+        assert bench.count_threads() == 1
+    assert os.sched_getaffinity(0) == before
+    assert json.loads(measure(capsys, "cloth:1000", "--threads", 1, "--json"))["threads"] == 1
+    assert os.sched_getaffinity(0) == before
+
+
+@pytest.mark.parametrize("generator", bench.GENERATORS)
+@pytest.mark.parametrize("triangles", [1000, 3333, 20000])
+def test_generated_scenes(generator, triangles):
+    scene = load_scene(f"{generator}:{triangles}")
+    assert abs(len(scene.faces) - triangles) <= 0.01 * triangles
+    assert scene.faces.dtype == np.int32
+    assert scene.x0.dtype == scene.x1.dtype == np.float32
+    assert np.array_equal(np.unique(scene.faces), np.arange(len(scene.x0)))
+    again = load_scene(scene.name)
+    for name in ("faces", "x0", "x1"):
+        assert np.array_equal(getattr(scene, name), getattr(again, name))
+    mesh = CollisionMesh(scene.faces, len(scene.x0), device="cpu")
+    detector = CollisionDetector(mesh)
+    collisions = detector.detect(scene.x0, scene.x1)
+    assert 0 < len(collisions.vertex_face) + len(collisions.edge_edge) < triangles
+    assert collisions.earliest_toi > 0
+    stats = collisions.stats
+    assert 1.0 < (stats.vertex_face.candidates + stats.edge_edge.candidates) / triangles < 100.0
+    assert len(detector.find_intersections(scene.x0)) == 0
+
+
+def test_default_scenes():
+    for name in bench.default_scenes():
+        assert isinstance(load_scene(name), BenchmarkScene)
+
+
+@pytest.mark.parametrize("command", [["bench"], ["bench", "detector"]])
+def test_help_has_examples(capsys, command):
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--help"])
+    assert end.value.code == 0
+    output = capsys.readouterr().out
+    assert f"  warp-bsc {' '.join(command)}" in output.partition("examples:")[2]
+    assert "exit status:" in output
+    assert max(map(len, output.splitlines())) <= 80
