@@ -115,9 +115,10 @@ def _kernels(kind, dtype):
         pair = candidates[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        if motion.finite and boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+        # comparisons in the type of the positions, which the caller has seen to be finite
+        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
+        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         if direction_separates(motion, centroid_direction(motion)):
             return
         y = coplanarity(motion)
