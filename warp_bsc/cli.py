@@ -1,6 +1,7 @@
 """The command line, ``warp-bsc``."""
 
 import argparse
+import importlib.util
 import json
 import os
 import sys
@@ -14,13 +15,22 @@ from rich.console import Console
 from rich.progress import track
 
 from . import __version__
+from .bench import benchmark_detector, count_threads, default_scenes, limited_threads, load_scene
 from .detector import CollisionDetector
 from .mesh import CollisionMesh
 from .narrow_phase import METHODS
 from .query import query_edge_edge, query_vertex_face
 from .query_file import KINDS, find_query_files, read_query_file
 from .replay import replay
-from .report import QueryAnswers, print_queries, print_replay, queries_to_dict, replay_to_dict
+from .report import (
+    QueryAnswers,
+    detector_benchmarks_to_dict,
+    print_detector_benchmarks,
+    print_queries,
+    print_replay,
+    queries_to_dict,
+    replay_to_dict,
+)
 from .scene import Scene
 
 __all__ = ["main"]
@@ -35,6 +45,7 @@ _EXAMPLES = f"""\
 examples:
   warp-bsc replay cloth.usd
   warp-bsc query 227vf.csv 227ee.csv
+  warp-bsc bench detector
   warp-bsc replay --help
 
 {_EXIT_STATUS}"""
@@ -72,6 +83,37 @@ examples:
   warp-bsc query pairs.csv --kind edge-edge --json > answers.json
 
 {_EXIT_STATUS}"""
+
+_BENCH_EXIT_STATUS = """\
+exit status:
+  0  done
+  2  wrong use or bad input; a line on standard error says what and where"""
+
+_BENCH = "Measure how long things take."
+
+_BENCH_EXAMPLES = f"""\
+examples:
+  warp-bsc bench detector
+  warp-bsc bench detector --help
+
+{_BENCH_EXIT_STATUS}"""
+
+_BENCH_DETECTOR = """\
+Measure the detector, from positions on the device to the results there and on
+the host. A scene is a USD file, of which one interval is measured; two meshes
+joined by a comma; or generated: cloth:TRIANGLES, a wrinkled sheet that folds
+onto itself, or crash:TRIANGLES, a thin tube that is crushed. Default: the scene
+of the checkout, if this is one, cloth:5000 and cloth:50000."""
+
+_BENCH_DETECTOR_EXAMPLES = f"""\
+examples:
+  warp-bsc bench detector
+  warp-bsc bench detector cloth.usd --interval 3
+  warp-bsc bench detector first.ply,second.ply crash:1100000 --device cuda:0
+  warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
+  warp-bsc bench detector --json > times.json
+
+{_BENCH_EXIT_STATUS}"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -111,38 +153,83 @@ def _build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"warp-bsc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def add_command(name, run, summary, description, examples):
-        command = commands.add_parser(
-            name,
-            help=summary,
-            description=description,
-            epilog=examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.set_defaults(run=run)
-        command.add_argument(
-            "--method",
-            choices=METHODS,
-            default="exact",
-            help="float: the signs as floating point computes them; conservative: what it cannot certify counts as a "
-            "collision; exact: the true answer (default)",
-        )
-        command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
-        command.add_argument("--json", action="store_true", help="print JSON only, with everything found")
-        command.add_argument("--fail-on-collision", action="store_true", help="exit with status 1 if anything collides")
-        return command
-
-    command = add_command("replay", _run_replay, "find the collisions in a USD scene", _REPLAY, _REPLAY_EXAMPLES)
+    command = _add_command(
+        commands, "replay", _run_replay, "find the collisions in a USD scene", _REPLAY, _REPLAY_EXAMPLES
+    )
     command.add_argument("scene", metavar="SCENE", help="a .usd, .usda, .usdc or .usdz file")
+    _add_detection_options(command, method="exact")
+    _add_fail_on_collision(command)
 
-    command = add_command("query", _run_query, "answer queries of CSV files", _QUERY, _QUERY_EXAMPLES)
+    command = _add_command(commands, "query", _run_query, "answer queries of CSV files", _QUERY, _QUERY_EXAMPLES)
     command.add_argument("paths", metavar="FILE", nargs="+", help="a CSV file, or a folder for all that are in it")
     command.add_argument(
         "--kind",
         choices=KINDS,
         help="what the queries are (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
     )
+    _add_detection_options(command, method="exact")
+    _add_fail_on_collision(command)
+
+    command = _add_command(commands, "bench", None, "measure how long things take", _BENCH, _BENCH_EXAMPLES)
+    benchmarks = command.add_subparsers(required=True, metavar="BENCHMARK")
+    command = _add_command(
+        benchmarks,
+        "detector",
+        _run_bench_detector,
+        "measure the detector",
+        _BENCH_DETECTOR,
+        _BENCH_DETECTOR_EXAMPLES,
+    )
+    command.add_argument("scenes", metavar="SCENE", nargs="*", help="what to measure")
+    command.add_argument("--interval", type=int, default=0, metavar="N", help="of a USD file, from 0 (default: 0)")
+    command.add_argument(
+        "--repeat", type=_positive, default=5, metavar="N", help="repetitions to take the median of (default: 5)"
+    )
+    command.add_argument(
+        "--threads", type=_positive, metavar="N", help="CPU cores to use, on Linux (default: all; those of a GPU aside)"
+    )
+    command.add_argument(
+        "--compare",
+        action="store_true",
+        help="measure the IPC Toolkit's candidates and collision-free step size too, on the CPU; needs ipctk",
+    )
+    _add_detection_options(command, method="conservative")
     return parser
+
+
+def _add_command(commands, name, run, summary, description, examples):
+    command = commands.add_parser(
+        name,
+        help=summary,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(run=run)
+    return command
+
+
+def _add_detection_options(command, *, method):
+    command.add_argument(
+        "--method",
+        choices=METHODS,
+        default=method,
+        help="float: the signs as floating point computes them; conservative: what it cannot certify counts as a "
+        "collision; exact: the true answer (default: %(default)s)",
+    )
+    command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+    command.add_argument("--json", action="store_true", help="print JSON only, with everything found")
+
+
+def _add_fail_on_collision(command):
+    command.add_argument("--fail-on-collision", action="store_true", help="exit with status 1 if anything collides")
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
+    return number
 
 
 def _run_replay(arguments) -> int:
@@ -150,9 +237,7 @@ def _run_replay(arguments) -> int:
     device = _find_device(arguments.device)
     console, progress = Console(), Console(stderr=True)
     with _loading_kernels(progress, device):
-        triangles = CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
-        points = np.zeros((6, 3), scene.dtype)
-        CollisionDetector(triangles, method=arguments.method).detect(points, points)
+        _load_detector(arguments.method, scene.dtype, device)
     intervals = list(
         track(
             replay(scene, method=arguments.method, device=device),
@@ -189,6 +274,43 @@ def _run_query(arguments) -> int:
     else:
         print_queries(console, answers, method=arguments.method, device=str(device))
     return 1 if arguments.fail_on_collision and any(answer.hits for answer in answers) else 0
+
+
+def _run_bench_detector(arguments) -> int:
+    if arguments.compare and importlib.util.find_spec("ipctk") is None:
+        raise ValueError("--compare needs the IPC Toolkit: pip install 'warp-bsc[bench]'")
+    scenes = [load_scene(name, interval=arguments.interval) for name in arguments.scenes or default_scenes()]
+    device = _find_device(arguments.device)
+    console, progress = Console(), Console(stderr=True)
+    options = {"method": arguments.method, "device": device, "repeat": arguments.repeat, "compare": arguments.compare}
+    with limited_threads(arguments.threads):
+        with _loading_kernels(progress, device):
+            for dtype in {scene.x0.dtype for scene in scenes}:
+                _load_detector(arguments.method, dtype, device)
+        benchmarks = [
+            benchmark_detector(scene, **options)
+            for scene in track(
+                scenes, description="Measuring", console=progress, transient=True, disable=not progress.is_terminal
+            )
+        ]
+        settings = {
+            "method": arguments.method,
+            "device": device,
+            "threads": count_threads(),
+            "repeat": arguments.repeat,
+        }
+    if arguments.json:
+        print(json.dumps(detector_benchmarks_to_dict(benchmarks, **settings)))
+    else:
+        print_detector_benchmarks(console, benchmarks, **settings)
+    return 0
+
+
+def _load_detector(method, dtype, device):
+    """Load the detector's kernels, and compile them if need be."""
+    triangles = CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+    points = np.zeros((6, 3), dtype)
+    CollisionDetector(triangles, method=method).detect(points, points)
 
 
 def _find_device(name: str | None):

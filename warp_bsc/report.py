@@ -1,4 +1,4 @@
-"""Shows what a replay, or the queries of a file, found: tables for people, plain data for programs."""
+"""Shows what a replay, the queries of a file or a benchmark found: tables for people, plain data for programs."""
 
 import os
 from collections import Counter
@@ -8,12 +8,21 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from .bench import DetectorBenchmark
 from .query import QueryResult
 from .query_file import QueryFile
 from .replay import Interval
 from .scene import Scene
 
-__all__ = ["QueryAnswers", "print_queries", "print_replay", "queries_to_dict", "replay_to_dict"]
+__all__ = [
+    "QueryAnswers",
+    "detector_benchmarks_to_dict",
+    "print_detector_benchmarks",
+    "print_queries",
+    "print_replay",
+    "queries_to_dict",
+    "replay_to_dict",
+]
 
 _LONGEST = 30  # rows in a table, or lines in a list
 _STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
@@ -215,6 +224,140 @@ def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) ->
     }
 
 
+def print_detector_benchmarks(
+    console: Console, benchmarks: list[DetectorBenchmark], *, method: str, device, threads: int, repeat: int
+) -> None:
+    """Print what the detector found and what it took, scene by scene.
+
+    Args:
+        console: Where to.
+        benchmarks: The measurements of each scene.
+        method: The method that was used.
+        device: The Warp device that was used.
+        threads: How many CPU cores were used.
+        repeat: How many repetitions the medians are of.
+    """
+    cores = _count(threads, "core") if device.is_cpu else device.name
+    _say(console, f"Method {method} on {device}, {cores}; medians of {_count(repeat, 'repetition')}")
+    names = _shorten([benchmark.scene.name for benchmark in benchmarks])
+    rows = list(zip(names, benchmarks, strict=True))
+
+    table = _table(
+        "Scene",
+        "Triangles",
+        "Candidates",
+        "Survivors",
+        "Hits",
+        "Unsure",
+        caption="Hits: pairs that the method reports.",
+    )
+    for name, found in rows:
+        numbers = [len(found.scene.faces), found.candidates, found.survivors, found.hits, found.unsure]
+        table.add_row(name, *(f"{number:,}" for number in numbers))
+    console.print(table)
+    console.print()
+
+    table = _table(
+        "Milliseconds",
+        "Detect",
+        "Detect\nand read",
+        "CUDA\ngraph",
+        "Million\npairs/s",
+        "Memory\n[MiB]",
+        caption="From positions on the device to results there, or read on the host.",
+    )
+    for name, took in rows:
+        table.add_row(
+            name,
+            f"{took.detect_milliseconds:,.2f}",
+            f"{took.read_milliseconds:,.2f}",
+            "" if took.graph_milliseconds is None else f"{took.graph_milliseconds:,.2f}",
+            f"{took.candidates_per_second / 1e6:,.1f}",
+            "" if took.memory is None else f"{took.memory / 2**20:,.1f}",
+        )
+    console.print(table)
+    console.print()
+
+    stages = benchmarks[0].stage_milliseconds
+    table = _table("Milliseconds by stage", *("\n".join(stage.rsplit(" ", 1)) for stage in stages))
+    for name, took in rows:
+        table.add_row(name, *(f"{milliseconds:,.2f}" for milliseconds in took.stage_milliseconds.values()))
+    console.print(table)
+
+    compared = [(name, took, took.ipc_toolkit) for name, took in rows if took.ipc_toolkit]
+    if compared:
+        console.print()
+        *_, other = compared[0]
+        table = _table(
+            f"IPC Toolkit {other.version}",
+            "Candidates",
+            "Build",
+            "Step\nsize",
+            "Sum",
+            "Detect",
+            "Ratio",
+            caption=f"Milliseconds on {_count(other.threads, 'core')}, for the earliest time of impact only.",
+        )
+        for name, took, other in compared:
+            table.add_row(
+                name,
+                f"{other.vertex_face_candidates + other.edge_edge_candidates:,}",
+                *(
+                    f"{milliseconds:,.1f}"
+                    for milliseconds in (
+                        other.build_milliseconds,
+                        other.step_milliseconds,
+                        other.milliseconds,
+                        took.detect_milliseconds,
+                    )
+                ),
+                f"{other.milliseconds / took.detect_milliseconds:,.1f}",
+            )
+        console.print(table)
+    if not all(benchmark.certified for benchmark in benchmarks):
+        _say(console, "Not certified, collisions may be missing.")
+
+
+def detector_benchmarks_to_dict(
+    benchmarks: list[DetectorBenchmark], *, method: str, device, threads: int, repeat: int
+) -> dict:
+    """Every measurement, to be written as JSON. Arguments as of :func:`print_detector_benchmarks`."""
+    return {
+        "benchmark": "detector",
+        "method": method,
+        "device": str(device),
+        "device_name": device.name,
+        "threads": threads,
+        "repeat": repeat,
+        "scenes": [
+            {
+                "scene": found.scene.name,
+                "precision": found.precision,
+                "triangles": len(found.scene.faces),
+                "vertices": len(found.scene.x0),
+                "candidates": found.candidates,
+                "survivors": found.survivors,
+                "hits": found.hits,
+                "unsure": found.unsure,
+                "vertex_face": asdict(found.vertex_face),
+                "edge_edge": asdict(found.edge_edge),
+                "earliest_toi": found.earliest_toi if found.hits else None,
+                "certified": found.certified,
+                "milliseconds": {
+                    "detect": found.detect_milliseconds,
+                    "detect_and_read": found.read_milliseconds,
+                    "cuda_graph": found.graph_milliseconds,
+                    "stages": found.stage_milliseconds,
+                },
+                "candidates_per_second": found.candidates_per_second,
+                "memory_bytes": found.memory,
+                "ipc_toolkit": asdict(found.ipc_toolkit) if found.ipc_toolkit else None,
+            }
+            for found in benchmarks
+        ],
+    }
+
+
 def _say(console: Console, line: str):
     console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
@@ -239,6 +382,11 @@ def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int |
     if len(rows) > 1:
         table.add_section()
         table.add_row("all", *format_all(map(sum, zip(*(numbers for _, numbers in rows), strict=True))))
+
+
+def _shorten(scenes: list[str]) -> list[str]:
+    """Names of scenes without their folders."""
+    return [",".join(os.path.basename(path) for path in scene.split(",")) for scene in scenes]
 
 
 def _count(number: int, one: str, many: str = "") -> str:
