@@ -325,6 +325,9 @@ def test_a_graph_says_that_a_queue_was_too_small(captured):
     wp.capture_launch(capture.graph)
     assert c.overflowed and not c.certified
     assert detector.detect(start, end).certified  # grows
+    wp.capture_launch(capture.graph)  # writes to the queues that it was captured with
+    with pytest.raises(RuntimeError, match="capture again"):
+        c.certified  # noqa: B018
     with wp.ScopedCapture(device="cuda:0") as capture:
         c = detector.detect(start, end)
     wp.capture_launch(capture.graph)

@@ -137,23 +137,25 @@ class Collisions:
         stats: Counts and times of every stage.
     """
 
-    def __init__(self, detector, captured, milliseconds):
+    def __init__(self, detector, clock):
         self._detector = detector
-        self._captured = captured
-        self._milliseconds = milliseconds
+        self._clock = clock  # None in a CUDA graph
         self._run = detector._run
+        self._growth = detector._growth
         self._read = None
 
     def _results(self):
         """The results by name, from the device if need be."""
         if self._read is not None:
             return self._read
+        if self._clock is None:
+            if self._growth != self._detector._growth:
+                raise RuntimeError("the detector's queues have grown since this detection was captured: capture again")
+            return self._detector._read(None)
         if self._run != self._detector._run:
             raise RuntimeError("these collisions were not read before another detection was captured, and are gone")
-        results = self._detector._read(self._milliseconds)
-        if not self._captured:
-            self._read = results
-        return results
+        self._read = self._detector._read(self._clock)
+        return self._read
 
     def __getattr__(self, name):
         """Reads the results from the device."""
@@ -190,6 +192,9 @@ class CollisionDetector:
         self.method = method
         self.tolerance = tolerance
         self._run = 0
+        self._growth = 0
+        self._captured = False
+        self._retired = []  # queues that a CUDA graph may still write to
         self._last = lambda: None  # the last results, as long as someone holds them
         self._broad_phase = BroadPhase(mesh)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
@@ -227,8 +232,9 @@ class CollisionDetector:
             raise RuntimeError("detect once before capturing, so that kernels are loaded and queues are large enough")
         if capturing:
             self._run += 1
+            self._captured = True
             self._launch(x0, x1)
-            return Collisions(self, True, dict)
+            return Collisions(self, None)
         self._start_run()
         self._positions_detected = x0, x1
         while True:
@@ -241,7 +247,7 @@ class CollisionDetector:
             if not self._overflowed(counts):
                 break
             self._grow(counts)
-        collisions = Collisions(self, False, clock.read)
+        collisions = Collisions(self, clock)
         self._last = weakref.ref(collisions)
         return collisions
 
@@ -339,21 +345,23 @@ class CollisionDetector:
         )
 
     def _grow(self, counts):
+        self._growth += 1
+        if self._captured:
+            self._retired += [self._face_pairs, *self._vertex_face.queues, *self._edge_edge.queues]
         if counts[_FACE_PAIRS] > len(self._face_pairs):
             self._face_pairs = wp.empty(roomy(counts[_FACE_PAIRS]), dtype=wp.vec2i, device=self.mesh.device)
         self._vertex_face.grow(counts[_VERTEX_FACE:_EDGE_EDGE])
         self._edge_edge.grow(counts[_EDGE_EDGE:_COUNTS])
 
-    def _read(self, read_milliseconds):
-        """The results of the last detection, by the names of the attributes of Collisions."""
+    def _read(self, clock):
+        """The results of the last detection, by the names of the attributes of Collisions; no clock in a CUDA graph."""
         counts = self._counts.numpy()
         overflowed = self._overflowed(counts)
         results = {
             "overflowed": overflowed,
             "certified": self.method != "float" and not overflowed and not counts[_NOT_FINITE],
         }
-        captured = read_milliseconds is dict
-        milliseconds = read_milliseconds()
+        milliseconds = clock.read() if clock else {}
         start = time.perf_counter()
         stage_counts = {}
         earliest = 2.0
@@ -364,7 +372,7 @@ class CollisionDetector:
             kind = narrow_phase.kind
             kind_counts = counts[place : place + len(Count)]
             contacts = narrow_phase.contacts.read(kind_counts[Count.FOUND])
-            if self.method == "exact" and not captured:
+            if self.method == "exact" and clock:
                 ask = (contacts["status"] == UNSURE) | ~contacts["localized"]
                 decide_exactly(kind, *self._positions_detected, elements, contacts, ask)
             hit = contacts["hit"]
@@ -380,7 +388,7 @@ class CollisionDetector:
                 hits=int(kind_counts[Count.FOUND]) - unsure,
                 unsure=unsure,
             )
-        if not captured:
+        if clock:
             milliseconds["exact"] = 1000.0 * (time.perf_counter() - start)
         results["earliest_toi"] = earliest
         results["stats"] = DetectionStats(**stage_counts, milliseconds=milliseconds)

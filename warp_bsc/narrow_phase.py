@@ -319,6 +319,18 @@ class NarrowPhase:
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * capacity, dtype=int, device=device)
 
+    @property
+    def queues(self):
+        """All arrays that a run writes to."""
+        return [
+            self.candidates,
+            self._survivors,
+            *self._unsorted.arrays,
+            *self.contacts.arrays,
+            self._keys,
+            self._order,
+        ]
+
     def overflowed(self, counts):
         """Whether a queue was too small for the counts, NumPy array."""
         return (
