@@ -277,6 +277,22 @@ def test_results_that_someone_holds_outlive_the_next_detection():
     assert_same(held[0], held[2])
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_results_are_of_the_positions_detected_whatever_becomes_of_these(method):
+    positions, faces = grid(2, np.float64)
+    positions = np.concatenate([positions, [[0.005, 0.005, 0.01], [0.006, 0.005, 0.02], [0.005, 0.006, 0.02]]])
+    end = positions.copy()
+    end[9, 2] = 0.0  # ends on an edge and on a corner of faces: for exact arithmetic to decide
+    mesh = bsc.CollisionMesh(np.concatenate([faces, [[9, 10, 11]]]), 12)
+    detector = bsc.CollisionDetector(mesh, method=method)
+    expected = detector.detect(positions, end)
+    x0, x1 = (wp.array(x, dtype=wp.vec3d, device=mesh.device) for x in (positions, end))
+    c = detector.detect(x0, x1)
+    x1.assign(positions)
+    assert len(c.vertex_face)
+    assert_same(c, expected)
+
+
 def test_detectors_side_by_side_do_not_disturb_one_another():
     x0, x1, faces = crumpled(0)
     mesh = bsc.CollisionMesh(faces, len(x0))
@@ -314,6 +330,15 @@ def test_a_graph_finds_what_a_detection_finds(captured):
             replay()
             assert_same(c, expected)
         assert c.certified and not c.overflowed
+
+
+@needs_gpu
+def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured):
+    detector, c, _, end, replay = captured
+    replay()
+    expected = c.edge_edge.tolist()
+    assert len(detector.find_intersections(end))
+    assert c.edge_edge.tolist() == expected
 
 
 @needs_gpu

@@ -95,9 +95,9 @@ class DetectorBenchmark:
         hits: Pairs that the method reports.
         earliest_toi: The earliest time of impact, 2.0 if there is none.
         certified: Whether no collision can be missing.
-        detect_milliseconds: Median time from positions on the device to the results there [ms].
-        read_milliseconds: Median time from positions on the device to the results on the host [ms]; the exact stage
-            of method "exact" runs there.
+        detect_milliseconds: Median time from positions on the device to the results there [ms]; with method "exact"
+            to those on the host.
+        read_milliseconds: Median time from positions on the device to the results on the host [ms].
         graph_milliseconds: Median time of 20 replays as a CUDA graph [ms], None on the CPU.
         stage_milliseconds: Median time by stage [ms].
         memory: Device memory of mesh and detector, queues included [bytes], None where nobody counts it.

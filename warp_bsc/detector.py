@@ -17,7 +17,7 @@ from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tol
 
 __all__ = ["CollisionDetector", "Collisions", "DetectionStats", "StageCounts"]
 
-_NOT_FINITE, _FACE_PAIRS, _CROSSINGS, _VERTEX_FACE = range(4)
+_NOT_FINITE, _FACE_PAIRS, _VERTEX_FACE = range(3)
 _EDGE_EDGE = _VERTEX_FACE + len(Count)
 _COUNTS = _EDGE_EDGE + len(Count)
 """Places of the counts in one array; those of a kind of pair are by :class:`Count` from its place on."""
@@ -114,7 +114,7 @@ class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
     They stay on the device until an attribute is asked for, or until the next detection would overwrite them. Those of
-    a detection in a CUDA graph are read anew each time, and say what the last replay found.
+    a detection in a CUDA graph are read anew each time, and say what the detector found last.
 
     Attributes:
         vertex_face: (vertex, face), int32, shape [n, 2].
@@ -154,8 +154,13 @@ class Collisions:
             return self._detector._read(None)
         if self._run != self._detector._run:
             raise RuntimeError("these collisions were not read before another detection was captured, and are gone")
-        self._read = self._detector._read(self._clock)
+        self._keep()
         return self._read
+
+    def _keep(self, *positions):
+        """Reads the results, unless they have been read or are gone."""
+        if self._read is None and self._run == self._detector._run:
+            self._read = self._detector._read(self._clock, *positions)
 
     def __getattr__(self, name):
         """Reads the results from the device."""
@@ -235,8 +240,10 @@ class CollisionDetector:
             self._captured = True
             self._launch(x0, x1)
             return Collisions(self, None)
-        self._start_run()
-        self._positions_detected = x0, x1
+        last = self._last()
+        if last is not None:
+            last._keep()
+        self._run += 1
         while True:
             clock = _StageClock(self.mesh.device)
             self._launch(x0, x1, clock)
@@ -249,6 +256,8 @@ class CollisionDetector:
             self._grow(counts)
         collisions = Collisions(self, clock)
         self._last = weakref.ref(collisions)
+        if self.method == "exact":
+            collisions._keep(x0, x1)  # now, while the positions are what they were
         return collisions
 
     def find_intersections(self, x):
@@ -267,19 +276,20 @@ class CollisionDetector:
         x = self._positions(x, "x", False)
         checked_coordinates(x.numpy(), (3,), "x")
         mesh = self.mesh
-        self._start_run()
+        face_pairs = wp.empty(8 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         candidates = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
+        counts = wp.zeros(2, dtype=wp.int64, device=mesh.device)
         while True:
-            self._counts.zero_()
-            self._broad_phase.pair_faces(x, x, self._counts, _FACE_PAIRS, self._face_pairs)
-            self._broad_phase.pair_edges_with_faces(self._face_pairs, self._counts, _FACE_PAIRS, _CROSSINGS, candidates)
-            counts = self._counts.numpy()
-            found = int(counts[_CROSSINGS])
-            if counts[_FACE_PAIRS] <= len(self._face_pairs) and found <= len(candidates):
+            self._broad_phase.pair_faces(x, x, counts, 0, face_pairs)
+            self._broad_phase.pair_edges_with_faces(face_pairs, counts, 0, 1, candidates)
+            pairs, found = (int(count) for count in counts.numpy())
+            if pairs <= len(face_pairs) and found <= len(candidates):
                 break
-            self._grow(counts)
+            if pairs > len(face_pairs):
+                face_pairs = wp.empty(roomy(pairs), dtype=wp.vec2i, device=mesh.device)
             if found > len(candidates):
                 candidates = wp.empty(roomy(found), dtype=wp.vec2i, device=mesh.device)
+            counts.zero_()
         status = wp.empty(found, dtype=int, device=mesh.device)
         inputs = [x, mesh.device_edges, mesh.device_faces, candidates]
         wp.launch(_kernels(x.dtype)[1], found, inputs=inputs, outputs=[status], device=mesh.device)
@@ -305,13 +315,6 @@ class CollisionDetector:
             raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {len(values)}")
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=mesh.device)
-
-    def _start_run(self):
-        """Sees to it that results that someone still holds are read before they are overwritten."""
-        last = self._last()
-        if last is not None and last._run == self._run:
-            last._results()
-        self._run += 1
 
     def _launch(self, x0, x1, clock=None):
         """Launches the whole pipeline, without asking the device anything.
@@ -353,16 +356,20 @@ class CollisionDetector:
         self._vertex_face.grow(counts[_VERTEX_FACE:_EDGE_EDGE])
         self._edge_edge.grow(counts[_EDGE_EDGE:_COUNTS])
 
-    def _read(self, clock):
-        """The results of the last detection, by the names of the attributes of Collisions; no clock in a CUDA graph."""
+    def _read(self, clock, *positions):
+        """The results of the last run, by the names of the attributes of Collisions.
+
+        Args:
+            clock: None in a CUDA graph.
+            positions: If given, contacts that floating point leaves open are decided exactly.
+        """
         counts = self._counts.numpy()
         overflowed = self._overflowed(counts)
         results = {
             "overflowed": overflowed,
             "certified": self.method != "float" and not overflowed and not counts[_NOT_FINITE],
         }
-        milliseconds = clock.read() if clock else {}
-        start = time.perf_counter()
+        milliseconds = {**clock.read(), "exact": 0.0} if clock else {}
         stage_counts = {}
         earliest = 2.0
         for narrow_phase, place, elements in (
@@ -372,9 +379,11 @@ class CollisionDetector:
             kind = narrow_phase.kind
             kind_counts = counts[place : place + len(Count)]
             contacts = narrow_phase.contacts.read(kind_counts[Count.FOUND])
-            if self.method == "exact" and clock:
+            if positions:
                 ask = (contacts["status"] == UNSURE) | ~contacts["localized"]
-                decide_exactly(kind, *self._positions_detected, elements, contacts, ask)
+                start = time.perf_counter()
+                decide_exactly(kind, *positions, elements, contacts, ask)
+                milliseconds["exact"] += 1000.0 * (time.perf_counter() - start)
             hit = contacts["hit"]
             results[kind] = contacts["pairs"][hit]
             for name in ("toi", "coordinates", "normal"):
@@ -388,8 +397,6 @@ class CollisionDetector:
                 hits=int(kind_counts[Count.FOUND]) - unsure,
                 unsure=unsure,
             )
-        if clock:
-            milliseconds["exact"] = 1000.0 * (time.perf_counter() - start)
         results["earliest_toi"] = earliest
         results["stats"] = DetectionStats(**stage_counts, milliseconds=milliseconds)
         return results
