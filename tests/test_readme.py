@@ -1,12 +1,16 @@
 """The README: its Python code runs as printed, its commands are those that the project runs."""
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import warp_bsc as bsc
+from warp_bsc import checker
 from warp_bsc.cli import main
+from warp_bsc.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -35,6 +39,21 @@ def test_the_scene_of_the_readme_replays_with_its_figures(capsys):
     output = capsys.readouterr().out
     assert "Collisions in 12 of 14 intervals" in output and "33 collisions in 12 of" in README.replace("\n", " ")
     assert "33 of" in output
+
+
+def test_the_collisions_of_the_scene_are_real():
+    scene = Scene(ROOT / "assets" / "cloth_twist.usd")
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(scene.faces, scene.vertex_count))
+    confirmed = 0
+    for start, end in pairwise(scene.times):
+        x0, x1 = scene.positions(start), scene.positions(end)
+        c = detector.detect(x0, x1)
+        corners = np.concatenate([c.vertex_face[:, :1], scene.faces[c.vertex_face[:, 1]]], axis=1)
+        confirmed += checker.vertex_face(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
+        corners = detector.mesh.edges[c.edge_edge].reshape(-1, 4)
+        confirmed += checker.edge_edge(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
+        assert len(detector.find_intersections(x0))  # the cloth is through itself at rest, too
+    assert confirmed == 33
 
 
 @pytest.mark.skipif(not (ROOT / ".ci" / "run").exists(), reason="not a checkout")
