@@ -401,7 +401,7 @@ def test_errors_stay_within_their_bounds(kind, dtype):
     ]
     points = np.concatenate(points)
     vectors = differences(kind, points)
-    moving = vectors.any(axis=(1, 2))
+    moving = vectors.any(axis=(1, 2)).astype(bool)
     points, vectors = points[moving], vectors[moving]
     computed = run(kind, points)
     k, q = exact_polynomials(kind, vectors * scales(vectors))
