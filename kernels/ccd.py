@@ -107,7 +107,6 @@ def edge_edge_motion(
 def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
     """Status of a query that no coordinate axis separates and, if ``timed``, its first contact."""
     result = Impact()
-    result.status = FREE
     result.toi = wp.float64(2.0)
     if direction_separates(motion, centroid_direction(motion)):
         return result

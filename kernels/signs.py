@@ -3,7 +3,7 @@
 Every number that is computed here comes with a **bound** on its distance from the exact value, and its sign is certain
 where it exceeds the bound. Bounds have the form
 
-    c * roundoff * (the same expression in absolute values, or in products of max-norms) + UNDERFLOW * roundoff,
+    c * roundoff * (the same expression in absolute values) + UNDERFLOW * roundoff,
 
 valid to first order in the roundoff for every order of evaluation and with or without fused multiply-add (fusing only
 leaves a rounding out); the constants c are rounded up by enough to cover the terms of second order. Each function

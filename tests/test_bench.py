@@ -191,14 +191,3 @@ def test_generated_scenes(generator, triangles):
 def test_default_scenes():
     for name in bench.default_scenes():
         assert isinstance(load_scene(name), BenchmarkScene)
-
-
-@pytest.mark.parametrize("command", [["bench"], ["bench", "detector"]])
-def test_help_has_examples(capsys, command):
-    with pytest.raises(SystemExit) as end:
-        main([*command, "--help"])
-    assert end.value.code == 0
-    output = capsys.readouterr().out
-    assert f"  warp-bsc {' '.join(command)}" in output.partition("examples:")[2]
-    assert "exit status:" in output
-    assert max(map(len, output.splitlines())) <= 80

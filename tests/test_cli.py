@@ -275,6 +275,13 @@ def test_scene_that_is_not_usd(capsys, tmp_path):
     assert f"{path}: not a readable USD file" in fail(capsys, "replay", path)
 
 
+def test_conservative_says_what_it_could_not_certify(capsys, falling_scene):
+    output = run(capsys, "replay", falling_scene, "--method", "conservative")
+    assert "No collision can be missing; hits that could not be certified: " in output
+    assert "Every answer" not in output
+    assert "collisions may be missing" in run(capsys, "replay", falling_scene, "--method", "float")
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
@@ -297,7 +304,7 @@ def test_device_that_is_not_there(capsys, falling_scene):
     assert "--device cuda:99: there is no such device" in fail(capsys, "replay", falling_scene, "--device", "cuda:99")
 
 
-@pytest.mark.parametrize("command", [[], ["replay"], ["query"]])
+@pytest.mark.parametrize("command", [[], ["replay"], ["query"], ["bench"], ["bench", "detector"]])
 def test_help_has_examples(capsys, command):
     with pytest.raises(SystemExit) as end:
         main([*command, "--help"])

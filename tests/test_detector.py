@@ -257,11 +257,8 @@ def test_queues_with_room_for_one_entry_grow():
 
 
 def test_every_pair_a_candidate():
-    """2,000 triangles through one point: a tree that separates nothing must still find all pairs."""
-    rng = np.random.default_rng(1)
-    x0 = rng.uniform(-1, 1, (3, 2000, 3))
-    x0[0] *= -1.0
-    x0 = np.concatenate([x0, -x0.sum(axis=0)[None]])[:3].transpose(1, 0, 2).reshape(-1, 3)
+    """2,000 triangles whose swept boxes all overlap: a tree that separates nothing must still find all pairs."""
+    x0 = np.random.default_rng(1).uniform(-1, 1, (6000, 3))
     mesh = bsc.CollisionMesh(np.arange(6000).reshape(2000, 3), 6000)
     c = bsc.CollisionDetector(mesh, method="float").detect(x0 - 10.0, x0 + 10.0)
     assert c.stats.vertex_face.candidates == 6000 * 1999

@@ -9,12 +9,13 @@ import warp as wp
 __all__ = ["launch_over", "launch_over_queue"]
 
 _SMALLEST_CHUNK = 1024
+_THREADS = os.cpu_count() or 1
 
 
 @functools.cache
 def _pool():
     """Threads for the CPU: Warp runs a kernel on one, but lets others run meanwhile."""
-    return ThreadPoolExecutor(os.cpu_count())
+    return ThreadPoolExecutor(_THREADS)
 
 
 def launch_over(kernel, count, *, inputs, outputs, device):
@@ -25,15 +26,14 @@ def launch_over(kernel, count, *, inputs, outputs, device):
     if device.is_cuda:
         wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device)
         return
-    threads = _pool()._max_workers
-    chunk = max(_SMALLEST_CHUNK, -(-count // (8 * threads)))
+    chunk = max(_SMALLEST_CHUNK, -(-count // (8 * _THREADS)))
 
     def launch(first):
         dim = min(chunk, count - first)
         wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device)
 
     starts = range(0, count, chunk)
-    if threads == 1 or len(starts) < 2:
+    if _THREADS == 1 or len(starts) < 2:
         for first in starts:
             launch(first)
     else:

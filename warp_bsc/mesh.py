@@ -26,8 +26,8 @@ class CollisionMesh:
         Args:
             faces: Vertex indices, integers, shape [face_count, 3], NumPy or Warp array.
             vertex_count: Number of positions.
-            world: The world of each vertex, integers from 0 on, shape [vertex_count]: what is in
-                different worlds does not collide. Default: all are in one.
+            world: The world of each vertex, integers from 0 on, shape [vertex_count]: what is in different
+                worlds does not collide. Default: all are in one.
             device: Warp device; default: Warp's default.
 
         Raises:

@@ -43,7 +43,7 @@ class Interval:
         mesh_pairs: Number of pairs that collide for each two meshes, by the paths of their prims, in order; a mesh that
             collides with itself is there twice.
         earliest: The earliest contact, None if there is none.
-        certified: Whether every answer is certain.
+        certified: Whether no collision can be missing.
         stats: Counts and times of the detector's stages.
     """
 

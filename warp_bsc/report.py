@@ -130,6 +130,9 @@ def print_replay(console: Console, scene: Scene, intervals: list[Interval], *, m
     uncertain = sum(not interval.certified for interval in intervals)
     if uncertain:
         _say(console, f"Not certified, collisions may be missing: {uncertain} of {_count(len(intervals), 'interval')}.")
+    elif method == "conservative":
+        unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
+        _say(console, f"No collision can be missing; hits that could not be certified: {unsure:,}.")
     else:
         _say(console, "Every answer is certified.")
     total = sum(interval.milliseconds for interval in intervals)
