@@ -22,6 +22,14 @@ def _double(x: Any) -> wp.vec3d:
 
 
 @wp.func
+def _finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
+    """Whether all coordinates are finite: no sum of doubles is then anything else, but for some beyond 1e307."""
+    start = _double(a0) + _double(b0) + _double(c0) + _double(d0)
+    end = _double(a1) + _double(b1) + _double(c1) + _double(d1)
+    return wp.isfinite(start + end)
+
+
+@wp.func
 def _size(x0: wp.vec3d, x1: wp.vec3d) -> wp.vec3d:
     return wp.max(wp.abs(x0), wp.abs(x1))
 
@@ -39,19 +47,17 @@ def _motion(
 ) -> Motion:
     """Relative motion, scaled by a power of two, which is exact, to coordinates below 2.
 
-    It is zero, which nothing can certify, where scaling is impossible: all points equal, less than 1e-280 or more than
-    1e300 apart, or not finite.
+    It is zero, which nothing can certify, where scaling is impossible: all points equal, or less than 1e-280 or more
+    than 1e300 apart.
     """
     motion = Motion()
     motion.kind = kind
     motion.roundoff = roundoff
-    total = u0 + u1 + v0 + v1 + w0 + w1  # not finite if any is not
-    motion.finite = wp.isfinite(total)
     u_size = _size(u0, u1)
     v_size = _size(v0, v1)
     w_size = _size(w0, w1)
     size = wp.max(wp.max(u_size, wp.max(v_size, w_size)))
-    if not (motion.finite and size > _SMALLEST and size < _LARGEST):
+    if not (size > _SMALLEST and size < _LARGEST):
         return motion
     exponent = (wp.cast(size, wp.uint64) >> wp.uint64(52)) & wp.uint64(2047)
     scale = wp.cast((wp.uint64(2046) - exponent) << wp.uint64(52), wp.float64)
@@ -71,7 +77,7 @@ def _motion(
 def vertex_face_motion(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of a vertex and a triangle."""
+    """Relative motion of a vertex and a triangle; of finite coordinates only."""
     origin0 = _double(a0)
     origin1 = _double(a1)
     return _motion(
@@ -90,7 +96,7 @@ def vertex_face_motion(
 def edge_edge_motion(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of two edges."""
+    """Relative motion of two edges; of finite coordinates only."""
     return _motion(
         EDGE_EDGE,
         roundoff,
@@ -139,11 +145,13 @@ def impact_vertex_face(
         Status, time of impact, barycentric coordinates and normal, in double precision.
     """
     result = Impact()
-    result.toi = wp.float64(2.0)
-    motion = vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF)
-    if motion.finite and vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
+    if not _finite(p0, a0, b0, c0, p1, a1, b1, c1):
+        result.status = UNSURE
         return result
-    return solve(motion, True, tolerance)
+    if vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
+        result.toi = wp.float64(2.0)
+        return result
+    return solve(vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF), True, tolerance)
 
 
 @wp.func
@@ -167,11 +175,13 @@ def impact_edge_edge(
         Status, time of impact, parameters along the edges and normal, in double precision.
     """
     result = Impact()
-    result.toi = wp.float64(2.0)
-    motion = edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
-    if motion.finite and edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not _finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        result.status = UNSURE
         return result
-    return solve(motion, True, tolerance)
+    if edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+        result.toi = wp.float64(2.0)
+        return result
+    return solve(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), True, tolerance)
 
 
 @wp.func
@@ -182,10 +192,11 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
     Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points
     that are not finite are UNSURE.
     """
-    motion = vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF)
-    if motion.finite and vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
+    if not _finite(p0, a0, b0, c0, p1, a1, b1, c1):
+        return UNSURE
+    if vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
         return FREE
-    return solve(motion, False, _TOLERANCE).status
+    return solve(vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF), False, _TOLERANCE).status
 
 
 @wp.func
@@ -196,7 +207,8 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that
     are not finite are UNSURE.
     """
-    motion = edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
-    if motion.finite and edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not _finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        return UNSURE
+    if edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
         return FREE
-    return solve(motion, False, _TOLERANCE).status
+    return solve(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), False, _TOLERANCE).status

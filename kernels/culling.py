@@ -8,6 +8,7 @@ from typing import Any
 
 import warp as wp
 
+from .boxes import boxes_apart
 from .polynomials import VERTEX_FACE, Motion
 from .signs import UNDERFLOW
 
@@ -18,34 +19,27 @@ _DIRECTION_ERROR = wp.constant(wp.float64(10.0))
 
 @wp.func
 def vertex_face_boxes_apart(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any) -> bool:
-    """Whether a coordinate axis separates vertex and triangle: comparisons only, hence exact at any scale."""
+    """Whether a coordinate axis separates vertex and triangle."""
     low0 = wp.min(a0, wp.min(b0, c0))
     low1 = wp.min(a1, wp.min(b1, c1))
     high0 = wp.max(a0, wp.max(b0, c0))
     high1 = wp.max(a1, wp.max(b1, c1))
-    for i in range(3):
-        if (p0[i] < low0[i] and p1[i] < low1[i]) or (p0[i] > high0[i] and p1[i] > high1[i]):
-            return True
-    return False
+    return boxes_apart(p0, p0, p1, p1, low0, high0, low1, high1)
 
 
 @wp.func
 def edge_edge_boxes_apart(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
-    """Whether a coordinate axis separates the edges: comparisons only, hence exact at any scale."""
-    ab_low0 = wp.min(a0, b0)
-    ab_low1 = wp.min(a1, b1)
-    ab_high0 = wp.max(a0, b0)
-    ab_high1 = wp.max(a1, b1)
-    cd_low0 = wp.min(c0, d0)
-    cd_low1 = wp.min(c1, d1)
-    cd_high0 = wp.max(c0, d0)
-    cd_high1 = wp.max(c1, d1)
-    for i in range(3):
-        if (ab_high0[i] < cd_low0[i] and ab_high1[i] < cd_low1[i]) or (
-            ab_low0[i] > cd_high0[i] and ab_low1[i] > cd_high1[i]
-        ):
-            return True
-    return False
+    """Whether a coordinate axis separates the edges."""
+    return boxes_apart(
+        wp.min(a0, b0),
+        wp.max(a0, b0),
+        wp.min(a1, b1),
+        wp.max(a1, b1),
+        wp.min(c0, d0),
+        wp.max(c0, d0),
+        wp.min(c1, d1),
+        wp.max(c1, d1),
+    )
 
 
 @wp.func

@@ -17,16 +17,3 @@ def owns_vertex(owned: int, corner: int) -> bool:
 def owns_edge(owned: int, side: int) -> bool:
     """Whether a face is the representative of the edge from corner ``side`` to the next."""
     return (owned >> (3 + side)) & 1 == 1
-
-
-@wp.func
-def boxes_overlap(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3) -> bool:
-    """Whether two closed boxes overlap."""
-    return (
-        low[0] <= other_high[0]
-        and low[1] <= other_high[1]
-        and low[2] <= other_high[2]
-        and other_low[0] <= high[0]
-        and other_low[1] <= high[1]
-        and other_low[2] <= high[2]
-    )

@@ -53,7 +53,6 @@ class Motion:
     v_size: wp.vec3d
     w_size: wp.vec3d
     kind: int  # VERTEX_FACE or EDGE_EDGE
-    finite: bool  # whether all coordinates are finite
     roundoff: wp.float64  # ROUNDOFF, or 0 for the signs that floating point computes
 
 
@@ -147,9 +146,7 @@ def largest_axis(x: wp.vec3d) -> int:
     ax = wp.abs(x[0])
     ay = wp.abs(x[1])
     az = wp.abs(x[2])
-    if ax >= ay and ax >= az:
-        return 0
-    return wp.where(ay >= az, 1, 2)
+    return wp.where(ax >= ay, wp.where(ax >= az, 0, 2), wp.where(ay >= az, 1, 2))
 
 
 @wp.func

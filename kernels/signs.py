@@ -32,28 +32,20 @@ each."""
 @wp.func
 def certified_sign(value: wp.float64, bound: wp.float64) -> int:
     """Sign of a number known to within ``bound``: 1 or -1 where it is certain, 0 where it is not."""
-    if value > bound:
-        return 1
-    if value < -bound:
-        return -1
-    return 0
+    return int(value > bound) - int(value < -bound)
 
 
 @wp.func
 def certified_sign_quadratic(q: wp.vec3d, bound: wp.float64) -> int:
     """The one certain sign of all Bernstein coefficients, hence of the quadratic on [0, 1]; 0 where there is none."""
-    if wp.min(q[0], wp.min(q[1], q[2])) > bound:
-        return 1
-    if wp.max(q[0], wp.max(q[1], q[2])) < -bound:
-        return -1
-    return 0
+    low = wp.min(q[0], wp.min(q[1], q[2]))
+    high = wp.max(q[0], wp.max(q[1], q[2]))
+    return int(low > bound) - int(high < -bound)
 
 
 @wp.func
 def certified_sign_cubic(k: wp.vec4d, bound: wp.float64) -> int:
     """The one certain sign of all Bernstein coefficients, hence of the cubic on [0, 1]; 0 where there is none."""
-    if wp.min(wp.min(k[0], k[1]), wp.min(k[2], k[3])) > bound:
-        return 1
-    if wp.max(wp.max(k[0], k[1]), wp.max(k[2], k[3])) < -bound:
-        return -1
-    return 0
+    low = wp.min(wp.min(k[0], k[1]), wp.min(k[2], k[3]))
+    high = wp.max(wp.max(k[0], k[1]), wp.max(k[2], k[3]))
+    return int(low > bound) - int(high < -bound)

@@ -7,7 +7,7 @@ to within rounding, and finds the first contact on the way.
 
 import warp as wp
 
-from .bernstein import mix, restrict_cubic, restrict_quadratic
+from .bernstein import THREE, mix, restrict_cubic, restrict_quadratic
 from .classification import constant_signs, verdict
 from .closest import between, closest_coordinates, contact_at
 from .culling import direction_separates
@@ -23,6 +23,8 @@ FINEST = wp.constant(wp.float64(2.0**-8))
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
+_NEWTON_STEPS = wp.constant(12)
+_NEWTON_END = wp.constant(wp.float64(2.0**-40))
 _CUBIC_ERROR = wp.constant(wp.float64(2.0))
 _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 
@@ -58,7 +60,6 @@ def restrict_motion(motion: Motion, start: wp.float64, end: wp.float64) -> Motio
     part.v_size = motion.v_size
     part.w_size = motion.w_size
     part.kind = motion.kind
-    part.finite = motion.finite
     part.roundoff = motion.roundoff
     return part
 
@@ -100,6 +101,40 @@ def status_between(motion: Motion, y: Coplanarity, start: wp.float64, end: wp.fl
 
 
 @wp.func
+def approximate_root(k: wp.vec4d) -> wp.float64:
+    """A root of a cubic that has opposite signs at 0 and at 1, by Newton's method, kept in place by bisection.
+
+    Nothing is certified: it only says where to look.
+    """
+    low = _ZERO
+    high = _ONE
+    t = k[0] / (k[0] - k[3])
+    for _ in range(_NEWTON_STEPS):
+        k01 = mix(k[0], k[1], t)
+        k12 = mix(k[1], k[2], t)
+        k23 = mix(k[2], k[3], t)
+        k012 = mix(k01, k12, t)
+        k123 = mix(k12, k23, t)
+        value = mix(k012, k123, t)
+        if wp.abs(value) <= _NEWTON_END * wp.abs(k[3] - k[0]):
+            break
+        if (value > _ZERO) == (k[0] > _ZERO):
+            low = t
+        else:
+            high = t
+        t -= value / (THREE * (k123 - k012))
+        if not (low < t < high):
+            t = _HALF * (low + high)
+    return t
+
+
+@wp.func
+def power_of_two(x: wp.float64) -> wp.float64:
+    """The largest power of two up to a positive number."""
+    return wp.cast((wp.cast(x, wp.uint64) >> wp.uint64(52)) << wp.uint64(52), wp.float64)
+
+
+@wp.func
 def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
     """Time before which there is certainly no contact, found by halving the step, earlier halves first.
 
@@ -108,10 +143,19 @@ def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
     Contact at a time that halving hits exactly stays undecided on both sides: intervals shorter than half the tolerance
     are therefore tried again stretched to the whole of it.
 
+    Most queries have one root, so the interval around it at which halving would end is tried first: that it contains
+    contact, and that all before it is free, are two tests in place of twenty.
+
     Returns:
         Status (FREE, HIT, UNSURE), time, exact in double precision, 2 if FREE, and the end of the interval that the
         search ended at.
     """
+    if y.k[0] * y.k[3] < _ZERO:
+        length = power_of_two(tolerance)
+        guess = length * wp.floor(approximate_root(y.k) / length)
+        if status_between(motion, y, guess, guess + length) == HIT:
+            if guess == _ZERO or status_between(motion, y, _ZERO, guess) == FREE:
+                return HIT, guess, guess + length
     start = _ZERO
     width = _ONE
     index = wp.int64(0)

@@ -1,25 +1,14 @@
-"""Benchmarks: what is measured is what the detector finds, and the scenes are what they say."""
+"""Benchmark of the detector: what is measured is what the detector finds."""
 
 import json
 import os
 
-import numpy as np
 import pytest
-import trimesh
 
-from warp_bsc import CollisionDetector, CollisionMesh, bench
-from warp_bsc.bench import BenchmarkScene, benchmark_detector, limited_threads, load_scene
+from warp_bsc import CollisionDetector, CollisionMesh
+from warp_bsc.bench import benchmark_detector, count_threads, limited_threads
+from warp_bsc.bench_scenes import load_scene
 from warp_bsc.cli import main
-
-FACES = np.array([[0, 1, 2], [3, 4, 5]])
-FLOOR = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
-ABOVE = np.array([*FLOOR, (1, 1, 1), (2, 1, 2), (1, 2, 2)], dtype=float)
-BELOW = ABOVE - np.repeat([[0, 0, 0], [0, 0, 4]], 3, axis=0)
-
-
-def write_mesh(path, points=ABOVE, faces=FACES):
-    trimesh.Trimesh(points, faces, process=False).export(path)
-    return path
 
 
 def measure(capsys, *arguments):
@@ -99,44 +88,11 @@ def test_comparison_needs_the_ipc_toolkit(capsys, monkeypatch):
     assert "warp-bsc[bench]" in fail(capsys, "detector", "cloth:1000", "--compare")
 
 
-@pytest.mark.parametrize("suffix", ["ply", "obj"])
-def test_pair_of_meshes(capsys, tmp_path, suffix):
-    first, second = write_mesh(tmp_path / f"a.{suffix}"), write_mesh(tmp_path / f"b.{suffix}", BELOW)
-    (measured,) = json.loads(measure(capsys, f"{first},{second}", "--json"))["scenes"]
-    assert (measured["triangles"], measured["vertices"], measured["hits"]) == (2, 6, 3)
-    assert measured["earliest_toi"] == pytest.approx(0.25, abs=2**-19)
-
-
-def test_pair_keeps_its_precision(tmp_path):
-    first, second = write_mesh(tmp_path / "a.obj"), write_mesh(tmp_path / "b.obj", BELOW)
-    assert load_scene(f"{first},{second}").x0.dtype == np.float32
-    second.write_text(second.read_text().replace("v 4.0", "v 4.1", 1))
-    scene = load_scene(f"{first},{second}")
-    assert scene.x0.dtype == scene.x1.dtype == np.float64
-    assert scene.x1[1, 0] == 4.1
-
-
 def test_usd_scene(capsys, request):
     path = request.config.rootpath / "assets" / "cloth_twist.usd"
     found = json.loads(measure(capsys, path, "--interval", 4, "--method", "exact", "--json"))
     assert found["scenes"][0]["hits"] == 7
     assert "no interval 14, they go from 0 to 13" in fail(capsys, "detector", path, "--interval", 14)
-
-
-def test_pairs_that_do_not_fit(capsys, tmp_path):
-    first = write_mesh(tmp_path / "a.ply")
-    fewer = write_mesh(tmp_path / "fewer.ply", ABOVE[:3], FACES[:1])
-    turned = write_mesh(tmp_path / "turned.ply", BELOW, FACES[::-1])
-    broken = tmp_path / "broken.ply"
-    broken.write_text("hello")
-    points = tmp_path / "points.ply"
-    trimesh.PointCloud(ABOVE).export(points)
-    assert "the first has 6 vertices, the second 3" in fail(capsys, "detector", f"{first},{fewer}")
-    assert "different faces" in fail(capsys, "detector", f"{first},{turned}")
-    assert "broken.ply: not a readable" in fail(capsys, "detector", f"{first},{broken}")
-    assert "points.ply: " in fail(capsys, "detector", f"{first},{points}")
-    assert "gone.ply: no such file" in fail(capsys, "detector", f"{first},gone.ply")
-    assert "got 3" in fail(capsys, "detector", f"{first},{first},{first}")
 
 
 @pytest.mark.parametrize(
@@ -161,33 +117,7 @@ def test_wrong_use(capsys, arguments, part):
 def test_threads(capsys):
     before = os.sched_getaffinity(0)
     with limited_threads(1):
-        assert bench.count_threads() == 1
+        assert count_threads() == 1
     assert os.sched_getaffinity(0) == before
     assert json.loads(measure(capsys, "cloth:1000", "--threads", 1, "--json"))["threads"] == 1
     assert os.sched_getaffinity(0) == before
-
-
-@pytest.mark.parametrize("generator", bench.GENERATORS)
-@pytest.mark.parametrize("triangles", [1000, 3333, 20000])
-def test_generated_scenes(generator, triangles):
-    scene = load_scene(f"{generator}:{triangles}")
-    assert abs(len(scene.faces) - triangles) <= 0.01 * triangles
-    assert scene.faces.dtype == np.int32
-    assert scene.x0.dtype == scene.x1.dtype == np.float32
-    assert np.array_equal(np.unique(scene.faces), np.arange(len(scene.x0)))
-    again = load_scene(scene.name)
-    for name in ("faces", "x0", "x1"):
-        assert np.array_equal(getattr(scene, name), getattr(again, name))
-    mesh = CollisionMesh(scene.faces, len(scene.x0), device="cpu")
-    detector = CollisionDetector(mesh)
-    collisions = detector.detect(scene.x0, scene.x1)
-    assert 0 < len(collisions.vertex_face) + len(collisions.edge_edge) < triangles
-    assert collisions.earliest_toi > 0
-    stats = collisions.stats
-    assert 1.0 < (stats.vertex_face.candidates + stats.edge_edge.candidates) / triangles < 100.0
-    assert len(detector.find_intersections(scene.x0)) == 0
-
-
-def test_default_scenes():
-    for name in bench.default_scenes():
-        assert isinstance(load_scene(name), BenchmarkScene)

@@ -8,8 +8,19 @@ from benchmark_data import data_folder
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.blocks import BlockBroadPhase
+from warp_bsc.bvh import BvhBroadPhase
 
 METHODS = ("float", "conservative", "exact")
+
+
+@pytest.fixture(params=[BlockBroadPhase, BvhBroadPhase], ids=["blocks", "bvh"])
+def broad_phase(request, monkeypatch, device):
+    """Both broad phases where both run, whatever the detector would choose."""
+    if device.is_cuda and request.param is BlockBroadPhase:
+        pytest.skip("blocks are for the CPU")
+    monkeypatch.setattr("warp_bsc.detector._broad_phase", request.param)
+    return request.param
 
 
 def grid(n, dtype=np.float32):
@@ -38,7 +49,7 @@ def all_collisions(mesh, x0, x1):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("seed", range(3))
-def test_exactly_the_colliding_pairs_are_found(seed, dtype):
+def test_exactly_the_colliding_pairs_are_found(seed, dtype, broad_phase):
     rng = np.random.default_rng(seed)
     x0 = rng.integers(-2, 3, (14, 3)).astype(dtype) if seed == 0 else rng.uniform(-1, 1, (14, 3)).astype(dtype)
     x1 = x0 + (rng.integers(-2, 3, (14, 3)) if seed == 0 else rng.uniform(-0.5, 0.5, (14, 3))).astype(dtype)
@@ -114,7 +125,7 @@ def cloth_funnel():
     return np.array(first.vertices), np.array(second.vertices), np.array(first.faces)
 
 
-def test_cloth_funnel_has_the_known_collisions(cloth_funnel):
+def test_cloth_funnel_has_the_known_collisions(cloth_funnel, broad_phase):
     x0, x1, faces = cloth_funnel
     c = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)), method="exact").detect(x0, x1)
     assert x0.dtype == np.float64
@@ -134,7 +145,7 @@ def test_answers_are_the_same_on_every_run_and_device(cloth_funnel):
             assert getattr(other, field).tobytes() == getattr(results[0], field).tobytes()
 
 
-def test_candidates_that_do_not_fit_at_first_are_not_lost():
+def test_candidates_that_do_not_fit_at_first_are_not_lost(broad_phase):
     rng = np.random.default_rng(0)
     x0 = rng.uniform(-1, 1, (300, 3))  # long triangles: nearly every pair of boxes overlaps
     faces = np.arange(300).reshape(100, 3)
@@ -144,7 +155,7 @@ def test_candidates_that_do_not_fit_at_first_are_not_lost():
     assert c.stats.edge_edge.candidates == 300 * 297 // 2
 
 
-def test_intersections_are_exactly_those_of_all_pairs():
+def test_intersections_are_exactly_those_of_all_pairs(broad_phase):
     rng = np.random.default_rng(4)
     x = rng.integers(-4, 5, (18, 3)).astype(np.float32)
     mesh = bsc.CollisionMesh(np.arange(18).reshape(6, 3), 18)
@@ -165,7 +176,7 @@ def test_touching_configurations_intersect_and_flat_ones_do_not():
     assert len(detector.find_intersections(folded))
 
 
-def test_degenerate_meshes_are_handled():
+def test_degenerate_meshes_are_handled(broad_phase):
     x = np.zeros((4, 3), dtype=np.float32)
     for faces in (np.zeros((0, 3), dtype=int), [[0, 1, 2]], [[0, 0, 1], [2, 2, 3]]):
         c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 4), method="exact").detect(x, x)
@@ -174,7 +185,7 @@ def test_degenerate_meshes_are_handled():
         assert c.earliest_toi == (0.0 if len(faces) == 2 else 2.0)
 
 
-def test_huge_double_positions_keep_their_pairs():
+def test_huge_double_positions_keep_their_pairs(broad_phase):
     """Positions beyond the range of float still get candidates."""
     x0 = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 1], [0.3, 0.2, 2], [0.2, 0.3, 2]]) * 1e60
     x1 = x0.copy()
@@ -240,15 +251,17 @@ def assert_same(collisions, others):
         assert getattr(collisions, field).tobytes() == getattr(others, field).tobytes(), field
 
 
-def test_queues_with_room_for_one_entry_grow():
+def test_queues_with_room_for_one_entry_grow(broad_phase):
     x0, x1, faces = crumpled(0)
     mesh = bsc.CollisionMesh(faces, len(x0))
     expected = bsc.CollisionDetector(mesh).detect(x0, x1)
     assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
     detector = bsc.CollisionDetector(mesh)
-    detector._face_pairs = wp.empty(1, dtype=wp.vec2i)
+    assert bool(detector._broad_phase.queues) == (broad_phase is BvhBroadPhase)
+    if detector._broad_phase.queues:
+        detector._broad_phase.queues = [wp.empty(1, dtype=wp.vec2i)]
     for narrow_phase in (detector._vertex_face, detector._edge_edge):
-        narrow_phase.candidates = wp.empty(1, dtype=wp.vec2i)
+        narrow_phase.near = wp.empty(1, dtype=wp.vec2i)
         narrow_phase._reserve_survivors(1)
         narrow_phase._reserve_contacts(1)
     c = detector.detect(x0, x1)
@@ -256,7 +269,7 @@ def test_queues_with_room_for_one_entry_grow():
     assert c.certified and not c.overflowed
 
 
-def test_every_pair_a_candidate():
+def test_every_pair_a_candidate(broad_phase):
     """2,000 triangles whose swept boxes all overlap: a tree that separates nothing must still find all pairs."""
     x0 = np.random.default_rng(1).uniform(-1, 1, (6000, 3))
     mesh = bsc.CollisionMesh(np.arange(6000).reshape(2000, 3), 6000)
@@ -392,7 +405,7 @@ def test_two_detectors_on_two_streams(captured):
     assert_same(results[1], alone)
 
 
-def test_worlds_do_not_collide_with_one_another():
+def test_worlds_do_not_collide_with_one_another(broad_phase):
     scenes = [crumpled(seed) for seed in range(3)]
     faces = scenes[0][2]
     n = len(scenes[0][0])

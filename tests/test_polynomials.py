@@ -20,7 +20,6 @@ def compute(
     edges: bool,
     single: bool,
     points: wp.array2d[wp.vec3d],
-    finite: wp.array[wp.bool],
     ends: wp.array2d[wp.vec3d],
     sizes: wp.array2d[wp.vec3d],
     normal: wp.array2d[wp.vec3d],
@@ -56,7 +55,6 @@ def compute(
         motion = ccd.edge_edge_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
     else:
         motion = ccd.vertex_face_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
-    finite[i] = motion.finite
     ends[i, 0] = motion.u0
     ends[i, 1] = motion.v0
     ends[i, 2] = motion.w0
@@ -86,7 +84,6 @@ def run(kind, points):
     n = len(points)
     single = points.dtype == np.float32
     shapes = {
-        "finite": (n, wp.bool),
         "ends": ((n, 6), wp.vec3d),  # u v w at the start, u v w at the end
         "sizes": ((n, 3), wp.vec3d),
         "normal": ((n, 3), wp.vec3d),
@@ -186,22 +183,18 @@ def test_motion_is_scaled_by_a_power_of_two(kind, dtype):
     computed = run(kind, points)
     expected = differences(kind, points)
     expected = expected * scales(expected)
-    assert computed.finite.all()
     assert np.array_equal(exact(computed.ends), expected)
     assert np.array_equal(exact(computed.sizes), np.maximum(abs(expected[:, :3]), abs(expected[:, 3:])))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_motion_that_cannot_be_scaled_is_zero(kind):
-    points = uniform(np.random.default_rng(1), 6, kind, np.float64)
+    points = uniform(np.random.default_rng(1), 4, kind, np.float64)
     points[0] = points[0, 0]  # all the same
     points[1] *= 1e-290
     points[2] *= 1e301
-    points[3, 5, 1] = np.nan
-    points[4, 2, 0] = np.inf
-    points[5, :, 2] = -np.inf
+    points[3, :, 0] = 1.5e308 * (-1.0) ** np.arange(8)  # differences overflow
     computed = run(kind, points)
-    assert computed.finite.tolist() == [True, True, True, False, False, False]
     assert not computed.ends.any()
     assert not computed.k.any()
 

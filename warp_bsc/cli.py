@@ -15,7 +15,9 @@ from rich.console import Console
 from rich.progress import track
 
 from . import __version__
-from .bench import benchmark_detector, count_threads, default_scenes, limited_threads, load_scene
+from .bench import benchmark_detector, count_threads, limited_threads
+from .bench_queries import benchmark_copy, benchmark_queries, check_query_count
+from .bench_scenes import default_scenes, load_scene
 from .detector import CollisionDetector
 from .mesh import CollisionMesh
 from .narrow_phase import METHODS
@@ -27,8 +29,10 @@ from .report import (
     detector_benchmarks_to_dict,
     print_detector_benchmarks,
     print_queries,
+    print_query_benchmarks,
     print_replay,
     queries_to_dict,
+    query_benchmarks_to_dict,
     replay_to_dict,
 )
 from .scene import Scene
@@ -94,6 +98,7 @@ _BENCH = "Measure how long things take."
 _BENCH_EXAMPLES = f"""\
 examples:
   warp-bsc bench detector
+  warp-bsc bench queries
   warp-bsc bench detector --help
 
 {_BENCH_EXIT_STATUS}"""
@@ -112,6 +117,19 @@ examples:
   warp-bsc bench detector first.ply,second.ply crash:1100000 --device cuda:0
   warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
   warp-bsc bench detector --json > times.json
+
+{_BENCH_EXIT_STATUS}"""
+
+_BENCH_QUERIES = """\
+Measure how many elementary queries a second are answered: random ones, the same
+on every device, of which the culls leave a third. Queries and answers stay on
+the device. On a GPU replays of a CUDA graph are timed, by events."""
+
+_BENCH_QUERIES_EXAMPLES = f"""\
+examples:
+  warp-bsc bench queries
+  warp-bsc bench queries --device cpu --threads 1 --count 1000000
+  warp-bsc bench queries --json > rates.json
 
 {_BENCH_EXIT_STATUS}"""
 
@@ -182,18 +200,22 @@ def _build_parser() -> argparse.ArgumentParser:
     )
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="what to measure")
     command.add_argument("--interval", type=int, default=0, metavar="N", help="of a USD file, from 0 (default: 0)")
-    command.add_argument(
-        "--repeat", type=_positive, default=5, metavar="N", help="repetitions to take the median of (default: 5)"
-    )
-    command.add_argument(
-        "--threads", type=_positive, metavar="N", help="CPU cores to use, on Linux (default: all; those of a GPU aside)"
-    )
+    _add_benchmark_options(command, repeat=5)
     command.add_argument(
         "--compare",
         action="store_true",
         help="measure the IPC Toolkit's candidates and collision-free step size too, on the CPU; needs ipctk",
     )
     _add_detection_options(command, method="conservative")
+
+    command = _add_command(
+        benchmarks, "queries", _run_bench_queries, "measure elementary queries", _BENCH_QUERIES, _BENCH_QUERIES_EXAMPLES
+    )
+    command.add_argument(
+        "--count", type=int, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
+    )
+    _add_benchmark_options(command, repeat=20)
+    _add_device_options(command)
     return parser
 
 
@@ -217,8 +239,25 @@ def _add_detection_options(command, *, method):
         help="float: the signs as floating point computes them; conservative: what it cannot certify counts as a "
         "collision; exact: the true answer (default: %(default)s)",
     )
+    _add_device_options(command)
+
+
+def _add_device_options(command):
     command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
     command.add_argument("--json", action="store_true", help="print JSON only, with everything found")
+
+
+def _add_benchmark_options(command, *, repeat):
+    command.add_argument(
+        "--repeat",
+        type=_positive,
+        default=repeat,
+        metavar="N",
+        help="repetitions to take the median of (default: %(default)s)",
+    )
+    command.add_argument(
+        "--threads", type=_positive, metavar="N", help="CPU cores to use, on Linux (default: all; those of a GPU aside)"
+    )
 
 
 def _add_fail_on_collision(command):
@@ -303,6 +342,25 @@ def _run_bench_detector(arguments) -> int:
         print(json.dumps(detector_benchmarks_to_dict(benchmarks, **settings)))
     else:
         print_detector_benchmarks(console, benchmarks, **settings)
+    return 0
+
+
+def _run_bench_queries(arguments) -> int:
+    if arguments.count is not None:
+        check_query_count(arguments.count)
+    device = _find_device(arguments.device)
+    console, progress = Console(), Console(stderr=True)
+    options = {"device": device, "repeat": arguments.repeat}
+    with limited_threads(arguments.threads):
+        with _loading_kernels(progress, device):
+            for kind in KINDS:
+                benchmark_queries(kind, count=1, device=device, repeat=1)
+        benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in KINDS]
+        settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
+    if arguments.json:
+        print(json.dumps(query_benchmarks_to_dict(benchmarks, **settings)))
+    else:
+        print_query_benchmarks(console, benchmarks, **settings)
     return 0
 
 

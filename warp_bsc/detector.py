@@ -10,17 +10,23 @@ import warp as wp
 
 from . import checker
 from .arrays import checked_coordinates
-from .broad_phase import BroadPhase
+from .blocks import BlockBroadPhase
+from .bvh import BvhBroadPhase
 from .kernels.crossing import edge_crosses_face
 from .kernels.signs import HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly, roomy
 
 __all__ = ["CollisionDetector", "Collisions", "DetectionStats", "StageCounts"]
 
-_NOT_FINITE, _FACE_PAIRS, _VERTEX_FACE = range(3)
+_NOT_FINITE, _BROAD_PHASE, _VERTEX_FACE = range(3)
 _EDGE_EDGE = _VERTEX_FACE + len(Count)
 _COUNTS = _EDGE_EDGE + len(Count)
 """Places of the counts in one array; those of a kind of pair are by :class:`Count` from its place on."""
+
+
+def _broad_phase(mesh, count):
+    """The broad phase for the mesh's device."""
+    return (BlockBroadPhase if mesh.device.is_cpu else BvhBroadPhase)(mesh, count)
 
 
 @functools.cache
@@ -201,16 +207,15 @@ class CollisionDetector:
         self._captured = False
         self._retired = []  # queues that a CUDA graph may still write to
         self._last = lambda: None  # the last results, as long as someone holds them
-        self._broad_phase = BroadPhase(mesh)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._counts = wp.zeros(_COUNTS, dtype=wp.int64, device=mesh.device)
         faces = len(mesh.faces)
-        self._face_pairs = wp.empty(8 * faces, dtype=wp.vec2i, device=mesh.device)
+        self._broad_phase = _broad_phase(mesh, self._counts[_BROAD_PHASE:_VERTEX_FACE])
         self._vertex_face = NarrowPhase(
-            "vertex_face", self._counts[_VERTEX_FACE:_EDGE_EDGE], 2 * faces, (mesh.vertex_count, faces)
+            "vertex_face", self._counts[_VERTEX_FACE:_EDGE_EDGE], faces, (mesh.vertex_count, faces)
         )
         self._edge_edge = NarrowPhase(
-            "edge_edge", self._counts[_EDGE_EDGE:_COUNTS], 4 * faces, (len(mesh.edges), len(mesh.edges))
+            "edge_edge", self._counts[_EDGE_EDGE:_COUNTS], 2 * faces, (len(mesh.edges), len(mesh.edges))
         )
 
     def detect(self, x0, x1):
@@ -276,17 +281,15 @@ class CollisionDetector:
         x = self._positions(x, "x", False)
         checked_coordinates(x.numpy(), (3,), "x")
         mesh = self.mesh
-        face_pairs = wp.empty(8 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         candidates = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
-        counts = wp.zeros(2, dtype=wp.int64, device=mesh.device)
+        counts = wp.zeros(1 + len(Count), dtype=wp.int64, device=mesh.device)
+        broad_phase = _broad_phase(mesh, counts[:1])
         while True:
-            self._broad_phase.pair_faces(x, x, counts, 0, face_pairs)
-            self._broad_phase.pair_edges_with_faces(face_pairs, counts, 0, 1, candidates)
-            pairs, found = (int(count) for count in counts.numpy())
-            if pairs <= len(face_pairs) and found <= len(candidates):
+            broad_phase.pair_edges_with_faces(x, counts[1:], candidates)
+            pairs, found = (int(count) for count in counts.numpy()[[0, 1 + Count.NEAR]])
+            if not broad_phase.overflowed(pairs) and found <= len(candidates):
                 break
-            if pairs > len(face_pairs):
-                face_pairs = wp.empty(roomy(pairs), dtype=wp.vec2i, device=mesh.device)
+            broad_phase.grow(pairs)
             if found > len(candidates):
                 candidates = wp.empty(roomy(found), dtype=wp.vec2i, device=mesh.device)
             counts.zero_()
@@ -325,10 +328,8 @@ class CollisionDetector:
         counts.zero_()
         count_not_finite, _ = _kernels(x0.dtype)
         wp.launch(count_not_finite, mesh.vertex_count, inputs=[x0, x1], outputs=[counts], device=mesh.device)
-        self._broad_phase.pair_faces(x0, x1, counts, _FACE_PAIRS, self._face_pairs)
-        queues = [self._vertex_face.candidates, self._edge_edge.candidates]
-        places = [_FACE_PAIRS, _VERTEX_FACE + Count.CANDIDATES, _EDGE_EDGE + Count.CANDIDATES]
-        self._broad_phase.pair_elements(self._face_pairs, counts, *places, queues)
+        vertex_face, edge_edge = self._vertex_face, self._edge_edge
+        self._broad_phase.pair_elements(x0, x1, vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near)
         options = {"method": self.method, "tolerance": self.tolerance}
         if clock:
             clock.lap("broad phase")
@@ -342,7 +343,7 @@ class CollisionDetector:
 
     def _overflowed(self, counts):
         return bool(
-            counts[_FACE_PAIRS] > len(self._face_pairs)
+            self._broad_phase.overflowed(counts[_BROAD_PHASE])
             or self._vertex_face.overflowed(counts[_VERTEX_FACE:_EDGE_EDGE])
             or self._edge_edge.overflowed(counts[_EDGE_EDGE:_COUNTS])
         )
@@ -350,9 +351,8 @@ class CollisionDetector:
     def _grow(self, counts):
         self._growth += 1
         if self._captured:
-            self._retired += [self._face_pairs, *self._vertex_face.queues, *self._edge_edge.queues]
-        if counts[_FACE_PAIRS] > len(self._face_pairs):
-            self._face_pairs = wp.empty(roomy(counts[_FACE_PAIRS]), dtype=wp.vec2i, device=self.mesh.device)
+            self._retired += [*self._broad_phase.queues, *self._vertex_face.queues, *self._edge_edge.queues]
+        self._broad_phase.grow(counts[_BROAD_PHASE])
         self._vertex_face.grow(counts[_VERTEX_FACE:_EDGE_EDGE])
         self._edge_edge.grow(counts[_EDGE_EDGE:_COUNTS])
 

@@ -18,6 +18,12 @@ def _pool():
     return ThreadPoolExecutor(_THREADS)
 
 
+@functools.cache
+def _load(kernel):
+    """Compiles a kernel, which several threads must not try at once."""
+    kernel.module.load("cpu")
+
+
 def launch_over(kernel, count, *, inputs, outputs, device):
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
@@ -37,8 +43,8 @@ def launch_over(kernel, count, *, inputs, outputs, device):
         for first in starts:
             launch(first)
     else:
-        launch(0)  # compiles the kernel, once
-        list(_pool().map(launch, starts[1:]))
+        _load(kernel)
+        list(_pool().map(launch, starts))
 
 
 def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs):

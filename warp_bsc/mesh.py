@@ -17,6 +17,7 @@ class CollisionMesh:
         edges: Vertex indices of the edges, smaller first, sorted, int32, shape [edge_count, 2].
         vertices: Indices of the vertices that faces use, sorted, int32, shape [used_vertex_count].
         vertex_count: Number of positions.
+        world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
         device: Warp device of the arrays that the detector uses.
     """
 
@@ -66,15 +67,15 @@ class CollisionMesh:
         self.device = wp.get_device(device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.device_vertices = wp.array(np.arange(vertex_count).reshape(-1, 1), dtype=int, device=self.device)
         self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
         self.device_owned = wp.array(owned, dtype=int, device=self.device)
-        self.device_world = None
+        self.world = None if world is None else self._checked_world(world)
+        self.device_face_world = None
         if world is not None:
-            self.device_world = wp.array(self._face_worlds(world), dtype=int, device=self.device)
+            self.device_face_world = wp.array(self.world[self.faces[:, 0]], dtype=int, device=self.device)
 
-    def _face_worlds(self, world):
-        """The world of each face, int32, shape [face_count]."""
+    def _checked_world(self, world):
+        """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face."""
         world = world.numpy() if isinstance(world, wp.array) else np.asarray(world)
         if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):
             raise ValueError(
@@ -86,4 +87,4 @@ class CollisionMesh:
         mixed = np.flatnonzero((worlds != worlds[:, :1]).any(axis=1))
         if len(mixed):
             raise ValueError(f"face {mixed[0]} has vertices in worlds {worlds[mixed[0]].tolist()}")
-        return worlds[:, 0].astype(np.int32)
+        return world.astype(np.int32)

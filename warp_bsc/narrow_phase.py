@@ -1,4 +1,4 @@
-"""The narrow phase: candidate pairs -> culls -> certified classification -> times of impact, sorted.
+"""The narrow phase: pairs that come near -> culls -> certified classification -> times of impact, sorted.
 
 Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
 the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels.queues`.
@@ -62,16 +62,26 @@ def check_tolerance(tolerance):
 
 
 class Count(enum.IntEnum):
-    """Counts of one kind of pair, from an offset on in the array of all counts."""
+    """Places of the counts of one kind of pair, in the order of the stages.
+
+    Attributes:
+        CANDIDATES: Pairs that share no vertex and whose boxes overlap over the time of the motion.
+        NEAR: Those of them that no coordinate axis separates at the start and at the end, on the same side.
+        SURVIVORS: Those that no cull decides.
+        CONTACTS: Those that classification leaves.
+        FOUND: Those that are not certified free.
+        UNSURE: Those of them that are not certified hits either.
+    """
 
     CANDIDATES = 0
-    SURVIVORS = 1
-    CONTACTS = 2
-    FOUND = 3
-    UNSURE = 4
+    NEAR = 1
+    SURVIVORS = 2
+    CONTACTS = 3
+    FOUND = 4
+    UNSURE = 5
 
 
-_CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_NEAR = wp.constant(int(Count.NEAR))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
@@ -105,24 +115,24 @@ def _kernels(kind, dtype):
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         roundoff: wp.float64,
-        candidates: wp.array[wp.vec2i],
+        near: wp.array[wp.vec2i],
         counts: wp.array[wp.int64],
         survivors: wp.array[wp.vec2i],
     ):
         i = first + wp.tid()
-        if not is_filled(i, candidates, counts, _CANDIDATES):
+        if not is_filled(i, near, counts, _NEAR):
             return
-        pair = candidates[i]
+        pair = near[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
-        # comparisons in the type of the positions, which the caller has seen to be finite
-        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-            return
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         if direction_separates(motion, centroid_direction(motion)):
             return
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        # last, because what the broad phase calls near passes, in single precision always; but exact at any scale
+        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         append(pair, survivors, counts, _SURVIVORS)
 
@@ -285,29 +295,29 @@ class Contacts:
 
 
 class NarrowPhase:
-    """Decides candidate pairs of one kind, on the device.
+    """Decides pairs of one kind, on the device.
 
     Attributes:
-        candidates: Queue of the candidates, to be filled by whoever finds them, array of vec2i.
+        near: Queue of the pairs to decide, to be filled by whoever finds them, array of vec2i.
         counts: Counts by :class:`Count`, array of int64.
         contacts: The contacts, sorted, as many as ``counts[Count.FOUND]`` says.
     """
 
-    def __init__(self, kind, counts, candidates, elements):
+    def __init__(self, kind, counts, capacity, elements):
         """Makes queues.
 
         Args:
             kind: "vertex_face" or "edge_edge".
             counts: Array of int64 with room for :class:`Count`, zero before each run.
-            candidates: Room for candidates.
+            capacity: Room for pairs at first.
             elements: How many first and second elements there are to pair.
         """
         self.kind = kind
         self._bits = [max(1, int(count - 1).bit_length()) for count in elements]
         self.counts = counts
-        self.candidates = wp.empty(candidates, dtype=wp.vec2i, device=counts.device)
-        self._reserve_survivors(candidates // 8 + 64)
-        self._reserve_contacts(candidates // 32 + 64)
+        self.near = wp.empty(capacity, dtype=wp.vec2i, device=counts.device)
+        self._reserve_survivors(capacity // 2 + 64)
+        self._reserve_contacts(capacity // 8 + 64)
 
     def _reserve_survivors(self, capacity):
         self._survivors = wp.empty(capacity, dtype=wp.vec2i, device=self.counts.device)
@@ -323,7 +333,7 @@ class NarrowPhase:
     def queues(self):
         """All arrays that a run writes to."""
         return [
-            self.candidates,
+            self.near,
             self._survivors,
             *self._unsorted.arrays,
             *self.contacts.arrays,
@@ -334,23 +344,23 @@ class NarrowPhase:
     def overflowed(self, counts):
         """Whether a queue was too small for the counts, NumPy array."""
         return (
-            counts[Count.CANDIDATES] > len(self.candidates)
+            counts[Count.NEAR] > len(self.near)
             or counts[Count.SURVIVORS] > len(self._survivors)
             or counts[Count.CONTACTS] > len(self.contacts.pairs)
         )
 
     def grow(self, counts):
         """Makes the queues large enough for the counts, with a quarter to spare."""
-        needed = {count: roomy(counts[count]) for count in (Count.CANDIDATES, Count.SURVIVORS, Count.CONTACTS)}
-        if counts[Count.CANDIDATES] > len(self.candidates):
-            self.candidates = wp.empty(needed[Count.CANDIDATES], dtype=wp.vec2i, device=self.counts.device)
+        needed = {count: roomy(counts[count]) for count in (Count.NEAR, Count.SURVIVORS, Count.CONTACTS)}
+        if counts[Count.NEAR] > len(self.near):
+            self.near = wp.empty(needed[Count.NEAR], dtype=wp.vec2i, device=self.counts.device)
         if counts[Count.SURVIVORS] > len(self._survivors):
             self._reserve_survivors(needed[Count.SURVIVORS])
         if counts[Count.CONTACTS] > len(self.contacts.pairs):
             self._reserve_contacts(needed[Count.CONTACTS])
 
     def run(self, x0, x1, elements, *, method, timed=True, tolerance=TOLERANCE, lap=lambda stage: None):
-        """Launches all stages over the candidates, without asking the device anything.
+        """Launches all stages over the pairs, without asking the device anything.
 
         Args:
             x0: Positions at the start of the step, Warp array of vec3 or vec3d.
@@ -367,8 +377,8 @@ class NarrowPhase:
         motion = [x0, x1, elements, roundoff]
         counts, found = self.counts, self._unsorted
 
-        inputs = [*motion, self.candidates, counts]
-        launch_over_queue(cull, self.candidates, counts, Count.CANDIDATES, inputs=inputs, outputs=[self._survivors])
+        inputs = [*motion, self.near, counts]
+        launch_over_queue(cull, self.near, counts, Count.NEAR, inputs=inputs, outputs=[self._survivors])
         lap("cull")
 
         inputs = [*motion, self._survivors, counts]

@@ -96,11 +96,11 @@ def _query(kind, points, method, timed, tolerance, device):
     elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
-    narrow_phase.candidates.assign(pairs)
+    narrow_phase.near.assign(pairs)
 
     def solve(method):
         while True:
-            counts.assign([n] + [0] * (len(Count) - 1))
+            counts.assign([n if count == Count.NEAR else 0 for count in Count])
             narrow_phase.run(x0, x1, elements, method=method, timed=timed, tolerance=tolerance)
             if not narrow_phase.overflowed(counts.numpy()):
                 break

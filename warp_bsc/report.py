@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from .bench import DetectorBenchmark
+from .bench_queries import MODES, SEED, QueryBenchmark
 from .query import QueryResult
 from .query_file import QueryFile
 from .replay import Interval
@@ -19,8 +20,10 @@ __all__ = [
     "detector_benchmarks_to_dict",
     "print_detector_benchmarks",
     "print_queries",
+    "print_query_benchmarks",
     "print_replay",
     "queries_to_dict",
+    "query_benchmarks_to_dict",
     "replay_to_dict",
 ]
 
@@ -355,6 +358,92 @@ def detector_benchmarks_to_dict(
                 "candidates_per_second": found.candidates_per_second,
                 "memory_bytes": found.memory,
                 "ipc_toolkit": asdict(found.ipc_toolkit) if found.ipc_toolkit else None,
+            }
+            for found in benchmarks
+        ],
+    }
+
+
+def print_query_benchmarks(
+    console: Console, benchmarks: list[QueryBenchmark], *, copy_rate: float, device, threads: int, repeat: int
+) -> None:
+    """Print how many elementary queries a second were answered, and what the answers were.
+
+    Args:
+        console: Where to.
+        benchmarks: The measurements of each kind of query.
+        copy_rate: Bytes that the device reads and writes when it copies [1/s].
+        device: The Warp device that was used.
+        threads: How many CPU cores were used.
+        repeat: How many repetitions the medians are of.
+    """
+    cores = _count(threads, "core") if device.is_cpu else device.name
+    _say(console, f"Random queries on {device}, {cores}; medians of {_count(repeat, 'repetition')}")
+    caption = "Survivors: queries that the culls leave."
+    table = _table("Kind", "Queries", "Survivors", "Share", "Free", "Hit", "Unsure", caption=caption)
+    for found in benchmarks:
+        numbers = [len(found.status), found.survivors, found.free, found.hits, found.unsure]
+        number, survivors, *answers = (f"{number:,}" for number in numbers)
+        table.add_row(found.kind, number, survivors, f"{found.survivor_share:.1%}", *answers)
+    console.print(table)
+    console.print()
+
+    table = _table(
+        "Mode",
+        "ms",
+        "Million\nqueries/s",
+        "Bytes\na query",
+        "GB/s",
+        "Share of\ncopying",
+    )
+    for took in benchmarks:
+        for mode, milliseconds in took.milliseconds.items():
+            rate = took.bytes_per_second[mode]
+            table.add_row(
+                f"{took.kind}, {mode}",
+                f"{milliseconds:,.2f}",
+                f"{took.queries_per_second[mode] / 1e6:,.1f}",
+                str(MODES[mode]),
+                f"{rate / 1e9:,.1f}",
+                f"{rate / copy_rate:.1%}",
+            )
+    console.print(table)
+    console.print()
+    _say(console, "status: the status of a query, one thread each.")
+    _say(console, "impact: its time of impact, coordinates and normal too.")
+    _say(console, "queued: its status, by one kernel that culls and one for the survivors.")
+    _say(console, f"Copying reads and writes {copy_rate / 1e9:,.1f} GB/s here.")
+
+
+def query_benchmarks_to_dict(
+    benchmarks: list[QueryBenchmark], *, copy_rate: float, device, threads: int, repeat: int
+) -> dict:
+    """Every measurement, to be written as JSON. Arguments as of :func:`print_query_benchmarks`."""
+    return {
+        "benchmark": "queries",
+        "device": str(device),
+        "device_name": device.name,
+        "threads": threads,
+        "repeat": repeat,
+        "seed": SEED,
+        "copy_bytes_per_second": copy_rate,
+        "kinds": [
+            {
+                "kind": found.kind,
+                "queries": len(found.status),
+                "survivors": found.survivors,
+                "survivor_share": found.survivor_share,
+                "certified": {"free": found.free, "hit": found.hits, "unsure": found.unsure},
+                "modes": {
+                    mode: {
+                        "milliseconds": milliseconds,
+                        "queries_per_second": found.queries_per_second[mode],
+                        "bytes_per_query": MODES[mode],
+                        "bytes_per_second": found.bytes_per_second[mode],
+                        "share_of_copy": found.bytes_per_second[mode] / copy_rate,
+                    }
+                    for mode, milliseconds in found.milliseconds.items()
+                },
             }
             for found in benchmarks
         ],

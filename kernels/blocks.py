@@ -1,0 +1,171 @@
+"""Blocks of eight boxes, eight elements each, compared with the vector instructions of a CPU.
+
+Elements sorted along a space-filling curve are cut into blocks of eight. Eight blocks have a node, eight nodes have one
+of the next level, up to one root: a tree whose links are arithmetic. Everything of the same sort lies beside each other
+in eights, so that one box is compared with eight at once.
+
+- ``boxes``, float32, 96 a block: for each axis the lowest and the highest coordinate at the start, then at the end.
+- ``elements``, int32, 40 a block: the numbers of the elements, three corners each, and their worlds.
+- ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
+- ``node_worlds``, int32, 16 a node: the first and the last world of the children.
+
+Where there are fewer than eight, the boxes of the others are empty, which overlap nothing.
+"""
+
+import warp as wp
+
+
+@wp.func_native(
+    snippet="""
+    typedef float Floats __attribute__((ext_vector_type(8), aligned(4)));
+    typedef int Ints __attribute__((ext_vector_type(8), aligned(4)));
+    typedef bool Bools __attribute__((ext_vector_type(8)));
+
+    auto floats = [](const float* at) { return *(const Floats*)at; };
+    auto ints = [](const int* at) { return *(const Ints*)at; };
+    auto bits = [](Ints mask) -> unsigned {
+        return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
+    };
+    auto lowest = [](float a, float b) { return a < b ? a : b; };
+    auto highest = [](float a, float b) { return a > b ? a : b; };
+
+    const float* box = boxes.data + 96 * (size_t)block;
+    const int* element = elements.data + 40 * (size_t)block;
+
+    // the block's own box, over all of the time, and its worlds, sorted as they are
+    Floats lows[3], highs[3];
+    float low[3], high[3];
+    for (int axis = 0; axis < 3; ++axis) {
+        const float* at = box + 32 * axis;
+        lows[axis] = __builtin_elementwise_min(floats(at), floats(at + 16));
+        highs[axis] = __builtin_elementwise_max(floats(at + 8), floats(at + 24));
+        low[axis] = lows[axis][0];
+        high[axis] = highs[axis][0];
+        for (int lane = 1; lane < 8; ++lane) {
+            low[axis] = lowest(low[axis], lows[axis][lane]);
+            high[axis] = highest(high[axis], highs[axis][lane]);
+        }
+    }
+    int first_world = element[32], last_world = element[32];
+    for (int lane = 1; lane < 8; ++lane)
+        last_world = element[32 + lane] > last_world ? element[32 + lane] : last_world;
+
+    const int capacity = pairs.shape[0];
+    constexpr int room = 512;
+    int found[2 * room];
+    int count = 0;
+    wp::int64 overlapping = 0;
+    auto flush = [&]() {
+        const wp::int64 slot = __atomic_fetch_add(&counts.data[near_count], (wp::int64)count, __ATOMIC_RELAXED);
+        for (int i = 0; i < count && slot + i < capacity; ++i) {
+            int* at = (int*)pairs.data + 2 * (size_t)(slot + i);
+            at[0] = found[2 * i];
+            at[1] = found[2 * i + 1];
+        }
+        count = 0;
+    };
+
+    auto compare = [&](int other, unsigned lanes) {
+        const float* other_box = other_boxes.data + 96 * (size_t)other;
+        const int* other_element = other_elements.data + 40 * (size_t)other;
+        Floats other_low0[3], other_high0[3], other_low1[3], other_high1[3], other_low[3], other_high[3];
+        for (int axis = 0; axis < 3; ++axis) {
+            const float* at = other_box + 32 * axis;
+            other_low0[axis] = floats(at);
+            other_high0[axis] = floats(at + 8);
+            other_low1[axis] = floats(at + 16);
+            other_high1[axis] = floats(at + 24);
+            other_low[axis] = __builtin_elementwise_min(other_low0[axis], other_low1[axis]);
+            other_high[axis] = __builtin_elementwise_max(other_high0[axis], other_high1[axis]);
+        }
+        for (; lanes; lanes &= lanes - 1) {
+            const int lane = __builtin_ctz(lanes);
+            Ints overlap = ints(other_element + 32) == element[32 + lane];
+            for (int axis = 0; axis < 3; ++axis)
+                overlap &= (other_low[axis] <= highs[axis][lane]) & (other_high[axis] >= lows[axis][lane]);
+            unsigned mask = bits(overlap);
+            if (symmetric && other == block)
+                mask &= ~((2u << lane) - 1u);
+            if (!mask)
+                continue;
+            Ints shared = 0;
+            for (int i = 0; i < corners; ++i)
+                for (int j = 0; j < other_corners; ++j)
+                    shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
+            mask &= ~bits(shared);
+            overlapping += __builtin_popcount(mask);
+            Ints apart = 0;
+            for (int axis = 0; axis < 3; ++axis) {
+                const float* at = box + 32 * axis + lane;
+                apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
+                apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
+            }
+            mask &= ~bits(apart);
+            if (count > room - 8)
+                flush();
+            for (; mask; mask &= mask - 1) {
+                const int a = element[lane], b = other_element[__builtin_ctz(mask)];
+                found[2 * count] = symmetric && b < a ? b : a;
+                found[2 * count + 1] = symmetric && b < a ? a : b;
+                ++count;
+            }
+        }
+    };
+
+    // at most seven nodes wait on each of at most eleven levels
+    struct { int level, node; } stack[88];
+    int height = 0;
+    stack[height++] = {level_starts.shape[0] - 2, 0};
+    while (height > 0) {
+        const int level = stack[--height].level, node = stack[height].node;
+        const float* child = other_nodes.data + 48 * (size_t)(level_starts.data[level] + node);
+        const int* child_worlds = other_node_worlds.data + 16 * (size_t)(level_starts.data[level] + node);
+        Ints overlap = (ints(child_worlds) <= last_world) & (ints(child_worlds + 8) >= first_world);
+        for (int axis = 0; axis < 3; ++axis)
+            overlap &= (floats(child + 16 * axis) <= high[axis]) & (floats(child + 16 * axis + 8) >= low[axis]);
+        for (unsigned mask = bits(overlap); mask; mask &= mask - 1) {
+            const int lane = __builtin_ctz(mask);
+            const wp::int64 index = 8 * (wp::int64)node + lane;
+            // each pair of blocks once: the blocks below one are those from 8^level times its index on
+            if (symmetric && ((index + 1) << (3 * level)) <= block)
+                continue;
+            if (level > 0) {
+                stack[height++] = {level - 1, (int)index};
+                continue;
+            }
+            Ints near_child = -1;
+            for (int axis = 0; axis < 3; ++axis)
+                near_child &= (lows[axis] <= child[16 * axis + 8 + lane]) & (highs[axis] >= child[16 * axis + lane]);
+            compare((int)index, bits(near_child));
+        }
+    }
+    if (count)
+        flush();
+    if (overlapping)
+        __atomic_fetch_add(&counts.data[overlap_count], overlapping, __ATOMIC_RELAXED);
+"""
+)
+def pair_block(
+    block: int,
+    boxes: wp.array[wp.float32],
+    elements: wp.array[wp.int32],
+    corners: int,
+    other_boxes: wp.array[wp.float32],
+    other_elements: wp.array[wp.int32],
+    other_corners: int,
+    other_nodes: wp.array[wp.float32],
+    other_node_worlds: wp.array[wp.int32],
+    level_starts: wp.array[wp.int32],
+    symmetric: int,
+    counts: wp.array[wp.int64],
+    overlap_count: int,
+    near_count: int,
+    pairs: wp.array[wp.vec2i],
+):
+    """Enqueues the pairs of a block's elements with those of a tree that share no corner and come near.
+
+    A pair whose boxes overlap over the time of the motion is counted, and enqueued unless an axis separates the two at
+    the start and at the end, on the same side. With ``symmetric`` both are of one tree, and each pair comes once, the
+    smaller number first.
+    """
+    ...
