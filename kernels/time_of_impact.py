@@ -12,6 +12,7 @@ from .classification import constant_signs, verdict
 from .closest import between, closest_coordinates, contact_at
 from .culling import direction_separates
 from .polynomials import Coplanarity, Motion, inside_tests, largest_axis
+from .roots import largest
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 
 MAX_VISITS = wp.constant(256)
@@ -65,13 +66,14 @@ def restrict_motion(motion: Motion, start: wp.float64, end: wp.float64) -> Motio
 
 
 @wp.func
-def status_between(motion: Motion, y: Coplanarity, start: wp.float64, end: wp.float64) -> int:
+def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float64, end: wp.float64) -> int:
     """Status over a part of the time: HIT if contact certainly occurs in it, FREE if certainly not.
+
+    The cubic k is Y restricted to that part.
 
     Bounds: restriction interpolates twice or thrice, 3r of the size each time: 9r k <= E for the cubic, 6r q <= 1.2F
     for the quadratics.
     """
-    k = restrict_cubic(y.k, start, end)
     k_bound = _CUBIC_ERROR * y.bound
     if certified_sign_cubic(k, k_bound) != 0:
         return FREE
@@ -102,10 +104,7 @@ def status_between(motion: Motion, y: Coplanarity, start: wp.float64, end: wp.fl
 
 @wp.func
 def approximate_root(k: wp.vec4d) -> wp.float64:
-    """A root of a cubic that has opposite signs at 0 and at 1, by Newton's method, kept in place by bisection.
-
-    Nothing is certified: it only says where to look.
-    """
+    """A root of a cubic that has opposite signs at 0 and at 1, by Newton's method, kept in place by bisection."""
     low = _ZERO
     high = _ONE
     t = k[0] / (k[0] - k[3])
@@ -129,61 +128,123 @@ def approximate_root(k: wp.vec4d) -> wp.float64:
 
 
 @wp.func
+def approximate_extremum(k: wp.vec4d) -> wp.float64:
+    """Where in [0, 1] a cubic with one sign at 0 and at 1 turns back from zero; 0 or 1 if nowhere."""
+    d0 = k[1] - k[0]
+    d1 = k[2] - k[1]
+    d2 = k[3] - k[2]
+    discriminant = d1 * d1 - d0 * d2
+    if discriminant <= _ZERO:
+        return _ZERO
+    # the root of the derivative d at which that rises where Y is positive, falls where Y is negative
+    root = wp.where(k[0] > _ZERO, wp.sqrt(discriminant), -wp.sqrt(discriminant))
+    b = d0 - d1
+    if b * root >= _ZERO:
+        return wp.clamp((b + root) / (b - d1 + d2), _ZERO, _ONE)
+    return wp.clamp(d0 / (b - root), _ZERO, _ONE)
+
+
+@wp.func
+def where_to_look(k: wp.vec4d) -> wp.float64:
+    """A time at which a cubic is about zero, or nearest to it, not certified; 0 or 1 if there is none between."""
+    if k[0] * k[3] < _ZERO:
+        return approximate_root(k)
+    return approximate_extremum(k)
+
+
+@wp.func
 def power_of_two(x: wp.float64) -> wp.float64:
     """The largest power of two up to a positive number."""
     return wp.cast((wp.cast(x, wp.uint64) >> wp.uint64(52)) << wp.uint64(52), wp.float64)
 
 
 @wp.func
-def first_contact(motion: Motion, y: Coplanarity, tolerance: wp.float64):
-    """Time before which there is certainly no contact, found by halving the step, earlier halves first.
+def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64):
+    """Time before which there is certainly no contact, by asking one interval after the other, earlier ones first.
+
+    An interval that is certainly free is left behind, and the other half or one twice as long comes next. An undecided
+    one is made shorter: so that it ends half the tolerance before a root of Y, where all is free as a rule, and the
+    interval of the tolerance's length that comes next certainly contains contact; or before Y turns back from zero;
+    else by half.
 
     The search ends at the first interval that certainly contains contact and is short enough, which makes its start the
-    time of impact to within the tolerance; or at the first that stays undecided, after which nothing is known.
-    Contact at a time that halving hits exactly stays undecided on both sides: intervals shorter than half the tolerance
-    are therefore tried again stretched to the whole of it.
+    time of impact to within the tolerance; or at one that stays undecided, after which nothing is known. That is one of
+    the shortest length, or one of the tolerance's in which already the shortest around the root is undecided, or the
+    whole step if the features may touch at the start and the shortest there is undecided.
 
-    Most queries have one root, so the interval around it at which halving would end is tried first: that it contains
-    contact, and that all before it is free, are two tests in place of twenty.
+    All times are multiples of the shortest length, a power of two, and hence exact.
+
+    Args:
+        motion: The query.
+        y: Its coplanarity.
+        status: What classification found: a HIT need not be asked for the whole step.
+        tolerance: Of the time, as a share of the step.
 
     Returns:
         Status (FREE, HIT, UNSURE), time, exact in double precision, 2 if FREE, and the end of the interval that the
         search ended at.
     """
-    if y.k[0] * y.k[3] < _ZERO:
-        length = power_of_two(tolerance)
-        guess = length * wp.floor(approximate_root(y.k) / length)
-        if status_between(motion, y, guess, guess + length) == HIT:
-            if guess == _ZERO or status_between(motion, y, _ZERO, guess) == FREE:
-                return HIT, guess, guess + length
+    length = power_of_two(tolerance)
+    shortest = FINEST * length
     start = _ZERO
-    width = _ONE
-    index = wp.int64(0)
-    stretched = bool(False)
-    for _visit in range(MAX_VISITS):
-        end = wp.where(stretched, wp.min(start + tolerance, _ONE), start + width)
-        status = status_between(motion, y, start, end)
-        if status == HIT and (stretched or width <= tolerance):
+    end = _ONE
+    root = _ZERO
+    ahead = bool(False)  # whether there may be a root half the tolerance behind the end of the interval
+    passing = bool(False)  # whether the interval is the one around that root
+    halved = bool(False)  # whether the interval is half of an undecided one
+    probing = bool(False)  # whether the shortest interval around the root is asked in place of the interval
+    probed = certified_sign(y.k[0], y.bound) != 0
+    answer = status
+    k = y.k
+    for visit in range(MAX_VISITS):
+        width = end - start
+        if visit > 0 or status != HIT:
+            low = wp.where(probing, wp.max(root - shortest, start), start)
+            high = wp.where(probing, wp.min(root + shortest, end), end)
+            k = restrict_cubic(y.k, low, high)
+            answer = status_between(motion, y, k, low, high)
+        half = shortest * wp.floor(_HALF * width / shortest)
+        if probing:
+            if answer == UNSURE:
+                return UNSURE, start, end
+            probing = False
+            probed = True
+            end = start + half
+            halved = True
+        elif answer == HIT and width <= length:
             return HIT, start, end
-        if stretched:
-            stretched = False
-        elif status == FREE:
-            index += wp.int64(1)
-            while width < _ONE and index % wp.int64(2) == wp.int64(0):
-                index /= wp.int64(2)
-                width += width
-            if index == wp.int64(1) and width == _ONE:
+        elif answer == FREE:
+            if end == _ONE:
                 return FREE, wp.float64(2.0), end
-            start = wp.float64(index) * width
-            continue
-        elif width + width <= tolerance:
-            stretched = True
-            continue
-        if width <= FINEST * tolerance:
+            start = end
+            width = wp.where(ahead, length, wp.where(halved, width, width + width))
+            end = wp.where(passing, _ONE, wp.min(start + width, _ONE))
+            passing = ahead
+            ahead = False
+            halved = False
+            probed = False
+        elif width <= shortest or (width <= length and largest(k) <= _CUBIC_ERROR * y.bound):
             return UNSURE, start, end
-        index *= wp.int64(2)
-        width *= _HALF
-    return UNSURE, start, start
+        elif start == _ZERO and not probed:
+            probing = True
+        else:
+            time = where_to_look(k)
+            root = start + shortest * wp.floor(width * time / shortest)
+            ahead = False
+            passing = False
+            halved = False
+            if time <= _ZERO or time >= _ONE or (probed and width <= length):
+                end = start + half
+                halved = True
+            elif root - _HALF * length > start:
+                end = root - _HALF * length
+                ahead = True
+            elif width > length:
+                end = start + length
+                passing = True
+            else:
+                probing = True
+    return UNSURE, start, end
 
 
 @wp.func
@@ -197,7 +258,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
         tolerance: Of the time of impact, as a share of the step.
     """
     result = Impact()
-    found, toi, end = first_contact(motion, y, tolerance)
+    found, toi, end = first_contact(motion, y, status, tolerance)
     if status == HIT and found == FREE:
         # cannot be, unless signs are those that floating point computes: then all that is known is that it starts at 0
         found = UNSURE
