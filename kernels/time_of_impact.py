@@ -24,6 +24,7 @@ FINEST = wp.constant(wp.float64(2.0**-8))
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
+_PLANAR = wp.constant(wp.float64(64.0))  # such an interval in lengths
 _NEWTON_STEPS = wp.constant(12)
 _NEWTON_END = wp.constant(wp.float64(2.0**-40))
 _CUBIC_ERROR = wp.constant(wp.float64(2.0))
@@ -169,8 +170,9 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
 
     The search ends at the first interval that certainly contains contact and is short enough, which makes its start the
     time of impact to within the tolerance; or at one that stays undecided, after which nothing is known. That is one of
-    the shortest length, or one of the tolerance's in which already the shortest around the root is undecided, or the
-    whole step if the features may touch at the start and the shortest there is undecided.
+    the shortest length; or one of the tolerance's in which already the shortest around the root is undecided; or the
+    whole step if the features may touch at the start and the shortest there is undecided; or one in which Y is zero as
+    far as can be told, so that no part of it certainly contains contact, and which is short enough for a bound.
 
     All times are multiples of the shortest length, a power of two, and hence exact.
 
@@ -223,7 +225,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             ahead = False
             halved = False
             probed = False
-        elif width <= shortest or (width <= length and largest(k) <= _CUBIC_ERROR * y.bound):
+        elif width <= shortest or (width <= _PLANAR * length and largest(k) <= _CUBIC_ERROR * y.bound):
             return UNSURE, start, end
         elif start == _ZERO and not probed:
             probing = True

@@ -326,20 +326,25 @@ class CollisionDetector:
         """
         mesh, counts = self.mesh, self._counts
         counts.zero_()
-        count_not_finite, _ = _kernels(x0.dtype)
-        wp.launch(count_not_finite, mesh.vertex_count, inputs=[x0, x1], outputs=[counts], device=mesh.device)
         vertex_face, edge_edge = self._vertex_face, self._edge_edge
         self._broad_phase.pair_elements(x0, x1, vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near)
         options = {"method": self.method, "tolerance": self.tolerance}
         if clock:
+            self._count_not_finite(x0, x1)
             clock.lap("broad phase")
             self._vertex_face.run(x0, x1, mesh.device_faces, **options, lap=clock.lap)
             self._edge_edge.run(x0, x1, mesh.device_edges, **options, lap=clock.lap)
             return
         with wp.ScopedStream(self._side_stream):
+            self._count_not_finite(x0, x1)
             self._vertex_face.run(x0, x1, mesh.device_faces, **options)
         self._edge_edge.run(x0, x1, mesh.device_edges, **options)
         wp.wait_stream(self._side_stream)
+
+    def _count_not_finite(self, x0, x1):
+        count_not_finite, _ = _kernels(x0.dtype)
+        inputs, outputs = [x0, x1], [self._counts]
+        wp.launch(count_not_finite, self.mesh.vertex_count, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def _overflowed(self, counts):
         return bool(

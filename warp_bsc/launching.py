@@ -24,13 +24,14 @@ def _load(kernel):
     kernel.module.load("cpu")
 
 
-def launch_over(kernel, count, *, inputs, outputs, device):
+def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256):
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
-    The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``.
+    The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
+    suit kernels of which few threads work long.
     """
     if device.is_cuda:
-        wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device)
+        wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, block_dim=block_dim)
         return
     chunk = max(_SMALLEST_CHUNK, -(-count // (8 * _THREADS)))
 
@@ -47,10 +48,10 @@ def launch_over(kernel, count, *, inputs, outputs, device):
         list(_pool().map(launch, starts))
 
 
-def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs):
+def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs, block_dim=256):
     """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU, without asking."""
     device = queue.device
     entries = len(queue)
     if device.is_cpu:
         entries = min(entries, int(counts.numpy()[count]))
-    launch_over(kernel, entries, inputs=inputs, outputs=outputs, device=device)
+    launch_over(kernel, entries, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)

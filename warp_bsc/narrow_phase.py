@@ -388,7 +388,9 @@ class NarrowPhase:
 
         inputs = [*motion, timed, tolerance, found.pairs, counts]
         outputs = [*found.arrays[1:], self._keys, self._order, *self._bits]
-        launch_over_queue(find_impacts, found.pairs, counts, Count.CONTACTS, inputs=inputs, outputs=outputs)
+        launch_over_queue(
+            find_impacts, found.pairs, counts, Count.CONTACTS, inputs=inputs, outputs=outputs, block_dim=32
+        )
         lap("time of impact")
 
         entries = len(found.pairs)
