@@ -183,11 +183,11 @@ class _Tree:
         encode, fill_blocks = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
-        launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device)
+        launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
         inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order]
         outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
-        launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device)
+        launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
         for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
             _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
@@ -216,7 +216,7 @@ class _Tree:
             other is self,
             counts,
         ]
-        launch_over(_pair_blocks, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device)
+        launch_over(_pair_blocks, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
 
 
 def _join(children, parents):

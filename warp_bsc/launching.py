@@ -8,7 +8,6 @@ import warp as wp
 
 __all__ = ["launch_over", "launch_over_queue"]
 
-_SMALLEST_CHUNK = 1024
 _THREADS = os.cpu_count() or 1
 
 
@@ -24,16 +23,16 @@ def _load(kernel):
     kernel.module.load("cpu")
 
 
-def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256):
+def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=1024):
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
     The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
-    suit kernels of which few threads work long.
+    suit kernels of which few threads work long; a chunk, at least so large, is what a core takes at a time.
     """
     if device.is_cuda:
         wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, block_dim=block_dim)
         return
-    chunk = max(_SMALLEST_CHUNK, -(-count // (8 * _THREADS)))
+    chunk = max(chunk, -(-count // (8 * _THREADS)))
 
     def launch(first):
         dim = min(chunk, count - first)
