@@ -8,7 +8,7 @@ import warp as wp
 from .kernels.blocks import pair_block
 from .kernels.boxes import rounded
 from .launching import launch_over
-from .narrow_phase import Count
+from .narrow_phase import UNLIMITED, Count
 
 __all__ = ["BlockBroadPhase"]
 
@@ -171,8 +171,8 @@ class _Tree:
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
 
-    def build(self, x0, x1, low, scale):
-        """Sorts the elements of a motion and boxes them.
+    def sort(self, x0, x1, low, scale):
+        """Sorts the elements of a motion along a Morton curve.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
@@ -180,13 +180,18 @@ class _Tree:
             low: Lowest coordinates of all, shape [3].
             scale: Cells of the sorting grid per unit of length, for each axis, shape [3].
         """
-        encode, fill_blocks = _kernels(x0.dtype)
+        encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
+
+    def fit(self, x0, x1):
+        """Boxes the elements of a motion, Warp arrays of vec3 or vec3d, in the order that they are in."""
+        _, fill_blocks = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order]
         outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
+        device = self._corners.device
         launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
         for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
@@ -233,6 +238,7 @@ class BlockBroadPhase:
     """
 
     queues = ()
+    capacity = UNLIMITED
 
     def __init__(self, mesh, count):
         """Makes room for trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
@@ -240,14 +246,10 @@ class BlockBroadPhase:
         self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
         self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world)
 
-    def overflowed(self, count):
-        """False, as there is no queue that could."""
-        return False
-
     def grow(self, count):
         """Nothing, as there is nothing that could."""
 
-    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
+    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False):
         """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
 
         Args:
@@ -257,8 +259,10 @@ class BlockBroadPhase:
             vertex_face: Queue for (vertex, face), array of vec2i.
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
+            refit: Whether to keep the order of the run before, which is as right, but slows down what follows if much
+                has moved.
         """
-        _build([self._vertices, self._edges, self._faces], x0, x1)
+        _build([self._vertices, self._edges, self._faces], x0, x1, refit)
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge)
 
@@ -270,16 +274,23 @@ class BlockBroadPhase:
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
         """
-        _build([self._edges, self._faces], x, x)
+        _build([self._edges, self._faces], x, x, False)
         self._edges.pair(self._faces, counts, pairs)
 
 
-def _build(trees, x0, x1):
-    """Builds trees for a motion, sorted on one grid around all of it."""
+def _build(trees, x0, x1, refit):
+    """Builds trees for a motion, sorted on one grid around all of it, or refits them."""
+    if not refit:
+        _sort(trees, x0, x1)
+    for tree in trees:
+        tree.fit(x0, x1)
+
+
+def _sort(trees, x0, x1):
     ends = x0.numpy(), x1.numpy()
     low = np.array([min(x[:, axis].min(initial=np.inf) for x in ends) for axis in range(3)])
     high = np.array([max(x[:, axis].max(initial=-np.inf) for x in ends) for axis in range(3)])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         scale = np.nan_to_num((1 << _CODE_BITS) / (high - low), posinf=0.0)
     for tree in trees:
-        tree.build(x0, x1, low, scale)
+        tree.sort(x0, x1, low, scale)

@@ -333,16 +333,17 @@ class BvhBroadPhase:
         self._bvh = None
         self.queues = [wp.empty(8 * faces, dtype=wp.vec2i, device=device)]
 
-    def overflowed(self, count):
-        """Whether a queue was too small for the count."""
-        return count > len(self.queues[0])
+    @property
+    def capacity(self):
+        """How much room there is for what the count counts."""
+        return len(self.queues[0])
 
     def grow(self, count):
         """Makes the queue large enough for the count."""
-        if self.overflowed(count):
+        if count > self.capacity:
             self.queues = [wp.empty(roomy(count), dtype=wp.vec2i, device=self._device)]
 
-    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
+    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False):
         """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
 
         Args:
@@ -352,8 +353,10 @@ class BvhBroadPhase:
             vertex_face: Queue for (vertex, face), array of vec2i.
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
+            refit: Whether to keep the hierarchy of the run before and only refit its boxes, which is as right and
+                allocates nothing, but slows down what follows if much has moved.
         """
-        self._pair_faces(x0, x1)
+        self._pair_faces(x0, x1, refit)
         self._launch_over_pairs(_pair_elements, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_edges_with_faces(self, x, counts, pairs):
@@ -364,10 +367,10 @@ class BvhBroadPhase:
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
         """
-        self._pair_faces(x, x)
+        self._pair_faces(x, x, False)
         self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
 
-    def _pair_faces(self, x0, x1):
+    def _pair_faces(self, x0, x1, refit):
         """Boxes all elements, and enqueues the pairs of faces whose swept boxes overlap, each once."""
         faces = len(self._mesh.faces)
         if faces == 0:
@@ -376,6 +379,8 @@ class BvhBroadPhase:
         boxes = self._mesh.face_lowers, self._mesh.face_uppers
         if self._bvh is None:
             self._bvh = wp.Bvh(*boxes, groups=self._worlds)
+        elif refit:
+            self._bvh.refit()
         else:
             self._bvh.rebuild()
         inputs = [self._bvh.id, *boxes, self._worlds, self._count, *self.queues]

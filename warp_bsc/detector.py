@@ -183,6 +183,14 @@ class CollisionDetector:
 
     Once its queues are large enough, which a detection sees to that is not captured, a detection allocates nothing and
     asks the device nothing, and can be captured in a CUDA graph and replayed on new positions in the same arrays.
+
+    Attributes:
+        mesh: The mesh.
+        method: The method.
+        tolerance: Of the times of impact, as a share of the step.
+        counts: What the last detection counted, Warp array of int64.
+        capacities: How much room there is for each count, and none for positions that are not finite, Warp array of
+            int64: where a count is larger, something is missing.
     """
 
     def __init__(self, mesh, *, method="conservative", tolerance=TOLERANCE):
@@ -208,15 +216,17 @@ class CollisionDetector:
         self._retired = []  # queues that a CUDA graph may still write to
         self._last = lambda: None  # the last results, as long as someone holds them
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
-        self._counts = wp.zeros(_COUNTS, dtype=wp.int64, device=mesh.device)
+        self.counts = wp.zeros(_COUNTS, dtype=wp.int64, device=mesh.device)
         faces = len(mesh.faces)
-        self._broad_phase = _broad_phase(mesh, self._counts[_BROAD_PHASE:_VERTEX_FACE])
+        self._broad_phase = _broad_phase(mesh, self.counts[_BROAD_PHASE:_VERTEX_FACE])
         self._vertex_face = NarrowPhase(
-            "vertex_face", self._counts[_VERTEX_FACE:_EDGE_EDGE], faces, (mesh.vertex_count, faces)
+            "vertex_face", self.counts[_VERTEX_FACE:_EDGE_EDGE], faces, (mesh.vertex_count, faces)
         )
         self._edge_edge = NarrowPhase(
-            "edge_edge", self._counts[_EDGE_EDGE:_COUNTS], 2 * faces, (len(mesh.edges), len(mesh.edges))
+            "edge_edge", self.counts[_EDGE_EDGE:_COUNTS], 2 * faces, (len(mesh.edges), len(mesh.edges))
         )
+
+        self.capacities = wp.array(self._room(), dtype=wp.int64, device=mesh.device)
 
     def detect(self, x0, x1):
         """Finds the collisions of a motion.
@@ -252,7 +262,7 @@ class CollisionDetector:
         while True:
             clock = _StageClock(self.mesh.device)
             self._launch(x0, x1, clock)
-            counts = self._counts.numpy()
+            counts = self.counts.numpy()
             if counts[_NOT_FINITE]:
                 for name, x in (("x0", x0), ("x1", x1)):
                     checked_coordinates(x.numpy(), (3,), name)
@@ -287,7 +297,7 @@ class CollisionDetector:
         while True:
             broad_phase.pair_edges_with_faces(x, counts[1:], candidates)
             pairs, found = (int(count) for count in counts.numpy()[[0, 1 + Count.NEAR]])
-            if not broad_phase.overflowed(pairs) and found <= len(candidates):
+            if pairs <= broad_phase.capacity and found <= len(candidates):
                 break
             broad_phase.grow(pairs)
             if found > len(candidates):
@@ -324,7 +334,7 @@ class CollisionDetector:
 
         With a clock one stage runs after the other; without, in a CUDA graph, the two kinds of pair side by side.
         """
-        mesh, counts = self.mesh, self._counts
+        mesh, counts = self.mesh, self.counts
         counts.zero_()
         vertex_face, edge_edge = self._vertex_face, self._edge_edge
         self._broad_phase.pair_elements(x0, x1, vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near)
@@ -332,34 +342,73 @@ class CollisionDetector:
         if clock:
             self._count_not_finite(x0, x1)
             clock.lap("broad phase")
-            self._vertex_face.run(x0, x1, mesh.device_faces, **options, lap=clock.lap)
-            self._edge_edge.run(x0, x1, mesh.device_edges, **options, lap=clock.lap)
+            vertex_face.run(x0, x1, mesh.device_faces, **options, lap=clock.lap)
+            edge_edge.run(x0, x1, mesh.device_edges, **options, lap=clock.lap)
+            for narrow_phase in (vertex_face, edge_edge):
+                narrow_phase.sort()
+            clock.lap("sort")
             return
         with wp.ScopedStream(self._side_stream):
             self._count_not_finite(x0, x1)
-            self._vertex_face.run(x0, x1, mesh.device_faces, **options)
-        self._edge_edge.run(x0, x1, mesh.device_edges, **options)
+            vertex_face.run(x0, x1, mesh.device_faces, **options)
+            vertex_face.sort()
+        edge_edge.run(x0, x1, mesh.device_edges, **options)
+        edge_edge.sort()
         wp.wait_stream(self._side_stream)
+
+    def find_contacts(self, x0, x1, *, refit=False):
+        """Launches a detection without sorting, on one stream, for those who respond to it on the device.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
+            x1: Positions at the end, of the same type.
+            refit: Whether the hierarchy of the detection before will do, because little has moved since. Then this can
+                be captured in the body of a conditional node.
+
+        Returns:
+            The narrow phases of vertex-face and edge-edge pairs, whose ``unsorted`` are the contacts.
+        """
+        counts, vertex_face, edge_edge = self.counts, self._vertex_face, self._edge_edge
+        self._run += 1
+        self._captured |= self.mesh.device.is_capturing
+        counts.zero_()
+        self._count_not_finite(x0, x1)
+        queues = vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near
+        self._broad_phase.pair_elements(x0, x1, *queues, refit=refit)
+        for narrow_phase, elements in ((vertex_face, self.mesh.device_faces), (edge_edge, self.mesh.device_edges)):
+            narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance)
+        return vertex_face, edge_edge
+
+    def grow(self):
+        """Makes queues larger that were too small; returns whether any was. Asks the device."""
+        counts = self.counts.numpy()
+        overflowed = self._overflowed(counts)
+        if overflowed:
+            self._grow(counts)
+        return overflowed
 
     def _count_not_finite(self, x0, x1):
         count_not_finite, _ = _kernels(x0.dtype)
-        inputs, outputs = [x0, x1], [self._counts]
+        inputs, outputs = [x0, x1], [self.counts]
         wp.launch(count_not_finite, self.mesh.vertex_count, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
+    def _room(self):
+        """How much room there is for what each count counts; none for positions that are not finite."""
+        queues = [*self._vertex_face.capacities, *self._edge_edge.capacities]
+        return np.array([0, self._broad_phase.capacity, *queues], dtype=np.int64)
+
     def _overflowed(self, counts):
-        return bool(
-            self._broad_phase.overflowed(counts[_BROAD_PHASE])
-            or self._vertex_face.overflowed(counts[_VERTEX_FACE:_EDGE_EDGE])
-            or self._edge_edge.overflowed(counts[_EDGE_EDGE:_COUNTS])
-        )
+        return bool((counts > self._room())[_BROAD_PHASE:].any())
 
     def _grow(self, counts):
         self._growth += 1
         if self._captured:
             self._retired += [*self._broad_phase.queues, *self._vertex_face.queues, *self._edge_edge.queues]
+            self._retired.append(self.capacities)
         self._broad_phase.grow(counts[_BROAD_PHASE])
         self._vertex_face.grow(counts[_VERTEX_FACE:_EDGE_EDGE])
         self._edge_edge.grow(counts[_EDGE_EDGE:_COUNTS])
+        self.capacities = wp.array(self._room(), dtype=wp.int64, device=self.mesh.device)
 
     def _read(self, clock, *positions):
         """The results of the last run, by the names of the attributes of Collisions.
@@ -368,7 +417,7 @@ class CollisionDetector:
             clock: None in a CUDA graph.
             positions: If given, contacts that floating point leaves open are decided exactly.
         """
-        counts = self._counts.numpy()
+        counts = self.counts.numpy()
         overflowed = self._overflowed(counts)
         results = {
             "overflowed": overflowed,

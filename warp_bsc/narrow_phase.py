@@ -29,6 +29,7 @@ from .launching import launch_over_queue
 __all__ = [
     "METHODS",
     "TOLERANCE",
+    "UNLIMITED",
     "Contacts",
     "Count",
     "NarrowPhase",
@@ -37,6 +38,9 @@ __all__ = [
     "decide_exactly",
     "roomy",
 ]
+
+UNLIMITED = 2**62
+"""Capacity for what is only counted."""
 
 METHODS = ("float", "conservative", "exact")
 """What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
@@ -300,6 +304,7 @@ class NarrowPhase:
     Attributes:
         near: Queue of the pairs to decide, to be filled by whoever finds them, array of vec2i.
         counts: Counts by :class:`Count`, array of int64.
+        unsorted: The contacts, as many as ``counts[Count.CONTACTS]`` says, of which some have turned out to be free.
         contacts: The contacts, sorted, as many as ``counts[Count.FOUND]`` says.
     """
 
@@ -324,7 +329,7 @@ class NarrowPhase:
 
     def _reserve_contacts(self, capacity):
         device = self.counts.device
-        self._unsorted = Contacts(capacity, device)
+        self.unsorted = Contacts(capacity, device)
         self.contacts = Contacts(capacity, device)
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * capacity, dtype=int, device=device)
@@ -335,19 +340,21 @@ class NarrowPhase:
         return [
             self.near,
             self._survivors,
-            *self._unsorted.arrays,
+            *self.unsorted.arrays,
             *self.contacts.arrays,
             self._keys,
             self._order,
         ]
 
+    @property
+    def capacities(self):
+        """How much room there is for what each count counts, in the order of :class:`Count`."""
+        rooms = {Count.NEAR: self.near, Count.SURVIVORS: self._survivors, Count.CONTACTS: self.contacts.pairs}
+        return [len(rooms[count]) if count in rooms else UNLIMITED for count in Count]
+
     def overflowed(self, counts):
         """Whether a queue was too small for the counts, NumPy array."""
-        return (
-            counts[Count.NEAR] > len(self.near)
-            or counts[Count.SURVIVORS] > len(self._survivors)
-            or counts[Count.CONTACTS] > len(self.contacts.pairs)
-        )
+        return bool((counts > self.capacities).any())
 
     def grow(self, counts):
         """Makes the queues large enough for the counts, with a quarter to spare."""
@@ -360,7 +367,7 @@ class NarrowPhase:
             self._reserve_contacts(needed[Count.CONTACTS])
 
     def run(self, x0, x1, elements, *, method, timed=True, tolerance=TOLERANCE, lap=lambda stage: None):
-        """Launches all stages over the pairs, without asking the device anything.
+        """Launches all stages but the sorting over the pairs, without asking the device anything.
 
         Args:
             x0: Positions at the start of the step, Warp array of vec3 or vec3d.
@@ -375,7 +382,7 @@ class NarrowPhase:
         cull, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
         roundoff = 0.0 if method == "float" else ROUNDOFF
         motion = [x0, x1, elements, roundoff]
-        counts, found = self.counts, self._unsorted
+        counts, found = self.counts, self.unsorted
 
         inputs = [*motion, self.near, counts]
         launch_over_queue(cull, self.near, counts, Count.NEAR, inputs=inputs, outputs=[self._survivors])
@@ -393,13 +400,15 @@ class NarrowPhase:
         )
         lap("time of impact")
 
+    def sort(self):
+        """Launches the sorting of the contacts, without asking the device anything."""
+        counts, found = self.counts, self.unsorted
         entries = len(found.pairs)
         if counts.device.is_cpu:
             entries = min(entries, int(counts.numpy()[Count.CONTACTS]))
         wp.utils.radix_sort_pairs(self._keys, self._order, entries, end_bit=sum(self._bits) + 1)
         inputs = [found.pairs, counts, self._order, *found.arrays[1:]]
         launch_over_queue(_sort_contacts, found.pairs, counts, Count.FOUND, inputs=inputs, outputs=self.contacts.arrays)
-        lap("sort")
 
 
 def roomy(count):

@@ -102,6 +102,7 @@ def _query(kind, points, method, timed, tolerance, device):
         while True:
             counts.assign([n if count == Count.NEAR else 0 for count in Count])
             narrow_phase.run(x0, x1, elements, method=method, timed=timed, tolerance=tolerance)
+            narrow_phase.sort()
             if not narrow_phase.overflowed(counts.numpy()):
                 break
             narrow_phase.grow(counts.numpy())
