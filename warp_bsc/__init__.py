@@ -15,6 +15,8 @@ _MODULES = {
     "Collisions": "detector",
     "DetectionStats": "detector",
     "QueryResult": "query",
+    "SolverCCD": "solver",
+    "SolverReport": "solver",
     "query_edge_edge": "query",
     "query_vertex_face": "query",
 }
@@ -25,6 +27,8 @@ __all__ = [
     "Collisions",
     "DetectionStats",
     "QueryResult",
+    "SolverCCD",
+    "SolverReport",
     "checker",
     "query_edge_edge",
     "query_vertex_face",

@@ -1,0 +1,273 @@
+"""The collision stage: what it returns is free of collisions, by exact detection of what is stored, and little else."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_bsc as bsc
+
+DT = 1.0 / 240.0
+STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
+SOLVERS = {
+    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
+    "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
+    "semi_implicit": newton.solvers.SolverSemiImplicit,
+}
+
+
+def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
+    """A square patch of cloth, centred, in the xy plane."""
+    corner = np.subtract(at, (0.5 * n * cell, 0.5 * n * cell, 0.0))
+    sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], fixed)
+    builder.add_cloth_grid(
+        pos=wp.vec3(*corner),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(*velocity),
+        dim_x=n,
+        dim_y=n,
+        cell_x=cell,
+        cell_y=cell,
+        mass=0.001,
+        **sides,
+        **STIFF,
+        **options,
+    )
+
+
+def bullet(speed, *, device, worlds=1):
+    """A patch shot at a sheet that is held at its border."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(world, 16, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    add_patch(world, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -speed))
+    builder = world
+    if worlds > 1:
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+class Rollout:
+    """Steps a solver, and asks exact detection about the motion of each step as it is stored."""
+
+    def __init__(self, model, solver):
+        self.model, self.solver = model, solver
+        self.states = model.state(), model.state()
+        self.control = model.control()
+        world = model.particle_world.numpy()
+        mesh = bsc.CollisionMesh(
+            model.tri_indices.numpy().reshape(-1, 3),
+            model.particle_count,
+            device=model.device,
+            world=world if model.world_count > 1 else None,
+        )
+        self.detector = bsc.CollisionDetector(mesh, method="exact")
+        self.collisions = 0
+
+    def step(self):
+        start, end = self.states
+        before = start.particle_q.numpy().copy()  # the inner solver may overwrite it
+        start.clear_forces()
+        self.solver.step(start, end, self.control, None, DT)
+        c = self.detector.detect(before, end.particle_q.numpy())
+        self.collisions += len(c.vertex_face) + len(c.edge_edge)
+        self.states = end, start
+
+    @property
+    def positions(self):
+        return self.states[0].particle_q.numpy()
+
+    @property
+    def velocities(self):
+        return self.states[0].particle_qd.numpy()
+
+    def momenta(self):
+        mass = self.model.particle_mass.numpy()[:, None].astype(float)
+        p = mass * self.velocities
+        return p.sum(axis=0), np.cross(self.positions.astype(float), p).sum(axis=0)
+
+
+@pytest.mark.parametrize("inner", SOLVERS)
+@pytest.mark.parametrize("speed", [10.0, 60.0])
+def test_nothing_passes_through(inner, speed, device):
+    model = bullet(speed, device=device)
+    through = Rollout(model, SOLVERS[inner](model))
+    stopped = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model)))
+    steps = 12 if speed < 50.0 else 6
+    for _ in range(steps):
+        through.step()
+        stopped.step()
+        assert stopped.solver.report.certified
+    assert through.collisions > 0
+    assert stopped.collisions == 0
+    assert len(stopped.detector.find_intersections(stopped.positions)) == 0
+    report = stopped.solver.report
+    assert (report.steps, report.uncertified_steps) == (steps, 0)
+
+
+@pytest.mark.parametrize("inner", SOLVERS)
+def test_without_collisions_nothing_changes(inner, device):
+    model = bullet(-10.0, device=device)
+    alone = Rollout(model, SOLVERS[inner](model))
+    staged = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model)))
+    for _ in range(3):
+        alone.step()
+        staged.step()
+        report = staged.solver.report
+        assert (report.hits, report.rounds, report.truncated, report.frozen, report.certified) == (0, 0, 0, 0, True)
+    assert alone.positions.tobytes() == staged.positions.tobytes()
+    assert alone.velocities.tobytes() == staged.velocities.tobytes()
+
+
+def test_momenta_of_free_bodies_are_conserved(device):
+    """Two patches that meet off centre, and turn from then on."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 3.0))
+    add_patch(builder, 8, 0.05, (0.13, 0.11, 0.05), velocity=(0.0, 0.0, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=0.0))
+    linear, angular = rollout.momenta()
+    met = 0
+    for _ in range(5):
+        rollout.step()
+        met += rollout.solver.report.hits
+    assert met > 100
+    assert rollout.solver.report.truncated_steps == 0
+    scale = (model.particle_mass.numpy()[:, None] * np.abs(rollout.velocities)).sum()
+    new_linear, new_angular = rollout.momenta()
+    assert np.abs(new_linear - linear).max() < 1e-5 * scale
+    assert np.abs(new_angular - angular).max() < 1e-5 * scale * 0.3
+
+
+def test_kinematic_and_inactive_particles_are_never_moved(device):
+    model = bullet(60.0, device=device)
+    flags = model.particle_flags.numpy()
+    flags[20:40] &= ~int(newton.ParticleFlags.ACTIVE)
+    model.particle_flags.assign(flags)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model)))
+    still = (model.particle_inv_mass.numpy() == 0.0) | ((flags & int(newton.ParticleFlags.ACTIVE)) == 0)
+    start = rollout.positions.copy()
+    for _ in range(5):
+        rollout.step()
+    assert still.sum() > 60
+    assert rollout.positions[still].tobytes() == start[still].tobytes()
+    assert rollout.collisions == 0
+
+
+def test_worlds_are_like_one_alone(device):
+    alone = bullet(60.0, device=device)
+    many = bullet(60.0, device=device, worlds=3)
+    one, all_worlds = (
+        Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), restitution=0.3)) for model in (alone, many)
+    )
+    for _ in range(5):
+        one.step()
+        all_worlds.step()
+    assert all_worlds.collisions == 0 and one.solver.report.rounds > 0
+    for world in all_worlds.positions.reshape(3, -1, 3):
+        assert world.tobytes() == one.positions.tobytes()
+
+
+@pytest.mark.parametrize("shape", ["plane", "box", "mesh"])
+def test_rigid_shapes_are_not_passed(shape, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    if shape == "plane":
+        builder.add_ground_plane()
+    elif shape == "box":
+        builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.1), wp.quat_identity()), hx=1.0, hy=1.0, hz=0.1)
+    else:
+        box = newton.Mesh.create_box(1.0, 1.0, 0.1, compute_normals=False, compute_uvs=False)
+        builder.add_shape_mesh(-1, mesh=box, xform=wp.transform((0.0, 0.0, -0.1), wp.quat_identity()))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.1), velocity=(1.0, 0.0, -60.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model)))
+    for _ in range(5):
+        rollout.step()
+        assert rollout.solver.report.certified
+        assert rollout.positions[:, 2].min() > 0.0
+    assert rollout.positions[:, 2].max() < 0.1
+    assert np.abs(rollout.velocities[:, 2]).max() < 10.0
+
+
+def test_what_crosses_at_the_start_is_named(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.0))
+    builder.add_cloth_grid(
+        pos=wp.vec3(0.013, -0.05, -0.051),
+        rot=wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 1.5),
+        vel=wp.vec3(),
+        dim_x=2,
+        dim_y=2,
+        cell_x=0.05,
+        cell_y=0.05,
+        mass=0.001,
+        **STIFF,
+    )
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model))
+    rollout = Rollout(model, solver)
+    expected = rollout.detector.find_intersections(rollout.positions)
+    rollout.step()
+    assert len(expected) > 0
+    np.testing.assert_array_equal(solver.report.intersections, expected)
+
+
+def test_the_inner_solver_is_asked_for_the_rest(device):
+    model = bullet(10.0, device=device)
+    inner = SOLVERS["vbd"](model)
+    solver = bsc.SolverCCD(inner)
+    assert isinstance(solver, newton.solvers.SolverBase)
+    assert solver.iterations == 5
+    assert solver.model is model and solver.device == model.device
+    assert solver.collision_frequency == inner.collision_frequency
+    assert solver.supported_observables == inner.supported_observables
+    solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+    solver.reset(model.state())
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        _ = solver.no_such_thing
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"separation": 0.0}, "separation"),
+        ({"separation": np.nan}, "separation"),
+        ({"friction": -1.0}, "friction"),
+        ({"restitution": 1.5}, "restitution"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(options, message, device):
+    model = bullet(10.0, device=device)
+    with pytest.raises(ValueError, match=message):
+        bsc.SolverCCD(SOLVERS["xpbd"](model), **options)
+
+
+def test_a_frame_in_a_graph_is_the_frame_without(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model))) for _ in range(2))
+    for _ in range(3):
+        plain.step()
+        captured.step()  # queues grow
+    for rollout in (plain, captured):
+        rollout.states = model.state(), model.state()
+
+    def frame(rollout):
+        for start, end in (rollout.states, rollout.states[::-1]):
+            start.clear_forces()
+            rollout.solver.step(start, end, rollout.control, None, DT)
+
+    with wp.ScopedCapture(device) as capture:
+        frame(captured)
+    for _ in range(4):
+        frame(plain)
+        wp.capture_launch(capture.graph)
+        assert captured.solver.report.certified
+        assert plain.positions.tobytes() == captured.positions.tobytes()
+        assert plain.velocities.tobytes() == captured.velocities.tobytes()
+    assert captured.solver.report.uncertified_steps == 0

@@ -1,0 +1,246 @@
+"""The response to collisions: moves vertices until their motion is certified to be free of collisions."""
+
+import warp as wp
+
+from .constraints import (
+    ACTIVE,
+    CERTIFIED,
+    FIRST_HITS,
+    FROZEN_NOW,
+    HITS,
+    PROJECTIONS,
+    REMAINING,
+    ROUND,
+    STEER,
+    TIMES,
+    Constraints,
+    Contacts,
+    Progress,
+    Vertices,
+    collect_contacts,
+    count_violated,
+    project_vertices,
+    solve_violated,
+    to_double,
+    to_single,
+)
+from .detector import CollisionDetector
+from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces, project_out_of_half_spaces
+from .narrow_phase import Count
+
+__all__ = ["FROZEN", "TRUNCATED", "Response"]
+
+_TRUNCATIONS = wp.constant(8)
+"""Rounds of truncation, after which what still collides stands still."""
+_ITERATIONS = 24
+"""Iterations over all constraints in a round of projection."""
+_ROUNDS_OF_ROOM = 4
+"""For the contacts of how many rounds there is room."""
+_SHARE = wp.constant(wp.float64(0.9))
+"""Which part of the way to its first contact a truncated vertex goes."""
+_NEVER = wp.constant(2**30)
+
+TRUNCATED, FROZEN = wp.constant(2), wp.constant(4)
+"""Bits of what has been done to a vertex."""
+
+_KERNEL = {"enable_backward": False}
+
+
+@wp.kernel(**_KERNEL)
+def _forget_if_full(constraints: Constraints, needed: int):
+    """Forgets all constraints where a detection might not find room for its own."""
+    if constraints.count[0] > constraints.vertices.shape[0] - needed:
+        constraints.count[0] = 0
+
+
+@wp.kernel(**_KERNEL)
+def _decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
+    """Whether another round is needed, from the contacts counted."""
+    overflowed = bool(False)
+    for i in range(counts.shape[0]):
+        overflowed = overflowed or counts[i] > capacities[i]
+    steer = progress.steer
+    hits = steer[HITS]
+    steer[HITS] = 0
+    steer[REMAINING] = hits
+    if steer[ROUND] == 0:
+        steer[FIRST_HITS] = steer[FIRST_HITS] + hits
+    stuck = steer[ROUND] > PROJECTIONS + _TRUNCATIONS and steer[FROZEN_NOW] == 0
+    steer[FROZEN_NOW] = 0
+    steer[CERTIFIED] = wp.where(hits == 0 and not overflowed, 1, 0)
+    steer[ACTIVE] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
+    steer[ROUND] = steer[ROUND] + steer[ACTIVE]
+
+
+@wp.kernel(**_KERNEL)
+def _truncate_vertices(vertices: Vertices, progress: Progress, dt: wp.float64):
+    """Cuts the path of each vertex before its first contact, and at last leaves it where it was."""
+    vertex = wp.tid()
+    if vertices.time[vertex] == _NEVER:
+        return
+    time = wp.float64(vertices.time[vertex]) / TIMES
+    vertices.time[vertex] = _NEVER
+    if vertices.inverse_mass[vertex] == 0.0:
+        return
+    if progress.steer[ROUND] <= PROJECTIONS + _TRUNCATIONS:
+        x0 = to_double(vertices.x0[vertex])
+        path = _SHARE * time * (to_double(vertices.x1[vertex]) - x0)
+        vertices.x1[vertex] = to_single(x0 + path)
+        vertices.velocity[vertex] = to_single(path / dt)
+        vertices.done[vertex] = vertices.done[vertex] | TRUNCATED
+    elif vertices.done[vertex] & FROZEN == 0:
+        vertices.x1[vertex] = vertices.x0[vertex]
+        vertices.velocity[vertex] = wp.vec3()
+        vertices.done[vertex] = vertices.done[vertex] | FROZEN
+        wp.atomic_add(progress.steer, FROZEN_NOW, 1)
+
+
+class Response:
+    """Moves the vertices of a motion until it is certified to be free of collisions, on the device.
+
+    Rounds of projection come first: each contact is moved apart at the end of the step, and the new motion is detected
+    again. What still collides after many has its path truncated before its first contact, a few times, and then stands
+    still, which ends, because what stood apart and stands still does not collide.
+
+    Attributes:
+        detector: What it detects with.
+        vertices: The vertices, whose ``x0``, ``x1`` and ``velocity`` are to be filled.
+        steer: Array of int that says, by :data:`CERTIFIED`, :data:`FIRST_HITS`, :data:`REMAINING` and :data:`ROUND`,
+            what was done.
+    """
+
+    def __init__(self, mesh, friction, plane_friction, *, separation, restitution):
+        """Makes room.
+
+        Args:
+            mesh: The :class:`ModelMesh`.
+            friction: Coefficients of the vertices; that of a contact is the geometric mean, Warp array of float.
+            plane_friction: Coefficients of the planes of the mesh, Warp array of float.
+            separation: How far projection moves contacts apart [m].
+            restitution: Which part of the approaching velocity comes back.
+        """
+        n, device = mesh.vertex_count, mesh.device
+        self.detector = CollisionDetector(mesh)
+        self._mesh, self._device = mesh, device
+        self._separation, self._restitution = separation, restitution
+        self.vertices = vertices = Vertices()
+        for name in ("x0", "x1", "velocity", "wanted_velocity"):
+            setattr(vertices, name, wp.zeros(n, dtype=wp.vec3, device=device))
+        vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
+        vertices.violated, vertices.done = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
+        for name in ("displacement", "velocity_change"):
+            setattr(vertices, name, wp.zeros((n, 3), dtype=wp.int64, device=device))
+        vertices.time = wp.full(n, int(_NEVER), dtype=int, device=device)
+        vertices.movable = mesh.model.particle_count
+        self._progress = progress = Progress()
+        progress.steer = self.steer = wp.zeros(int(STEER), dtype=int, device=device)
+        progress.contact_round = wp.zeros(max(1, mesh.model.world_count), dtype=int, device=device)
+        self._half_spaces = half_spaces = HalfSpaces()
+        half_spaces.friction, half_spaces.world = plane_friction, mesh.device_planes.world
+        for name in ("start", "end"):
+            setattr(half_spaces, name, wp.zeros(len(plane_friction), dtype=wp.vec4d, device=device))
+        self._constraints = self._with_room(0)
+        self._retired = []
+
+    def start(self, particle_q, body_q):
+        """Takes down where everything is at the start of a step, from arrays as of :meth:`ModelMesh.positions`."""
+        self._place(particle_q, body_q, self.vertices.x0, self._half_spaces.start)
+
+    def end(self, particle_q, body_q):
+        """Takes down where everything wants to be at the end of the step."""
+        self._place(particle_q, body_q, self.vertices.x1, self._half_spaces.end)
+
+    def _place(self, particle_q, body_q, positions, planes):
+        self._mesh.positions(particle_q, body_q, positions)
+        place = self._mesh.device_planes
+        inputs = [place.point, place.normal, place.body, body_q]
+        wp.launch(place_half_spaces, len(planes), inputs=inputs, outputs=[planes], device=self._device)
+
+    def resolve(self, dt):
+        """Changes ``vertices.x1`` and ``vertices.velocity`` until no contact is left, or none that can be moved.
+
+        Args:
+            dt: Length of the step [s].
+        """
+        vertices = self.vertices
+        wp.copy(vertices.wanted_velocity, vertices.velocity)
+        self.steer.zero_()
+        self._progress.contact_round.fill_(-1)
+        self._constraints.count.zero_()
+        vertices.done.zero_()
+        vertices.time.fill_(int(_NEVER))
+        self._leave_half_spaces()
+        self._detect(refit=False)
+        wp.capture_while(self.steer, self._round, dt=dt)
+
+    def _leave_half_spaces(self):
+        if len(self._half_spaces.end):
+            inputs = [self.vertices, self._half_spaces, self._progress, self._separation, self._restitution]
+            wp.launch(project_out_of_half_spaces, self.vertices.movable, inputs=inputs, device=self._device)
+
+    def _round(self, dt):
+        """One round: what the contacts ask for, and whether there still are some."""
+        vertices, progress, n = self.vertices, self._progress, self.vertices.movable
+        for _ in range(_ITERATIONS):
+            inputs = [vertices, self._constraints, progress]
+            self._launch_over_constraints(count_violated, inputs)
+            self._launch_over_constraints(solve_violated, [*inputs, self._restitution])
+            wp.launch(project_vertices, len(vertices.x0), inputs=[vertices], device=self._device)
+        wp.launch(_truncate_vertices, n, inputs=[vertices, progress, dt], device=self._device)
+        self._leave_half_spaces()
+        self._detect(refit=True)
+
+    def _detect(self, refit):
+        """Detects the motion as it is now, and decides what that means."""
+        detector, vertices, progress = self.detector, self.vertices, self._progress
+        while True:
+            narrow_phases = detector.find_contacts(vertices.x0, vertices.x1, refit=refit)
+            if self._device.is_capturing or not detector.grow():
+                break
+        most = sum(len(narrow_phase.unsorted.pairs) for narrow_phase in narrow_phases)
+        self._make_room(_ROUNDS_OF_ROOM * most)
+        wp.launch(_forget_if_full, 1, inputs=[self._constraints, most], device=self._device)
+        for narrow_phase, elements in zip(
+            narrow_phases, (detector.mesh.device_faces, detector.mesh.device_edges), strict=True
+        ):
+            found = narrow_phase.unsorted
+            contacts = Contacts()
+            contacts.edges = int(narrow_phase.kind == "edge_edge")
+            contacts.elements, contacts.counts = elements, narrow_phase.counts
+            contacts.pairs, contacts.status, contacts.toi = found.pairs, found.status, found.toi
+            contacts.coordinates, contacts.normal = found.coordinates, found.normal
+            entries = len(found.pairs)
+            if self._device.is_cpu:
+                entries = min(entries, int(contacts.counts.numpy()[Count.CONTACTS]))
+            inputs = [vertices, contacts, self._constraints, progress, self._separation]
+            wp.launch(collect_contacts, entries, inputs=inputs, device=self._device)
+        if len(self._half_spaces.end):
+            inputs = [vertices, self._half_spaces, progress]
+            wp.launch(collect_penetrations, vertices.movable, inputs=inputs, device=self._device)
+        wp.launch(_decide, 1, inputs=[progress, detector.counts, detector.capacities], device=self._device)
+
+    def _with_room(self, room):
+        """Constraints, none yet."""
+        constraints = Constraints()
+        constraints.count = wp.zeros(1, dtype=int, device=self._device)
+        constraints.vertices = wp.empty(room, dtype=wp.vec4i, device=self._device)
+        constraints.weights = wp.empty(room, dtype=wp.vec4d, device=self._device)
+        constraints.normal = wp.empty(room, dtype=wp.vec3d, device=self._device)
+        constraints.separation = wp.empty(room, dtype=wp.float64, device=self._device)
+        return constraints
+
+    def _make_room(self, room):
+        """Makes room for so many constraints, and keeps those that there are."""
+        old = self._constraints
+        if len(old.vertices) >= room or self._device.is_capturing:
+            return
+        self._constraints = new = self._with_room(room)
+        for name in ("count", "vertices", "weights", "normal", "separation"):
+            wp.copy(getattr(new, name), getattr(old, name), count=len(getattr(old, name)))
+        self._retired.append(old)  # a CUDA graph may still write to it
+
+    def _launch_over_constraints(self, kernel, inputs):
+        entries = len(self._constraints.vertices)
+        if self._device.is_cpu:
+            entries = min(entries, int(self._constraints.count.numpy()[0]))
+        wp.launch(kernel, entries, inputs=inputs, device=self._device)

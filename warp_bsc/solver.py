@@ -1,0 +1,303 @@
+"""The collision stage for Newton: a solver that lets another one step, and makes what it did free of collisions."""
+
+import time
+
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND
+from .model_mesh import ModelMesh
+from .response import FROZEN, TRUNCATED, Response
+
+__all__ = ["SolverCCD", "SolverReport"]
+
+_SEPARATION = 1e-3
+"""Default distance that contacts are moved apart, as a share of the median length of an edge."""
+
+_STEPS, _UNCERTIFIED_STEPS, _TRUNCATED_STEPS, _FROZEN_STEPS, _TOTALS = (wp.constant(i) for i in range(5))
+"""Places in the array of totals, and how many there are."""
+
+
+@wp.kernel(enable_backward=False)
+def _start_velocities(
+    particle_qd: wp.array[wp.vec3],
+    x0: wp.array[wp.vec3],
+    x1: wp.array[wp.vec3],
+    dt: float,
+    velocity: wp.array[wp.vec3],
+):
+    vertex = wp.tid()
+    if vertex < particle_qd.shape[0]:
+        velocity[vertex] = particle_qd[vertex]
+    else:
+        velocity[vertex] = (x1[vertex] - x0[vertex]) / dt
+
+
+@wp.kernel(enable_backward=False)
+def _write_back(
+    done: wp.array[int],
+    x1: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    fallbacks: wp.array[int],
+):
+    """Only what the response has changed, so that the rest stays as it is bit for bit."""
+    particle = wp.tid()
+    if done[particle] != 0:
+        particle_q[particle] = x1[particle]
+        particle_qd[particle] = velocity[particle]
+    if done[particle] & TRUNCATED != 0:
+        fallbacks[0] = 1
+    if done[particle] & FROZEN != 0:
+        fallbacks[1] = 1
+
+
+@wp.kernel(enable_backward=False)
+def _count_step(steer: wp.array[int], fallbacks: wp.array[int], totals: wp.array[int]):
+    totals[_STEPS] = totals[_STEPS] + 1
+    totals[_UNCERTIFIED_STEPS] = totals[_UNCERTIFIED_STEPS] + 1 - steer[CERTIFIED]
+    totals[_TRUNCATED_STEPS] = totals[_TRUNCATED_STEPS] + fallbacks[0]
+    totals[_FROZEN_STEPS] = totals[_FROZEN_STEPS] + fallbacks[1]
+
+
+class SolverReport:
+    """What a :class:`SolverCCD` found and did. It stays on the device, and is read from there when asked."""
+
+    def __init__(self, mesh, response, totals):
+        """Of which solver, by its parts."""
+        self._mesh, self._response, self._totals = mesh, response, totals
+        self._start, self._end = None, None  # of the last step, in seconds, or events on a GPU
+
+    @property
+    def certified(self) -> bool:
+        """Whether the motion of the last step, as stored, was detected to be free of collisions, with none dropped."""
+        return bool(self._steer(CERTIFIED))
+
+    @property
+    def hits(self) -> int:
+        """Contacts of the motion that the inner solver wanted for the last step."""
+        return self._steer(FIRST_HITS)
+
+    @property
+    def rounds(self) -> int:
+        """Rounds of response in the last step."""
+        return self._steer(ROUND)
+
+    @property
+    def truncated(self) -> int:
+        """Vertices whose paths were cut before a contact in the last step."""
+        return self._done(TRUNCATED)
+
+    @property
+    def frozen(self) -> int:
+        """Vertices that were left where they were in the last step."""
+        return self._done(FROZEN)
+
+    @property
+    def intersections(self) -> np.ndarray:
+        """(edge, face) that cross at the start of the last step, of the solver's ``mesh``, int32, shape [n, 2].
+
+        What crosses already is not what the promise is about. Looked for when asked, by exact arithmetic.
+        """
+        return self._response.detector.find_intersections(self._response.vertices.x0)
+
+    @property
+    def milliseconds(self) -> float | None:
+        """Time of the last step that was not captured, without the inner solver's [ms]; None if there was none."""
+        if self._start is None:
+            return None
+        if isinstance(self._start, wp.Event):
+            return wp.get_event_elapsed_time(self._start, self._end)
+        return 1e3 * (self._end - self._start)
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return self._total(_STEPS)
+
+    @property
+    def uncertified_steps(self) -> int:
+        """Steps so far that were not certified."""
+        return self._total(_UNCERTIFIED_STEPS)
+
+    @property
+    def truncated_steps(self) -> int:
+        """Steps so far in which a path was cut."""
+        return self._total(_TRUNCATED_STEPS)
+
+    @property
+    def frozen_steps(self) -> int:
+        """Steps so far in which a vertex was left where it was."""
+        return self._total(_FROZEN_STEPS)
+
+    def _steer(self, place):
+        return int(self._response.steer.numpy()[int(place)])
+
+    def _done(self, bit):
+        return int(np.count_nonzero(self._response.vertices.done.numpy() & int(bit)))
+
+    def _total(self, place):
+        return int(self._totals.numpy()[int(place)])
+
+
+class SolverCCD(SolverBase):
+    """Lets another solver step, then makes the motion that it wanted free of collisions.
+
+    The cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide
+    with particles. Everything else is the inner solver's: what is not defined here is asked of it.
+
+    Attributes:
+        solver: The inner solver.
+        mesh: The triangles that collide, :class:`ModelMesh`.
+        report: What was found and done, :class:`SolverReport`.
+    """
+
+    def __init__(self, solver, *, separation=None, friction=None, restitution=None):
+        """Puts the stage behind a solver.
+
+        Args:
+            solver: Any Newton solver that moves particles.
+            separation: How far contacts are moved apart [m]; default: a thousandth of the median length of an edge.
+            friction: Coefficient of particles; default: the model's ``particle_mu``. That of shapes is their
+                material's, that of a contact the geometric mean.
+            restitution: Which part of the approaching velocity comes back, in [0, 1]; default: the model's
+                ``soft_contact_restitution``.
+
+        Raises:
+            ValueError: If a number is out of range.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
+        """
+        self.solver = solver
+        super().__init__(solver.model)
+        self.collision_pipeline = solver.collision_pipeline
+        self.supports_collision_pipeline = solver.supports_collision_pipeline
+        self.supports_body_pair_reduced_contacts = solver.supports_body_pair_reduced_contacts
+        model = solver.model
+        friction = model.particle_mu if friction is None else friction
+        restitution = model.soft_contact_restitution if restitution is None else restitution
+        if not 0.0 <= friction < np.inf:
+            raise ValueError(f"friction must be at least 0, not {friction!r}")
+        if not 0.0 <= restitution <= 1.0:
+            raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
+        self.mesh = mesh = ModelMesh(model)
+        if separation is None:
+            separation = _SEPARATION * self._median_edge()
+        elif not 0.0 < separation < np.inf:
+            raise ValueError(f"separation must be more than 0, not {separation!r}")
+        shape_friction = np.zeros(0) if model.shape_material_mu is None else model.shape_material_mu.numpy()
+        vertex_friction = np.full(mesh.vertex_count, friction, dtype=np.float32)
+        vertex_friction[model.particle_count :] = shape_friction[mesh.shape_vertices.shape]
+        self._response = Response(
+            mesh,
+            wp.array(vertex_friction, dtype=float, device=mesh.device),
+            wp.array(shape_friction[mesh.planes.shape], dtype=float, device=mesh.device),
+            separation=float(separation),
+            restitution=float(restitution),
+        )
+        self._fallbacks = wp.zeros(2, dtype=int, device=mesh.device)
+        self._totals = wp.zeros(int(_TOTALS), dtype=int, device=mesh.device)
+        self.report = SolverReport(mesh, self._response, self._totals)
+
+    def _median_edge(self):
+        """The median length of an edge of the cloth and soft bodies at rest [m]; 1 if they have none."""
+        rest = self.model.particle_q.numpy() if self.model.particle_count else np.zeros((0, 3))
+        edges = self.mesh.edges[self.mesh.edges[:, 1] < self.model.particle_count]
+        lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+        return float(np.median(lengths)) if lengths.any() else 1.0
+
+    def step(self, state_in, state_out, control, contacts, dt, **options):
+        """Steps the inner solver, and changes positions and velocities of particles where their motion collides.
+
+        Args:
+            state_in: The state at the start; the inner solver may change it.
+            state_out: The state at the end. May be the same.
+            control: As for the inner solver.
+            contacts: As for the inner solver.
+            dt: Length of the step [s].
+            options: As for the inner solver.
+        """
+        response, device = self._response, self.mesh.device
+        vertices = response.vertices
+        response.start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
+        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        self._lap(start=True)
+        response.end(state_out.particle_q, state_out.body_q)
+        inputs = [state_out.particle_qd, vertices.x0, vertices.x1, dt]
+        wp.launch(_start_velocities, len(vertices.x0), inputs=inputs, outputs=[vertices.velocity], device=device)
+        response.resolve(dt)
+        self._fallbacks.zero_()
+        inputs = [vertices.done, vertices.x1, vertices.velocity]
+        outputs = [state_out.particle_q, state_out.particle_qd, self._fallbacks]
+        wp.launch(_write_back, self.model.particle_count, inputs=inputs, outputs=outputs, device=device)
+        inputs, outputs = [response.steer, self._fallbacks], [self._totals]
+        wp.launch(_count_step, 1, inputs=inputs, outputs=outputs, device=device)
+        self._lap(start=False)
+
+    def _lap(self, *, start):
+        device = self.mesh.device
+        if device.is_capturing:
+            return
+        now = time.perf_counter()
+        if device.is_cuda:
+            now = wp.record_event(wp.Event(device, enable_timing=True))
+        if start:
+            self.report._start = now
+        else:
+            self.report._end = now
+
+    def notify_model_changed(self, flags):
+        """Tells the inner solver, and reads masses and flags of particles again. Shapes stay what they were."""
+        self.solver.notify_model_changed(flags)
+        self.mesh.refresh_inverse_masses()
+
+    @property
+    def contacts(self):
+        """The inner solver's."""
+        return self.solver.contacts
+
+    @contacts.setter
+    def contacts(self, value):
+        self.solver.contacts = value
+
+    @property
+    def collision_frequency(self):
+        """The inner solver's."""
+        return self.solver.collision_frequency
+
+    @property
+    def collision_frequency_type(self):
+        """The inner solver's."""
+        return self.solver.collision_frequency_type
+
+    @property
+    def supported_observables(self):
+        """The inner solver's."""
+        return self.solver.supported_observables
+
+    def set_collision_frequency(self, **options):
+        """Sets the inner solver's."""
+        self.solver.set_collision_frequency(**options)
+
+    def observables(self, *arguments, **options):
+        """The inner solver's."""
+        return self.solver.observables(*arguments, **options)
+
+    def validate_observables(self, *arguments, **options):
+        """Asks the inner solver."""
+        return self.solver.validate_observables(*arguments, **options)
+
+    def reset(self, state, *arguments, **options):
+        """Resets the inner solver; the stage itself remembers nothing from one step to the next."""
+        self.solver.reset(state, *arguments, **options)
+
+    def update_contacts(self, contacts, state=None):
+        """Updates the inner solver's."""
+        self.solver.update_contacts(contacts, state)
+
+    def __getattr__(self, name):
+        """What is not defined here, of the inner solver."""
+        if name == "solver":
+            raise AttributeError(name)
+        return getattr(self.solver, name)
