@@ -48,11 +48,15 @@ TIMES = wp.constant(wp.float64(2.0**30))
 
 _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new contacts grows from round to round: what is in a jam moves further."""
-_WIDEST = wp.constant(wp.float64(100.0))
+_WIDEST = wp.constant(wp.float64(5.0))
 """How often the separation it grows to at most."""
+_RELAXATION = wp.constant(wp.float64(1.5))
+_TURNING = wp.constant(wp.float64(1.0))
+"""How fast a contact may turn its vertices, as a share of the relative velocity, to keep angular momentum."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Sums are of integers in these units of a metre, so that they are the same in any order."""
 _CONTACTS = wp.constant(int(Count.CONTACTS))
+_TINY = wp.constant(wp.float64(1e-300))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -66,12 +70,13 @@ class Vertices:
     x0: wp.array[wp.vec3]
     x1: wp.array[wp.vec3]
     velocity: wp.array[wp.vec3]
-    wanted_velocity: wp.array[wp.vec3]  # before any contact
+    wanted_x1: wp.array[wp.vec3]  # before any contact
+    wanted_velocity: wp.array[wp.vec3]
     inverse_mass: wp.array[float]
     friction: wp.array[float]
     world: wp.array[int]
-    violated: wp.array[int]  # how many violated constraints it has
-    displacement: wp.array2d[wp.int64]  # sums over them
+    active: wp.array[int]  # how many active constraints it has
+    displacement: wp.array2d[wp.int64]  # from where it wanted to be, summed over its constraints
     velocity_change: wp.array2d[wp.int64]
     time: wp.array[int]  # of its first contact
     done: wp.array[int]  # what has been done to it, in bits
@@ -112,6 +117,10 @@ class Constraints:
     weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
     normal: wp.array[wp.vec3d]
     separation: wp.array[wp.float64]  # along the normal [m]
+    friction: wp.array[float]  # coefficient
+    urgency: wp.array[wp.float64]  # share of its violation that a whole step's approach is
+    displacing: wp.array[wp.vec3d]  # what it does to displacements, times mass [kg m]
+    impulse: wp.array[wp.vec3d]  # and to velocities [kg m/s]
 
 
 @wp.func
@@ -162,6 +171,52 @@ def _weights(contacts: Contacts, i: int) -> wp.vec4d:
     return wp.vec4d(_ONE, -c[0], -c[1], -c[2])
 
 
+@wp.func
+def widened(separation: wp.float64, progress: Progress) -> wp.float64:
+    """The separation that is asked for in a round."""
+    return separation * wp.min(wp.pow(_WIDENING, wp.float64(progress.steer[ROUND])), _WIDEST)
+
+
+@wp.func
+def _relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.vec3d:
+    """From the second contact point to the first, or its velocity."""
+    result = wp.vec3d()
+    for j in range(4):
+        result += weights[j] * to_double(x[corners[j]])
+    return result
+
+
+@wp.func
+def _gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
+    """How much more than the separation contact points are apart at the end of the step [m]."""
+    end = _relative(constraints.weights[i], constraints.vertices[i], vertices.x1)
+    return wp.dot(constraints.normal[i], end) - constraints.separation[i]
+
+
+@wp.func
+def add_constraint(
+    vertices: Vertices,
+    constraints: Constraints,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    separation: wp.float64,
+    friction: float,
+):
+    """Adds a constraint that does nothing yet, if there is room."""
+    i = wp.atomic_add(constraints.count, 0, 1)
+    if i < constraints.vertices.shape[0]:
+        constraints.vertices[i] = corners
+        constraints.weights[i] = weights
+        constraints.normal[i] = normal
+        constraints.separation[i] = separation
+        constraints.friction[i] = friction
+        path = _relative(weights, corners, vertices.x1) - _relative(weights, corners, vertices.x0)
+        constraints.urgency[i] = wp.dot(normal, path) / wp.min(_gap(vertices, constraints, i), -_TINY)
+        constraints.displacing[i] = wp.vec3d()
+        constraints.impulse[i] = wp.vec3d()
+
+
 @wp.kernel(**_KERNEL)
 def collect_contacts(
     vertices: Vertices, contacts: Contacts, constraints: Constraints, progress: Progress, separation: wp.float64
@@ -174,14 +229,17 @@ def collect_contacts(
     if wp.min(corners) >= vertices.movable:
         return
     add_contact(progress, vertices.world[corners[0]])
-    finished = progress.steer[ROUND]
-    if finished < PROJECTIONS:
-        slot = wp.atomic_add(constraints.count, 0, 1)
-        if slot < constraints.vertices.shape[0]:
-            constraints.vertices[slot] = corners
-            constraints.weights[slot] = _weights(contacts, i)
-            constraints.normal[slot] = contacts.normal[i]
-            constraints.separation[slot] = separation * wp.min(wp.pow(_WIDENING, wp.float64(finished)), _WIDEST)
+    if progress.steer[ROUND] < PROJECTIONS:
+        friction = wp.sqrt(vertices.friction[corners[0]] * vertices.friction[corners[3]])
+        add_constraint(
+            vertices,
+            constraints,
+            corners,
+            _weights(contacts, i),
+            contacts.normal[i],
+            widened(separation, progress),
+            friction,
+        )
     else:
         time = int(wp.floor(TIMES * contacts.toi[i]))
         for j in range(4):
@@ -189,63 +247,52 @@ def collect_contacts(
 
 
 @wp.func
-def _depth(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
-    """How much a constraint is violated [m]."""
-    corners = constraints.vertices[i]
+def _parting(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> wp.float64:
+    """How much faster than restitution asks contact points part [m/s]."""
+    normal = constraints.normal[i]
     weights = constraints.weights[i]
-    end = wp.vec3d()
+    corners = constraints.vertices[i]
+    wanted = wp.dot(normal, _relative(weights, corners, vertices.wanted_velocity))
+    is_ = wp.dot(normal, _relative(weights, corners, vertices.velocity))
+    return is_ - restitution * wp.max(-wanted, _ZERO)
+
+
+@wp.func
+def _is_pushing(multiplier: wp.vec3d, normal: wp.vec3d) -> bool:
+    return wp.dot(multiplier, normal) > _ZERO
+
+
+@wp.func
+def _mobility(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
+    mobility = _ZERO
     for j in range(4):
-        end += weights[j] * to_double(vertices.x1[corners[j]])
-    return constraints.separation[i] - wp.dot(constraints.normal[i], end)
+        vertex = constraints.vertices[i][j]
+        parts = wp.max(wp.float64(vertices.active[vertex]) / _RELAXATION, _ONE)
+        share = wp.float64(vertices.inverse_mass[vertex]) * parts
+        mobility += constraints.weights[i][j] * constraints.weights[i][j] * share
+    return mobility
 
 
 @wp.func
-def _is_violated(vertices: Vertices, constraints: Constraints, progress: Progress, i: int) -> bool:
-    if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
-        return False
-    return _depth(vertices, constraints, i) > _ZERO
-
-
-@wp.kernel(**_KERNEL)
-def count_violated(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """Counts the violated constraints of each vertex."""
-    i = wp.tid()
-    if _is_violated(vertices, constraints, progress, i):
-        for j in range(4):
-            wp.atomic_add(vertices.violated, constraints.vertices[i][j], 1)
-
-
-@wp.func
-def _against_sliding(x: wp.vec3d, normal: wp.vec3d, limit: wp.float64) -> wp.vec3d:
-    """What friction does to a relative motion: it takes all that is not along the normal, up to a limit."""
-    slide = x - wp.dot(x, normal) * normal
-    length = wp.length(slide)
-    if length <= limit:
-        return -slide
-    return -(limit / length) * slide
-
-
-@wp.func
-def push_and_change(
+def updated(
+    multiplier: wp.vec3d,
     normal: wp.vec3d,
-    depth: wp.float64,
-    path: wp.vec3d,
-    velocity: wp.vec3d,
-    wanted_velocity: wp.vec3d,
+    excess: wp.float64,
+    motion: wp.vec3d,
+    mobility: wp.float64,
     friction: wp.float64,
-    restitution: wp.float64,
-):
-    """Changes of the relative position and velocity at a contact that is violated by a depth.
+) -> wp.vec3d:
+    """A multiplier after a step towards no excess (negative: a lack) along the normal and no motion across it.
 
-    Along the normal, the velocity becomes what restitution gives back of the wanted one. Friction takes from the
-    sliding no more than its coefficient times what changes along the normal (Coulomb). The push itself is no part of
-    the velocity: it would turn separation into speed.
+    Along the normal it only pushes; across, it is limited by friction (Coulomb). What has been too much is taken back.
     """
-    push = depth * normal + _against_sliding(path, normal, friction * depth)
-    rebound = restitution * wp.max(-wp.dot(wanted_velocity, normal), _ZERO)
-    bounce = wp.max(rebound - wp.dot(velocity, normal), _ZERO)
-    change = bounce * normal + _against_sliding(velocity, normal, friction * bounce)
-    return push, change
+    along = wp.max(wp.dot(multiplier, normal) - excess / mobility, _ZERO)
+    across = multiplier - wp.dot(multiplier, normal) * normal
+    across -= (motion - wp.dot(motion, normal) * normal) / mobility
+    length = wp.length(across)
+    if length > friction * along:
+        across = across * (friction * along / length)
+    return along * normal + across
 
 
 @wp.func
@@ -254,61 +301,182 @@ def _add(sums: wp.array2d[wp.int64], vertex: int, x: wp.vec3d):
         wp.atomic_add(sums, vertex, axis, wp.int64(wp.rint(_UNITS * x[axis])))
 
 
-@wp.kernel(**_KERNEL)
-def solve_violated(vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64):
-    """Sums up what violated constraints ask of their vertices.
+@wp.func
+def _spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, sums: wp.array2d[wp.int64]):
+    """Adds what a constraint does to its vertices."""
+    for j in range(4):
+        vertex = constraints.vertices[i][j]
+        share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
+        if share != _ZERO:
+            _add(sums, vertex, share * x)
 
-    All do so at once: the mass of a vertex is split among them (Tonge et al. 2012), which converges, and conserves
-    momentum, because what a contact does to its two sides is opposite and equal.
+
+@wp.kernel(**_KERNEL)
+def count_displacing(vertices: Vertices, constraints: Constraints, progress: Progress):
+    """Counts the active constraints of each vertex: those that are violated or do something."""
+    i = wp.tid()
+    if i < constraints.count[0] and is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
+        if _gap(vertices, constraints, i) < _ZERO:
+            for j in range(4):
+                wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+
+
+@wp.kernel(**_KERNEL)
+def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
+    """An iteration over constraints on positions.
+
+    All take a step at once: the mass of a vertex is split among those that are active (Tonge et al. 2012), which
+    converges, and conserves momentum, because what a contact does to its two sides is opposite and equal.
     """
     i = wp.tid()
-    if not _is_violated(vertices, constraints, progress, i):
+    if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
         return
-    corners = constraints.vertices[i]
-    weights = constraints.weights[i]
-    path = wp.vec3d()
-    velocity = wp.vec3d()
-    wanted_velocity = wp.vec3d()
-    mobility = _ZERO
-    for j in range(4):
-        vertex = corners[j]
-        path += weights[j] * (to_double(vertices.x1[vertex]) - to_double(vertices.x0[vertex]))
-        velocity += weights[j] * to_double(vertices.velocity[vertex])
-        wanted_velocity += weights[j] * to_double(vertices.wanted_velocity[vertex])
-        share = wp.float64(vertices.inverse_mass[vertex]) * wp.float64(vertices.violated[vertex])
-        mobility += weights[j] * weights[j] * share
+    gap = _gap(vertices, constraints, i)
+    if gap >= _ZERO:
+        return
+    mobility = _mobility(vertices, constraints, i)
     if mobility <= _ZERO:
         return
-    friction = wp.sqrt(wp.float64(vertices.friction[corners[0]]) * wp.float64(vertices.friction[corners[3]]))
-    depth = _depth(vertices, constraints, i)
-    push, change = push_and_change(constraints.normal[i], depth, path, velocity, wanted_velocity, friction, restitution)
-    for j in range(4):
-        vertex = corners[j]
-        share = weights[j] * wp.float64(vertices.inverse_mass[vertex]) / mobility
-        if share != _ZERO:
-            _add(vertices.displacement, vertex, share * push)
-            _add(vertices.velocity_change, vertex, share * change)
+    weights = constraints.weights[i]
+    corners = constraints.vertices[i]
+    path = _relative(weights, corners, vertices.x1) - _relative(weights, corners, vertices.x0)
+    old = constraints.displacing[i]
+    new = updated(
+        old,
+        constraints.normal[i],
+        gap,
+        path,
+        mobility,
+        wp.float64(constraints.friction[i]),
+    )
+    constraints.displacing[i] = new
+    _spread(vertices, constraints, i, new - old, vertices.displacement)
 
 
 @wp.func
-def _sum(sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3d:
-    return wp.vec3d(
-        wp.float64(sums[vertex, 0]) / _UNITS, wp.float64(sums[vertex, 1]) / _UNITS, wp.float64(sums[vertex, 2]) / _UNITS
-    )
+def _moved(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
+    y = to_double(x)
+    for axis in range(3):
+        y[axis] += wp.float64(sums[vertex, axis]) / _UNITS
+    return to_single(y)
 
 
 @wp.kernel(**_KERNEL)
-def project_vertices(vertices: Vertices):
+def move_vertices(vertices: Vertices):
     """Does to each vertex what its constraints ask for."""
     vertex = wp.tid()
-    if vertices.violated[vertex] == 0:
+    if vertices.active[vertex] == 0:
         return
-    vertices.violated[vertex] = 0
-    if vertices.inverse_mass[vertex] == 0.0:
+    vertices.active[vertex] = 0
+    if vertices.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = _moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+        vertices.done[vertex] = vertices.done[vertex] | PROJECTED
+
+
+@wp.kernel(**_KERNEL)
+def start_impulses(vertices: Vertices, constraints: Constraints, dt: wp.float64):
+    """Impulses that go with the displacements, but for the separation: as contacts at their times would have acted.
+
+    Then angular momentum is that of the contacts as well, whose two sides meet in a point (only) at that time.
+    """
+    i = wp.tid()
+    if i < constraints.count[0] and _is_pushing(constraints.displacing[i], constraints.normal[i]):
+        constraints.impulse[i] = constraints.displacing[i] * (wp.max(constraints.urgency[i], _ZERO) / dt)
+        for j in range(4):
+            vertices.active[constraints.vertices[i][j]] = 1
+        _spread(vertices, constraints, i, constraints.impulse[i], vertices.velocity_change)
+
+
+@wp.func
+def _accelerates(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> bool:
+    """Whether a constraint has an impulse, or should: where it has displaced something that still is at it."""
+    if _is_pushing(constraints.impulse[i], constraints.normal[i]):
+        return True
+    if not _is_pushing(constraints.displacing[i], constraints.normal[i]):
+        return False
+    at_it = _gap(vertices, constraints, i) <= constraints.separation[i]
+    return at_it and _parting(vertices, constraints, i, restitution) < _ZERO
+
+
+@wp.kernel(**_KERNEL)
+def count_accelerating(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
+    i = wp.tid()
+    if i < constraints.count[0] and _accelerates(vertices, constraints, i, restitution):
+        for j in range(4):
+            wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+
+
+@wp.kernel(**_KERNEL)
+def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
+    """An iteration over constraints on velocities."""
+    i = wp.tid()
+    if i >= constraints.count[0] or not _accelerates(vertices, constraints, i, restitution):
         return
-    vertices.x1[vertex] = to_single(to_double(vertices.x1[vertex]) + _sum(vertices.displacement, vertex))
-    vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + _sum(vertices.velocity_change, vertex))
-    vertices.done[vertex] = vertices.done[vertex] | PROJECTED
-    for axis in range(3):
-        vertices.displacement[vertex, axis] = wp.int64(0)
-        vertices.velocity_change[vertex, axis] = wp.int64(0)
+    mobility = _mobility(vertices, constraints, i)
+    if mobility <= _ZERO:
+        return
+    old = constraints.impulse[i]
+    new = updated(
+        old,
+        constraints.normal[i],
+        _parting(vertices, constraints, i, restitution),
+        _relative(constraints.weights[i], constraints.vertices[i], vertices.velocity),
+        mobility,
+        wp.float64(constraints.friction[i]),
+    )
+    constraints.impulse[i] = new
+    _spread(vertices, constraints, i, new - old, vertices.velocity_change)
+
+
+@wp.kernel(**_KERNEL)
+def balance(vertices: Vertices, constraints: Constraints):
+    """Turns the four vertices of each contact by what it has done to their angular momentum.
+
+    Displacements, and impulses at points that are apart by now, are forces that do not meet: small torques. A rotation
+    takes each back, as far as it is small beside the motion.
+    """
+    i = wp.tid()
+    if i >= constraints.count[0]:
+        return
+    weights = constraints.weights[i]
+    corners = constraints.vertices[i]
+    mass = _ZERO
+    centre = wp.vec3d()
+    for j in range(4):
+        vertex = corners[j]
+        if vertices.inverse_mass[vertex] == 0.0 or vertices.done[vertex] > PROJECTED:
+            return
+        mass += _ONE / wp.float64(vertices.inverse_mass[vertex])
+        centre += to_double(vertices.x1[vertex]) / wp.float64(vertices.inverse_mass[vertex])
+    centre = centre / mass
+    inertia = wp.mat33d()
+    for j in range(4):
+        r = to_double(vertices.x1[corners[j]]) - centre
+        square = wp.dot(r, r) * wp.identity(n=3, dtype=wp.float64) - wp.outer(r, r)
+        inertia += square / wp.float64(vertices.inverse_mass[corners[j]])
+    velocity = _relative(weights, corners, vertices.wanted_velocity)
+    torque = wp.cross(constraints.displacing[i], velocity)
+    torque += wp.cross(_relative(weights, corners, vertices.x1), constraints.impulse[i])
+    if wp.length(torque) == _ZERO or wp.determinant(inertia) <= _ZERO:
+        return
+    turning = -wp.inverse(inertia) * torque
+    fastest = _ZERO
+    for j in range(4):
+        fastest = wp.max(fastest, wp.length(wp.cross(turning, to_double(vertices.x1[corners[j]]) - centre)))
+    limit = _TURNING * wp.length(velocity)
+    if fastest > limit:
+        turning = turning * (limit / fastest)
+    for j in range(4):
+        r = to_double(vertices.x1[corners[j]]) - centre
+        _add(vertices.velocity_change, corners[j], wp.cross(turning, r))
+        vertices.active[corners[j]] = 1
+
+
+@wp.kernel(**_KERNEL)
+def change_velocities(vertices: Vertices):
+    vertex = wp.tid()
+    if vertices.active[vertex] == 0:
+        return
+    vertices.active[vertex] = 0
+    if vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] <= PROJECTED:
+        vertices.velocity[vertex] = _moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)

@@ -4,20 +4,19 @@ import warp as wp
 
 from .constraints import (
     FIRST_HITS,
-    PROJECTED,
     PROJECTIONS,
     ROUND,
     TIMES,
+    Constraints,
     Progress,
     Vertices,
+    add_constraint,
     add_contact,
-    is_projecting,
-    push_and_change,
     to_double,
-    to_single,
+    widened,
 )
 
-__all__ = ["HalfSpaces", "collect_penetrations", "place_half_spaces", "project_out_of_half_spaces"]
+__all__ = ["HalfSpaces", "collect_penetrations", "place_half_spaces"]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
@@ -74,58 +73,46 @@ def _clearance(plane: wp.vec4d, x: wp.vec3):
     return value, _ROUNDOFF * magnitude + _TINY
 
 
-@wp.func
-def _concerns(half_spaces: HalfSpaces, i: int, world: int) -> bool:
-    return half_spaces.world[i] < 0 or half_spaces.world[i] == world
-
-
 @wp.kernel(**_KERNEL)
-def project_out_of_half_spaces(
+def collect_penetrations(
     vertices: Vertices,
     half_spaces: HalfSpaces,
+    constraints: Constraints,
     progress: Progress,
     separation: wp.float64,
-    restitution: wp.float64,
+    ahead: bool,
 ):
-    """Moves vertices out of half-spaces, to the separation, before the first round and in each that projects."""
+    """Makes constraints of vertices that may have entered half-spaces; after the last projection, takes down when.
+
+    What is within at the start is moved out as well, but if it cannot be, that is no new contact. Ahead of the first
+    detection contacts are counted, but not as found by it.
+    """
     vertex = wp.tid()
     world = vertices.world[vertex]
-    first = progress.steer[ROUND] == 0
-    if vertices.inverse_mass[vertex] == 0.0 or not (first or is_projecting(progress, world)):
-        return
-    for i in range(half_spaces.end.shape[0]):
-        x1 = vertices.x1[vertex]
-        clearance, error = _clearance(half_spaces.end[i], x1)
-        if clearance <= error and _concerns(half_spaces, i, world):
-            plane = half_spaces.end[i]
-            push, change = push_and_change(
-                wp.vec3d(plane[0], plane[1], plane[2]),
-                separation - clearance,
-                to_double(x1) - to_double(vertices.x0[vertex]),
-                to_double(vertices.velocity[vertex]),
-                to_double(vertices.wanted_velocity[vertex]),
-                wp.sqrt(wp.float64(vertices.friction[vertex]) * wp.float64(half_spaces.friction[i])),
-                restitution,
-            )
-            vertices.x1[vertex] = to_single(to_double(x1) + push)
-            vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)
-            vertices.done[vertex] = vertices.done[vertex] | PROJECTED
-            if first:
-                wp.atomic_add(progress.steer, FIRST_HITS, 1)
-
-
-@wp.kernel(**_KERNEL)
-def collect_penetrations(vertices: Vertices, half_spaces: HalfSpaces, progress: Progress):
-    """Counts vertices that may have entered half-spaces, and takes down when; what was within before is left there."""
-    vertex = wp.tid()
     if vertices.inverse_mass[vertex] == 0.0:
         return
     for i in range(half_spaces.end.shape[0]):
-        if _concerns(half_spaces, i, vertices.world[vertex]):
-            before, error_before = _clearance(half_spaces.start[i], vertices.x0[vertex])
-            after, error_after = _clearance(half_spaces.end[i], vertices.x1[vertex])
-            if before >= -error_before and after <= error_after:
-                add_contact(progress, vertices.world[vertex])
-                if progress.steer[ROUND] >= PROJECTIONS:
-                    part = wp.max(before, _ZERO) / wp.max(before - after, _TINY)
-                    wp.atomic_min(vertices.time, vertex, int(wp.floor(TIMES * wp.min(part, wp.float64(1.0)))))
+        if half_spaces.world[i] >= 0 and half_spaces.world[i] != world:
+            continue
+        after, error_after = _clearance(half_spaces.end[i], vertices.x1[vertex])
+        if after > error_after:
+            continue
+        before, error_before = _clearance(half_spaces.start[i], vertices.x0[vertex])
+        if ahead:
+            wp.atomic_add(progress.steer, FIRST_HITS, 1)
+        elif before >= -error_before:
+            add_contact(progress, world)
+        if progress.steer[ROUND] < PROJECTIONS:
+            plane = half_spaces.end[i]
+            add_constraint(
+                vertices,
+                constraints,
+                wp.vec4i(vertex),
+                wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
+                wp.vec3d(plane[0], plane[1], plane[2]),
+                plane[3] + widened(separation, progress),
+                wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
+            )
+        else:
+            part = wp.max(before, _ZERO) / wp.max(before - after, _TINY)
+            wp.atomic_min(vertices.time, vertex, int(wp.floor(TIMES * wp.min(part, wp.float64(1.0)))))

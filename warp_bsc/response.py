@@ -1,5 +1,6 @@
 """The response to collisions: moves vertices until their motion is certified to be free of collisions."""
 
+import numpy as np
 import warp as wp
 
 from .constraints import (
@@ -17,22 +18,28 @@ from .constraints import (
     Contacts,
     Progress,
     Vertices,
+    accelerate,
+    balance,
+    change_velocities,
     collect_contacts,
-    count_violated,
-    project_vertices,
-    solve_violated,
+    count_accelerating,
+    count_displacing,
+    displace,
+    move_vertices,
+    start_impulses,
     to_double,
     to_single,
 )
 from .detector import CollisionDetector
-from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces, project_out_of_half_spaces
+from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces
 from .narrow_phase import Count
 
 __all__ = ["FROZEN", "TRUNCATED", "Response"]
 
 _TRUNCATIONS = wp.constant(8)
 """Rounds of truncation, after which what still collides stands still."""
-_ITERATIONS = 24
+
+_ITERATIONS = 48
 """Iterations over all constraints in a round of projection."""
 _ROUNDS_OF_ROOM = 4
 """For the contacts of how many rounds there is room."""
@@ -124,10 +131,10 @@ class Response:
         self._mesh, self._device = mesh, device
         self._separation, self._restitution = separation, restitution
         self.vertices = vertices = Vertices()
-        for name in ("x0", "x1", "velocity", "wanted_velocity"):
+        for name in ("x0", "x1", "velocity", "wanted_x1", "wanted_velocity"):
             setattr(vertices, name, wp.zeros(n, dtype=wp.vec3, device=device))
         vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
-        vertices.violated, vertices.done = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
+        vertices.active, vertices.done = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
         for name in ("displacement", "velocity_change"):
             setattr(vertices, name, wp.zeros((n, 3), dtype=wp.int64, device=device))
         vertices.time = wp.full(n, int(_NEVER), dtype=int, device=device)
@@ -139,6 +146,9 @@ class Response:
         half_spaces.friction, half_spaces.world = plane_friction, mesh.device_planes.world
         for name in ("start", "end"):
             setattr(half_spaces, name, wp.zeros(len(plane_friction), dtype=wp.vec4d, device=device))
+        plane_worlds = mesh.planes.world
+        planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
+        self._most_penetrations = vertices.movable * int(planes_of_a_world)
         self._constraints = self._with_room(0)
         self._retired = []
 
@@ -163,31 +173,56 @@ class Response:
             dt: Length of the step [s].
         """
         vertices = self.vertices
+        wp.copy(vertices.wanted_x1, vertices.x1)
         wp.copy(vertices.wanted_velocity, vertices.velocity)
         self.steer.zero_()
         self._progress.contact_round.fill_(-1)
         self._constraints.count.zero_()
-        vertices.done.zero_()
+        for sums in (vertices.displacement, vertices.velocity_change, vertices.done):
+            sums.zero_()
         vertices.time.fill_(int(_NEVER))
-        self._leave_half_spaces()
+        if self._most_penetrations:  # what only lies on a plane needs no second detection
+            self._reserve(self._most_penetrations)
+            self._collect_penetrations(ahead=True)
+            self._displace(1)
         self._detect(refit=False)
         wp.capture_while(self.steer, self._round, dt=dt)
+        wp.capture_if(self._constraints.count, self._change_velocities, dt=dt)
 
-    def _leave_half_spaces(self):
-        if len(self._half_spaces.end):
-            inputs = [self.vertices, self._half_spaces, self._progress, self._separation, self._restitution]
-            wp.launch(project_out_of_half_spaces, self.vertices.movable, inputs=inputs, device=self._device)
+    def _collect_penetrations(self, ahead):
+        inputs = [self.vertices, self._half_spaces, self._constraints, self._progress, self._separation, ahead]
+        wp.launch(collect_penetrations, self.vertices.movable, inputs=inputs, device=self._device)
+
+    def _displace(self, iterations):
+        """Moves vertices to where the constraints let them be."""
+        vertices = self.vertices
+        inputs = [vertices, self._constraints, self._progress]
+        for _ in range(iterations):
+            self._launch_over_constraints(count_displacing, inputs)
+            self._launch_over_constraints(displace, inputs)
+            wp.launch(move_vertices, vertices.movable, inputs=[vertices], device=self._device)
+
+    def _change_velocities(self, dt):
+        """Makes velocities of what the constraints that have displaced something let them be."""
+        vertices = self.vertices
+        inputs = [vertices, self._constraints]
+        self._launch_over_constraints(start_impulses, [*inputs, dt])
+        self._change(vertices)
+        for _ in range(_ITERATIONS):
+            self._launch_over_constraints(count_accelerating, [*inputs, self._restitution])
+            self._launch_over_constraints(accelerate, [*inputs, self._restitution])
+            self._change(vertices)
+        self._launch_over_constraints(balance, inputs)
+        self._change(vertices)
+
+    def _change(self, vertices):
+        wp.launch(change_velocities, vertices.movable, inputs=[vertices], device=self._device)
 
     def _round(self, dt):
         """One round: what the contacts ask for, and whether there still are some."""
-        vertices, progress, n = self.vertices, self._progress, self.vertices.movable
-        for _ in range(_ITERATIONS):
-            inputs = [vertices, self._constraints, progress]
-            self._launch_over_constraints(count_violated, inputs)
-            self._launch_over_constraints(solve_violated, [*inputs, self._restitution])
-            wp.launch(project_vertices, len(vertices.x0), inputs=[vertices], device=self._device)
-        wp.launch(_truncate_vertices, n, inputs=[vertices, progress, dt], device=self._device)
-        self._leave_half_spaces()
+        self._displace(_ITERATIONS)
+        inputs = [self.vertices, self._progress, dt]
+        wp.launch(_truncate_vertices, self.vertices.movable, inputs=inputs, device=self._device)
         self._detect(refit=True)
 
     def _detect(self, refit):
@@ -197,9 +232,7 @@ class Response:
             narrow_phases = detector.find_contacts(vertices.x0, vertices.x1, refit=refit)
             if self._device.is_capturing or not detector.grow():
                 break
-        most = sum(len(narrow_phase.unsorted.pairs) for narrow_phase in narrow_phases)
-        self._make_room(_ROUNDS_OF_ROOM * most)
-        wp.launch(_forget_if_full, 1, inputs=[self._constraints, most], device=self._device)
+        self._reserve(self._most_penetrations + sum(len(narrow_phase.unsorted.pairs) for narrow_phase in narrow_phases))
         for narrow_phase, elements in zip(
             narrow_phases, (detector.mesh.device_faces, detector.mesh.device_edges), strict=True
         ):
@@ -214,9 +247,8 @@ class Response:
                 entries = min(entries, int(contacts.counts.numpy()[Count.CONTACTS]))
             inputs = [vertices, contacts, self._constraints, progress, self._separation]
             wp.launch(collect_contacts, entries, inputs=inputs, device=self._device)
-        if len(self._half_spaces.end):
-            inputs = [vertices, self._half_spaces, progress]
-            wp.launch(collect_penetrations, vertices.movable, inputs=inputs, device=self._device)
+        if self._most_penetrations:
+            self._collect_penetrations(ahead=False)
         wp.launch(_decide, 1, inputs=[progress, detector.counts, detector.capacities], device=self._device)
 
     def _with_room(self, room):
@@ -226,18 +258,26 @@ class Response:
         constraints.vertices = wp.empty(room, dtype=wp.vec4i, device=self._device)
         constraints.weights = wp.empty(room, dtype=wp.vec4d, device=self._device)
         constraints.normal = wp.empty(room, dtype=wp.vec3d, device=self._device)
-        constraints.separation = wp.empty(room, dtype=wp.float64, device=self._device)
+        constraints.separation, constraints.urgency = (
+            wp.empty(room, dtype=wp.float64, device=self._device) for _ in range(2)
+        )
+        constraints.friction = wp.empty(room, dtype=float, device=self._device)
+        constraints.displacing, constraints.impulse = (
+            wp.empty(room, dtype=wp.vec3d, device=self._device) for _ in range(2)
+        )
         return constraints
 
-    def _make_room(self, room):
-        """Makes room for so many constraints, and keeps those that there are."""
+    def _reserve(self, needed):
+        """Makes room for so many more constraints; a CUDA graph forgets those that there are if need be."""
         old = self._constraints
-        if len(old.vertices) >= room or self._device.is_capturing:
-            return
-        self._constraints = new = self._with_room(room)
-        for name in ("count", "vertices", "weights", "normal", "separation"):
-            wp.copy(getattr(new, name), getattr(old, name), count=len(getattr(old, name)))
-        self._retired.append(old)  # a CUDA graph may still write to it
+        if not self._device.is_capturing:
+            filled = int(old.count.numpy()[0])
+            if len(old.vertices) < filled + needed:
+                self._constraints = new = self._with_room(2 * filled + _ROUNDS_OF_ROOM * needed)
+                for name in Constraints.vars:
+                    wp.copy(getattr(new, name), getattr(old, name), count=len(getattr(old, name)))
+                self._retired.append(old)  # a CUDA graph may still write to it
+        wp.launch(_forget_if_full, 1, inputs=[self._constraints, needed], device=self._device)
 
     def _launch_over_constraints(self, kernel, inputs):
         entries = len(self._constraints.vertices)

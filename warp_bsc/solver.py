@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
-from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND
+from .constraints import CERTIFIED, FIRST_HITS, ROUND
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
 
