@@ -162,10 +162,12 @@ def test_worlds_are_like_one_alone(device):
     one, all_worlds = (
         Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), restitution=0.3)) for model in (alone, many)
     )
+    hits = 0
     for _ in range(5):
         one.step()
         all_worlds.step()
-    assert all_worlds.collisions == 0 and one.solver.report.rounds > 0
+        hits += one.solver.report.hits
+    assert all_worlds.collisions == 0 and hits > 100
     for world in all_worlds.positions.reshape(3, -1, 3):
         assert world.tobytes() == one.positions.tobytes()
 

@@ -22,15 +22,21 @@ __all__ = [
     "Contacts",
     "Progress",
     "Vertices",
+    "accelerate",
+    "add_constraint",
     "add_contact",
+    "change_velocities",
     "collect_contacts",
-    "count_violated",
+    "count_accelerating",
+    "count_displacing",
+    "displace",
     "is_projecting",
-    "project_vertices",
-    "push_and_change",
-    "solve_violated",
+    "move_vertices",
+    "relative",
+    "start_impulses",
     "to_double",
     "to_single",
+    "widened",
 ]
 
 PROJECTIONS = wp.constant(40)
@@ -51,8 +57,6 @@ _WIDENING = wp.constant(wp.float64(1.25))
 _WIDEST = wp.constant(wp.float64(5.0))
 """How often the separation it grows to at most."""
 _RELAXATION = wp.constant(wp.float64(1.5))
-_TURNING = wp.constant(wp.float64(1.0))
-"""How fast a contact may turn its vertices, as a share of the relative velocity, to keep angular momentum."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Sums are of integers in these units of a metre, so that they are the same in any order."""
 _CONTACTS = wp.constant(int(Count.CONTACTS))
@@ -178,7 +182,7 @@ def widened(separation: wp.float64, progress: Progress) -> wp.float64:
 
 
 @wp.func
-def _relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.vec3d:
+def relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.vec3d:
     """From the second contact point to the first, or its velocity."""
     result = wp.vec3d()
     for j in range(4):
@@ -189,7 +193,7 @@ def _relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.
 @wp.func
 def _gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
     """How much more than the separation contact points are apart at the end of the step [m]."""
-    end = _relative(constraints.weights[i], constraints.vertices[i], vertices.x1)
+    end = relative(constraints.weights[i], constraints.vertices[i], vertices.x1)
     return wp.dot(constraints.normal[i], end) - constraints.separation[i]
 
 
@@ -211,7 +215,7 @@ def add_constraint(
         constraints.normal[i] = normal
         constraints.separation[i] = separation
         constraints.friction[i] = friction
-        path = _relative(weights, corners, vertices.x1) - _relative(weights, corners, vertices.x0)
+        path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
         constraints.urgency[i] = wp.dot(normal, path) / wp.min(_gap(vertices, constraints, i), -_TINY)
         constraints.displacing[i] = wp.vec3d()
         constraints.impulse[i] = wp.vec3d()
@@ -252,8 +256,8 @@ def _parting(vertices: Vertices, constraints: Constraints, i: int, restitution: 
     normal = constraints.normal[i]
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    wanted = wp.dot(normal, _relative(weights, corners, vertices.wanted_velocity))
-    is_ = wp.dot(normal, _relative(weights, corners, vertices.velocity))
+    wanted = wp.dot(normal, relative(weights, corners, vertices.wanted_velocity))
+    is_ = wp.dot(normal, relative(weights, corners, vertices.velocity))
     return is_ - restitution * wp.max(-wanted, _ZERO)
 
 
@@ -339,7 +343,7 @@ def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
         return
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    path = _relative(weights, corners, vertices.x1) - _relative(weights, corners, vertices.x0)
+    path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
     old = constraints.displacing[i]
     new = updated(
         old,
@@ -400,6 +404,7 @@ def _accelerates(vertices: Vertices, constraints: Constraints, i: int, restituti
 
 @wp.kernel(**_KERNEL)
 def count_accelerating(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
+    """Counts the constraints of each vertex that are active for velocities."""
     i = wp.tid()
     if i < constraints.count[0] and _accelerates(vertices, constraints, i, restitution):
         for j in range(4):
@@ -420,7 +425,7 @@ def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.flo
         old,
         constraints.normal[i],
         _parting(vertices, constraints, i, restitution),
-        _relative(constraints.weights[i], constraints.vertices[i], vertices.velocity),
+        relative(constraints.weights[i], constraints.vertices[i], vertices.velocity),
         mobility,
         wp.float64(constraints.friction[i]),
     )
@@ -429,51 +434,8 @@ def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.flo
 
 
 @wp.kernel(**_KERNEL)
-def balance(vertices: Vertices, constraints: Constraints):
-    """Turns the four vertices of each contact by what it has done to their angular momentum.
-
-    Displacements, and impulses at points that are apart by now, are forces that do not meet: small torques. A rotation
-    takes each back, as far as it is small beside the motion.
-    """
-    i = wp.tid()
-    if i >= constraints.count[0]:
-        return
-    weights = constraints.weights[i]
-    corners = constraints.vertices[i]
-    mass = _ZERO
-    centre = wp.vec3d()
-    for j in range(4):
-        vertex = corners[j]
-        if vertices.inverse_mass[vertex] == 0.0 or vertices.done[vertex] > PROJECTED:
-            return
-        mass += _ONE / wp.float64(vertices.inverse_mass[vertex])
-        centre += to_double(vertices.x1[vertex]) / wp.float64(vertices.inverse_mass[vertex])
-    centre = centre / mass
-    inertia = wp.mat33d()
-    for j in range(4):
-        r = to_double(vertices.x1[corners[j]]) - centre
-        square = wp.dot(r, r) * wp.identity(n=3, dtype=wp.float64) - wp.outer(r, r)
-        inertia += square / wp.float64(vertices.inverse_mass[corners[j]])
-    velocity = _relative(weights, corners, vertices.wanted_velocity)
-    torque = wp.cross(constraints.displacing[i], velocity)
-    torque += wp.cross(_relative(weights, corners, vertices.x1), constraints.impulse[i])
-    if wp.length(torque) == _ZERO or wp.determinant(inertia) <= _ZERO:
-        return
-    turning = -wp.inverse(inertia) * torque
-    fastest = _ZERO
-    for j in range(4):
-        fastest = wp.max(fastest, wp.length(wp.cross(turning, to_double(vertices.x1[corners[j]]) - centre)))
-    limit = _TURNING * wp.length(velocity)
-    if fastest > limit:
-        turning = turning * (limit / fastest)
-    for j in range(4):
-        r = to_double(vertices.x1[corners[j]]) - centre
-        _add(vertices.velocity_change, corners[j], wp.cross(turning, r))
-        vertices.active[corners[j]] = 1
-
-
-@wp.kernel(**_KERNEL)
 def change_velocities(vertices: Vertices):
+    """Gives each vertex that has not been truncated the velocity that its constraints ask for."""
     vertex = wp.tid()
     if vertices.active[vertex] == 0:
         return

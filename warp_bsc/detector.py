@@ -370,7 +370,7 @@ class CollisionDetector:
         """
         counts, vertex_face, edge_edge = self.counts, self._vertex_face, self._edge_edge
         self._run += 1
-        self._captured |= self.mesh.device.is_capturing
+        self._captured |= bool(self.mesh.device.is_capturing)
         counts.zero_()
         self._count_not_finite(x0, x1)
         queues = vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near

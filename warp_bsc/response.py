@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from .angular_momentum import SUMS, sum_bodies, sum_torques, turn_vertices
 from .constraints import (
     ACTIVE,
     CERTIFIED,
@@ -19,7 +20,6 @@ from .constraints import (
     Progress,
     Vertices,
     accelerate,
-    balance,
     change_velocities,
     collect_contacts,
     count_accelerating,
@@ -141,7 +141,9 @@ class Response:
         vertices.movable = mesh.model.particle_count
         self._progress = progress = Progress()
         progress.steer = self.steer = wp.zeros(int(STEER), dtype=int, device=device)
+        self._another_round = self.steer[int(ACTIVE) : int(ACTIVE) + 1]
         progress.contact_round = wp.zeros(max(1, mesh.model.world_count), dtype=int, device=device)
+        self._turn = wp.zeros((max(1, mesh.model.world_count), SUMS), dtype=wp.int64, device=device)
         self._half_spaces = half_spaces = HalfSpaces()
         half_spaces.friction, half_spaces.world = plane_friction, mesh.device_planes.world
         for name in ("start", "end"):
@@ -186,7 +188,7 @@ class Response:
             self._collect_penetrations(ahead=True)
             self._displace(1)
         self._detect(refit=False)
-        wp.capture_while(self.steer, self._round, dt=dt)
+        wp.capture_while(self._another_round, self._round, dt=dt)
         wp.capture_if(self._constraints.count, self._change_velocities, dt=dt)
 
     def _collect_penetrations(self, ahead):
@@ -212,8 +214,10 @@ class Response:
             self._launch_over_constraints(count_accelerating, [*inputs, self._restitution])
             self._launch_over_constraints(accelerate, [*inputs, self._restitution])
             self._change(vertices)
-        self._launch_over_constraints(balance, inputs)
-        self._change(vertices)
+        self._turn.zero_()
+        self._launch_over_constraints(sum_torques, [*inputs, self._turn])
+        for kernel in (sum_bodies, turn_vertices):
+            wp.launch(kernel, vertices.movable, inputs=[vertices, self._turn], device=self._device)
 
     def _change(self, vertices):
         wp.launch(change_velocities, vertices.movable, inputs=[vertices], device=self._device)
