@@ -159,9 +159,7 @@ def test_kinematic_and_inactive_particles_are_never_moved(device):
 def test_worlds_are_like_one_alone(device):
     alone = bullet(60.0, device=device)
     many = bullet(60.0, device=device, worlds=3)
-    one, all_worlds = (
-        Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), restitution=0.3)) for model in (alone, many)
-    )
+    one, all_worlds = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), restitution=0.3)) for model in (alone, many))
     hits = 0
     for _ in range(5):
         one.step()
@@ -252,7 +250,7 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
     if not device.is_cuda or not wp.is_conditional_graph_supported():
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
-    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model))) for _ in range(2))
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
     for _ in range(3):
         plain.step()
         captured.step()  # queues grow

@@ -211,8 +211,8 @@ class Response:
         self._launch_over_constraints(start_impulses, [*inputs, dt])
         self._change(vertices)
         for _ in range(_ITERATIONS):
-            self._launch_over_constraints(count_accelerating, [*inputs, self._restitution])
-            self._launch_over_constraints(accelerate, [*inputs, self._restitution])
+            self._launch_over_constraints(count_accelerating, [*inputs, self._progress, self._restitution])
+            self._launch_over_constraints(accelerate, [*inputs, self._progress, self._restitution])
             self._change(vertices)
         self._turn.zero_()
         self._launch_over_constraints(sum_torques, [*inputs, self._turn])
@@ -265,6 +265,7 @@ class Response:
         constraints.separation, constraints.urgency = (
             wp.empty(room, dtype=wp.float64, device=self._device) for _ in range(2)
         )
+        constraints.offset = wp.empty(room, dtype=wp.float64, device=self._device)
         constraints.friction = wp.empty(room, dtype=float, device=self._device)
         constraints.displacing, constraints.impulse = (
             wp.empty(room, dtype=wp.vec3d, device=self._device) for _ in range(2)
