@@ -9,11 +9,20 @@ import warp_bsc as bsc
 
 DT = 1.0 / 240.0
 STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
+
+
+def semi_implicit(model):
+    """The explicit solver, without its own contacts between particles, which are far too stiff here."""
+    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
+    return newton.solvers.SolverSemiImplicit(model)
+
+
 SOLVERS = {
     "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
     "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
-    "semi_implicit": newton.solvers.SolverSemiImplicit,
+    "semi_implicit": semi_implicit,
 }
+SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
 
 
 def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
@@ -65,11 +74,11 @@ class Rollout:
         self.detector = bsc.CollisionDetector(mesh, method="exact")
         self.collisions = 0
 
-    def step(self):
+    def step(self, dt=DT):
         start, end = self.states
         before = start.particle_q.numpy().copy()  # the inner solver may overwrite it
         start.clear_forces()
-        self.solver.step(start, end, self.control, None, DT)
+        self.solver.step(start, end, self.control, None, dt)
         c = self.detector.detect(before, end.particle_q.numpy())
         self.collisions += len(c.vertex_face) + len(c.edge_edge)
         self.states = end, start
@@ -94,10 +103,11 @@ def test_nothing_passes_through(inner, speed, device):
     model = bullet(speed, device=device)
     through = Rollout(model, SOLVERS[inner](model))
     stopped = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model)))
-    steps = 12 if speed < 50.0 else 6
+    substeps = SUBSTEPS[inner]
+    steps = substeps * (12 if speed < 50.0 else 6)
     for _ in range(steps):
-        through.step()
-        stopped.step()
+        through.step(DT / substeps)
+        stopped.step(DT / substeps)
         assert stopped.solver.report.certified
     assert through.collisions > 0
     assert stopped.collisions == 0
@@ -251,7 +261,7 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
     plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
-    for _ in range(3):
+    for _ in range(8):
         plain.step()
         captured.step()  # queues grow
     for rollout in (plain, captured):
@@ -271,3 +281,43 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
         assert plain.positions.tobytes() == captured.positions.tobytes()
         assert plain.velocities.tobytes() == captured.velocities.tobytes()
     assert captured.solver.report.uncertified_steps == 0
+
+
+def test_positions_that_are_not_finite_leave_everything_standing(device):
+    model = bullet(10.0, device=device)
+
+    class Diverging(newton.solvers.SolverXPBD):
+        def step(self, state_in, state_out, *arguments, **options):
+            super().step(state_in, state_out, *arguments, **options)
+            q = state_out.particle_q.numpy()
+            q[-1] = np.nan
+            state_out.particle_q.assign(q)
+
+    solver = bsc.SolverCCD(Diverging(model))
+    start, end = model.state(), model.state()
+    solver.step(start, end, model.control(), None, DT)
+    assert not solver.report.certified and solver.report.undetected and solver.report.uncertified_steps == 1
+    np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
+    assert (end.particle_qd.numpy() == 0.0).all()
+
+
+def test_a_graph_without_room_stands_still_and_says_so(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
+    response = rollout.solver._response
+    response.detector._vertex_face._reserve_contacts(1)
+    response.detector.capacities.assign(response.detector._room())
+    start, end = rollout.states
+    with wp.ScopedCapture(device) as capture:
+        rollout.solver.step(start, end, rollout.control, None, DT)
+    for _ in range(8):
+        wp.capture_launch(capture.graph)
+        wp.copy(start.particle_q, end.particle_q)
+        wp.copy(start.particle_qd, end.particle_qd)
+        if rollout.solver.report.undetected:
+            break
+    report = rollout.solver.report
+    assert report.undetected and not report.certified
+    np.testing.assert_array_equal(end.particle_q.numpy(), response.vertices.x0.numpy())

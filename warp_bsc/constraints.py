@@ -18,6 +18,7 @@ __all__ = [
     "ROUND",
     "STEER",
     "TIMES",
+    "UNDETECTED",
     "Constraints",
     "Contacts",
     "Progress",
@@ -44,10 +45,12 @@ PROJECTIONS = wp.constant(40)
 PROJECTED = wp.constant(1)
 """Bit of what has been done to a vertex."""
 
-ACTIVE, ROUND, CERTIFIED, HITS, FIRST_HITS, REMAINING, FROZEN_NOW, STEER = (wp.constant(i) for i in range(8))
+ACTIVE, ROUND, CERTIFIED, HITS, FIRST_HITS, REMAINING, FROZEN_NOW, UNDETECTED, STEER = (
+    wp.constant(i) for i in range(9)
+)
 """Places in the array that steers the rounds: whether there is another, how many there were, whether the motion is
-certified, contacts counted so far in a detection, those of the first, those of the last, and how many vertices this
-round has frozen; and how many places there are."""
+certified, contacts counted so far in a detection, those of the first, those of the last, how many vertices this round
+has frozen, and whether a detection was incomplete; and how many places there are."""
 
 TIMES = wp.constant(wp.float64(2.0**30))
 """Units of time in a step, in which times are integers."""

@@ -15,6 +15,7 @@ from .constraints import (
     ROUND,
     STEER,
     TIMES,
+    UNDETECTED,
     Constraints,
     Contacts,
     Progress,
@@ -75,6 +76,7 @@ def _decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array
     stuck = steer[ROUND] > PROJECTIONS + _TRUNCATIONS and steer[FROZEN_NOW] == 0
     steer[FROZEN_NOW] = 0
     steer[CERTIFIED] = wp.where(hits == 0 and not overflowed, 1, 0)
+    steer[UNDETECTED] = wp.where(overflowed, 1, 0)
     steer[ACTIVE] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     steer[ROUND] = steer[ROUND] + steer[ACTIVE]
 
@@ -102,12 +104,23 @@ def _truncate_vertices(vertices: Vertices, progress: Progress, dt: wp.float64):
         wp.atomic_add(progress.steer, FROZEN_NOW, 1)
 
 
+@wp.kernel(**_KERNEL)
+def _stand_still(vertices: Vertices, progress: Progress):
+    """Leaves everything where it was if a detection was incomplete: positions not finite, or a graph without room."""
+    vertex = wp.tid()
+    if progress.steer[UNDETECTED] == 1 and vertices.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = vertices.x0[vertex]
+        vertices.velocity[vertex] = wp.vec3()
+        vertices.done[vertex] = vertices.done[vertex] | FROZEN
+
+
 class Response:
     """Moves the vertices of a motion until it is certified to be free of collisions, on the device.
 
     Rounds of projection come first: each contact is moved apart at the end of the step, and the new motion is detected
     again. What still collides after many has its path truncated before its first contact, a few times, and then stands
-    still, which ends, because what stood apart and stands still does not collide.
+    still, which ends, because what stood apart and stands still does not collide. Where a detection is incomplete,
+    everything stands still, and the motion is not certified.
 
     Attributes:
         detector: What it detects with.
@@ -190,6 +203,7 @@ class Response:
         self._detect(refit=False)
         wp.capture_while(self._another_round, self._round, dt=dt)
         wp.capture_if(self._constraints.count, self._change_velocities, dt=dt)
+        wp.launch(_stand_still, vertices.movable, inputs=[vertices, self._progress], device=self._device)
 
     def _collect_penetrations(self, ahead):
         inputs = [self.vertices, self._half_spaces, self._constraints, self._progress, self._separation, ahead]

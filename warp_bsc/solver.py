@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
-from .constraints import CERTIFIED, FIRST_HITS, ROUND
+from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
 
@@ -81,6 +81,20 @@ class SolverReport:
         return self._steer(FIRST_HITS)
 
     @property
+    def remaining(self) -> int:
+        """Contacts of the motion of the last step that could not be resolved, as what is kinematic leaves no room."""
+        return self._steer(REMAINING)
+
+    @property
+    def undetected(self) -> bool:
+        """Whether the last step stood still because it could not be detected.
+
+        Positions were not finite, or a CUDA graph had too little room: step without it, which makes room, and capture
+        anew.
+        """
+        return bool(self._steer(UNDETECTED))
+
+    @property
     def rounds(self) -> int:
         """Rounds of response in the last step."""
         return self._steer(ROUND)
@@ -99,9 +113,13 @@ class SolverReport:
     def intersections(self) -> np.ndarray:
         """(edge, face) that cross at the start of the last step, of the solver's ``mesh``, int32, shape [n, 2].
 
-        What crosses already is not what the promise is about. Looked for when asked, by exact arithmetic.
+        What crosses already is not what the promise is about. Shapes that cross each other are left out. Looked for
+        when asked, by exact arithmetic.
         """
-        return self._response.detector.find_intersections(self._response.vertices.x0)
+        mesh, particles = self._mesh, self._mesh.model.particle_count
+        pairs = self._response.detector.find_intersections(self._response.vertices.x0)
+        of_particles = [(elements < particles).any(axis=1) for elements in (mesh.edges, mesh.faces)]
+        return pairs[of_particles[0][pairs[:, 0]] | of_particles[1][pairs[:, 1]]]
 
     @property
     def milliseconds(self) -> float | None:
