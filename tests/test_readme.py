@@ -29,6 +29,7 @@ def test_python_code_runs_as_printed(tmp_path, capsys):
     np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
     assert names["c"].certified
     assert names["r"].hit.tolist() == [True]
+    assert (names["solver"].report.steps, names["solver"].report.uncertified_steps) == (10, 0)
     assert names["count"].numpy().tolist() == [1]
     assert "[[3, 0], [4, 0], [5, 0]]" in capsys.readouterr().out
 
@@ -63,7 +64,7 @@ def test_continuous_integration_runs_the_command_of_the_readme():
 
 
 def test_files_that_the_readme_names_exist():
-    for name in re.findall(r"`((?:kernels|warp_bsc|assets)/[\w./]+)`", README) + re.findall(
+    for name in re.findall(r"`((?:kernels|warp_bsc|assets|examples)/[\w./]+)`", README) + re.findall(
         r"\]\((\w[\w./]+)\)", README
     ):
         assert (ROOT / name).exists(), name
