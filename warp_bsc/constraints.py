@@ -59,12 +59,6 @@ _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new contacts grows from round to round: what is in a jam moves further."""
 _WIDEST = wp.constant(wp.float64(5.0))
 """How often the separation it grows to at most."""
-_LATE = wp.constant(4)
-"""Round after which constraints ask for less than the separation where they can."""
-_GIVEN = wp.constant(wp.float64(0.8))
-"""Which part of the distance at the start they then ask for."""
-_LEAST = wp.constant(wp.float64(0.1))
-"""Which part of the separation they ask for at least."""
 _RELAXATION = wp.constant(wp.float64(1.5))
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Sums are of integers in these units of a metre, so that they are the same in any order."""
@@ -129,7 +123,6 @@ class Constraints:
     vertices: wp.array[wp.vec4i]
     weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
     normal: wp.array[wp.vec3d]
-    offset: wp.array[wp.float64]  # of a plane along the normal [m], 0 between vertices
     separation: wp.array[wp.float64]  # along the normal [m]
     friction: wp.array[float]  # coefficient
     urgency: wp.array[wp.float64]  # share of its violation that a whole step's approach is
@@ -201,30 +194,19 @@ def relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.v
 
 
 @wp.func
-def _gap(vertices: Vertices, constraints: Constraints, progress: Progress, i: int) -> wp.float64:
-    """How much more than is asked for contact points are apart at the end of the step [m].
-
-    Late on it is only that they hardly approach, which all constraints at once can have: standing still is that.
-    """
-    normal = constraints.normal[i]
-    weights = constraints.weights[i]
-    corners = constraints.vertices[i]
-    asked = constraints.separation[i]
-    if progress.steer[ROUND] > _LATE:
-        start = wp.dot(normal, relative(weights, corners, vertices.x0)) - constraints.offset[i]
-        asked = wp.min(asked, wp.max(_GIVEN * start, _LEAST * asked))
-    return wp.dot(normal, relative(weights, corners, vertices.x1)) - constraints.offset[i] - asked
+def _gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
+    """How much more than the separation contact points are apart at the end of the step [m]."""
+    end = relative(constraints.weights[i], constraints.vertices[i], vertices.x1)
+    return wp.dot(constraints.normal[i], end) - constraints.separation[i]
 
 
 @wp.func
 def add_constraint(
     vertices: Vertices,
     constraints: Constraints,
-    progress: Progress,
     corners: wp.vec4i,
     weights: wp.vec4d,
     normal: wp.vec3d,
-    offset: wp.float64,
     separation: wp.float64,
     friction: float,
 ):
@@ -236,9 +218,8 @@ def add_constraint(
         constraints.normal[i] = normal
         constraints.separation[i] = separation
         constraints.friction[i] = friction
-        constraints.offset[i] = offset
         path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
-        constraints.urgency[i] = wp.dot(normal, path) / wp.min(_gap(vertices, constraints, progress, i), -_TINY)
+        constraints.urgency[i] = wp.dot(normal, path) / wp.min(_gap(vertices, constraints, i), -_TINY)
         constraints.displacing[i] = wp.vec3d()
         constraints.impulse[i] = wp.vec3d()
 
@@ -260,11 +241,9 @@ def collect_contacts(
         add_constraint(
             vertices,
             constraints,
-            progress,
             corners,
             _weights(contacts, i),
             contacts.normal[i],
-            _ZERO,
             widened(separation, progress),
             friction,
         )
@@ -344,7 +323,7 @@ def count_displacing(vertices: Vertices, constraints: Constraints, progress: Pro
     """Counts the active constraints of each vertex: those that are violated or do something."""
     i = wp.tid()
     if i < constraints.count[0] and is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
-        if _gap(vertices, constraints, progress, i) < _ZERO:
+        if _gap(vertices, constraints, i) < _ZERO:
             for j in range(4):
                 wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
 
@@ -359,7 +338,7 @@ def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
     i = wp.tid()
     if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
         return
-    gap = _gap(vertices, constraints, progress, i)
+    gap = _gap(vertices, constraints, i)
     if gap >= _ZERO:
         return
     mobility = _mobility(vertices, constraints, i)
@@ -416,32 +395,30 @@ def start_impulses(vertices: Vertices, constraints: Constraints, dt: wp.float64)
 
 
 @wp.func
-def _accelerates(
-    vertices: Vertices, constraints: Constraints, progress: Progress, i: int, restitution: wp.float64
-) -> bool:
+def _accelerates(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> bool:
     """Whether a constraint has an impulse, or should: where it has displaced something that still is at it."""
     if _is_pushing(constraints.impulse[i], constraints.normal[i]):
         return True
     if not _is_pushing(constraints.displacing[i], constraints.normal[i]):
         return False
-    at_it = _gap(vertices, constraints, progress, i) <= constraints.separation[i]
+    at_it = _gap(vertices, constraints, i) <= constraints.separation[i]
     return at_it and _parting(vertices, constraints, i, restitution) < _ZERO
 
 
 @wp.kernel(**_KERNEL)
-def count_accelerating(vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64):
+def count_accelerating(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
     """Counts the constraints of each vertex that are active for velocities."""
     i = wp.tid()
-    if i < constraints.count[0] and _accelerates(vertices, constraints, progress, i, restitution):
+    if i < constraints.count[0] and _accelerates(vertices, constraints, i, restitution):
         for j in range(4):
             wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
 
 
 @wp.kernel(**_KERNEL)
-def accelerate(vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64):
+def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
     """An iteration over constraints on velocities."""
     i = wp.tid()
-    if i >= constraints.count[0] or not _accelerates(vertices, constraints, progress, i, restitution):
+    if i >= constraints.count[0] or not _accelerates(vertices, constraints, i, restitution):
         return
     mobility = _mobility(vertices, constraints, i)
     if mobility <= _ZERO:

@@ -107,12 +107,10 @@ def collect_penetrations(
             add_constraint(
                 vertices,
                 constraints,
-                progress,
                 wp.vec4i(vertex),
                 wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
                 wp.vec3d(plane[0], plane[1], plane[2]),
-                plane[3],
-                widened(separation, progress),
+                plane[3] + widened(separation, progress),
                 wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
             )
         else:

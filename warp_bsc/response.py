@@ -167,6 +167,14 @@ class Response:
         self._constraints = self._with_room(0)
         self._retired = []
 
+    def prepare(self):
+        """Resolves the model as it stands, which makes what a CUDA graph cannot make: the hierarchy, and some room."""
+        for place in (self.start, self.end):
+            place(self._mesh.model.particle_q, self._mesh.model.body_q)
+        self.resolve(1.0)
+        self.steer.zero_()
+        self.vertices.done.zero_()
+
     def start(self, particle_q, body_q):
         """Takes down where everything is at the start of a step, from arrays as of :meth:`ModelMesh.positions`."""
         self._place(particle_q, body_q, self.vertices.x0, self._half_spaces.start)
@@ -225,8 +233,8 @@ class Response:
         self._launch_over_constraints(start_impulses, [*inputs, dt])
         self._change(vertices)
         for _ in range(_ITERATIONS):
-            self._launch_over_constraints(count_accelerating, [*inputs, self._progress, self._restitution])
-            self._launch_over_constraints(accelerate, [*inputs, self._progress, self._restitution])
+            self._launch_over_constraints(count_accelerating, [*inputs, self._restitution])
+            self._launch_over_constraints(accelerate, [*inputs, self._restitution])
             self._change(vertices)
         self._turn.zero_()
         self._launch_over_constraints(sum_torques, [*inputs, self._turn])
@@ -279,7 +287,6 @@ class Response:
         constraints.separation, constraints.urgency = (
             wp.empty(room, dtype=wp.float64, device=self._device) for _ in range(2)
         )
-        constraints.offset = wp.empty(room, dtype=wp.float64, device=self._device)
         constraints.friction = wp.empty(room, dtype=float, device=self._device)
         constraints.displacing, constraints.impulse = (
             wp.empty(room, dtype=wp.vec3d, device=self._device) for _ in range(2)

@@ -214,6 +214,7 @@ class SolverCCD(SolverBase):
             separation=float(separation),
             restitution=float(restitution),
         )
+        self._response.prepare()
         self._fallbacks = wp.zeros(2, dtype=int, device=mesh.device)
         self._totals = wp.zeros(int(_TOTALS), dtype=int, device=mesh.device)
         self.report = SolverReport(mesh, self._response, self._totals)
