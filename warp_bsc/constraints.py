@@ -60,6 +60,7 @@ _WIDENING = wp.constant(wp.float64(1.25))
 _WIDEST = wp.constant(wp.float64(5.0))
 """How often the separation it grows to at most."""
 _RELAXATION = wp.constant(wp.float64(1.5))
+"""How many of the constraints that share a vertex count as one, as they mostly ask for the same."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Sums are of integers in these units of a metre, so that they are the same in any order."""
 _CONTACTS = wp.constant(int(Count.CONTACTS))
@@ -260,8 +261,8 @@ def _parting(vertices: Vertices, constraints: Constraints, i: int, restitution: 
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
     wanted = wp.dot(normal, relative(weights, corners, vertices.wanted_velocity))
-    is_ = wp.dot(normal, relative(weights, corners, vertices.velocity))
-    return is_ - restitution * wp.max(-wanted, _ZERO)
+    speed = wp.dot(normal, relative(weights, corners, vertices.velocity))
+    return speed - restitution * wp.max(-wanted, _ZERO)
 
 
 @wp.func
@@ -320,7 +321,7 @@ def _spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, s
 
 @wp.kernel(**_KERNEL)
 def count_displacing(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """Counts the active constraints of each vertex: those that are violated or do something."""
+    """Counts the constraints of each vertex that are active for positions: those that are violated."""
     i = wp.tid()
     if i < constraints.count[0] and is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
         if _gap(vertices, constraints, i) < _ZERO:

@@ -41,7 +41,7 @@ _TRUNCATIONS = wp.constant(8)
 """Rounds of truncation, after which what still collides stands still."""
 
 _ITERATIONS = 48
-"""Iterations over all constraints in a round of projection."""
+"""Iterations over all constraints, in each round on positions, and at the end on velocities."""
 _ROUNDS_OF_ROOM = 4
 """For the contacts of how many rounds there is room."""
 _SHARE = wp.constant(wp.float64(0.9))
@@ -125,8 +125,7 @@ class Response:
     Attributes:
         detector: What it detects with.
         vertices: The vertices, whose ``x0``, ``x1`` and ``velocity`` are to be filled.
-        steer: Array of int that says, by :data:`CERTIFIED`, :data:`FIRST_HITS`, :data:`REMAINING` and :data:`ROUND`,
-            what was done.
+        steer: Array of int that says, by the places that :mod:`.constraints` names, what was done.
     """
 
     def __init__(self, mesh, friction, plane_friction, *, separation, restitution):
