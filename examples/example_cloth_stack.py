@@ -134,11 +134,7 @@ class Example:
     def print_report(self):
         """Prints what the stage did, and what came of it."""
         if self.ccd:
-            report = self.solver.report
-            print(
-                f"{report.steps} steps, {report.truncated_steps} with truncation, {report.frozen_steps} with vertices "
-                f"left standing, {report.uncertified_steps} not certified"
-            )
+            print(self.solver.report)
         print(f"mean speed {self.speed():.4f} m/s, tops of the sheets {self.heights().max(axis=(1, 2)).round(4)} m")
 
     @staticmethod

@@ -179,11 +179,7 @@ class Example:
     def print_report(self):
         """Prints what the stage did."""
         if self.ccd:
-            report = self.solver.report
-            print(
-                f"{report.steps} steps, {report.truncated_steps} with truncation, {report.frozen_steps} with vertices "
-                f"left standing, {report.uncertified_steps} not certified"
-            )
+            print(self.solver.report)
         print(f"{len(self.find_intersections())} edges of the cloth cross faces")
 
     @staticmethod

@@ -168,11 +168,7 @@ class Example:
     def print_report(self):
         """Prints what the stage did, and what came of it."""
         if self.ccd:
-            report = self.solver.report
-            print(
-                f"{report.steps} steps, {report.truncated_steps} with truncation, {report.frozen_steps} with vertices "
-                f"left standing, {report.uncertified_steps} not certified"
-            )
+            print(self.solver.report)
         print(
             f"pressed to {self.lowest_height / HEIGHT:.1%} of their height, recovered to {self.height() / HEIGHT:.1%}, "
             f"smallest tetrahedron at {self.volume_ratios().min():.1%} of its volume"

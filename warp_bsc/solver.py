@@ -150,6 +150,13 @@ class SolverReport:
         """Steps so far in which a vertex was left where it was."""
         return self._total(_FROZEN_STEPS)
 
+    def __str__(self):
+        """The steps so far, in a line."""
+        return (
+            f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
+            f"left standing, {self.uncertified_steps} not certified"
+        )
+
     def _steer(self, place):
         return int(self._response.steer.numpy()[int(place)])
 
