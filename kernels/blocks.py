@@ -5,7 +5,8 @@ of the next level, up to one root: a tree whose links are arithmetic. Everything
 in eights, so that one box is compared with eight at once.
 
 - ``boxes``, float32, 96 a block: for each axis the lowest and the highest coordinate at the start, then at the end.
-- ``elements``, int32, 40 a block: the numbers of the elements, three corners each, and their worlds.
+- ``elements``, int32, 41 a block: the numbers of the elements, three corners each, their worlds, and which of them have
+  changed, as bits.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
 - ``node_worlds``, int32, 16 a node: the first and the last world of the children.
 
@@ -30,7 +31,7 @@ import warp as wp
     auto highest = [](float a, float b) { return a > b ? a : b; };
 
     const float* box = boxes.data + 96 * (size_t)block;
-    const int* element = elements.data + 40 * (size_t)block;
+    const int* element = elements.data + 41 * (size_t)block;
 
     // the block's own box, over all of the time, and its worlds, sorted as they are
     Floats lows[3], highs[3];
@@ -65,9 +66,15 @@ import warp as wp
         count = 0;
     };
 
+    const unsigned changed = element[40];
     auto compare = [&](int other, unsigned lanes) {
         const float* other_box = other_boxes.data + 96 * (size_t)other;
-        const int* other_element = other_elements.data + 40 * (size_t)other;
+        const int* other_element = other_elements.data + 41 * (size_t)other;
+        const unsigned other_changed = other_element[40];
+        if (!other_changed)
+            lanes &= changed;
+        if (!lanes)
+            return;
         Floats other_low0[3], other_high0[3], other_low1[3], other_high1[3], other_low[3], other_high[3];
         for (int axis = 0; axis < 3; ++axis) {
             const float* at = other_box + 32 * axis;
@@ -84,6 +91,8 @@ import warp as wp
             for (int axis = 0; axis < 3; ++axis)
                 overlap &= (other_low[axis] <= highs[axis][lane]) & (other_high[axis] >= lows[axis][lane]);
             unsigned mask = bits(overlap);
+            if (!(changed >> lane & 1))
+                mask &= other_changed;
             if (symmetric && other == block)
                 mask &= ~((2u << lane) - 1u);
             if (!mask)
@@ -94,13 +103,15 @@ import warp as wp
                     shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
             mask &= ~bits(shared);
             overlapping += __builtin_popcount(mask);
-            Ints apart = 0;
-            for (int axis = 0; axis < 3; ++axis) {
-                const float* at = box + 32 * axis + lane;
-                apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
-                apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
+            if (!keep_apart) {
+                Ints apart = 0;
+                for (int axis = 0; axis < 3; ++axis) {
+                    const float* at = box + 32 * axis + lane;
+                    apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
+                    apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
+                }
+                mask &= ~bits(apart);
             }
-            mask &= ~bits(apart);
             if (count > room - 8)
                 flush();
             for (; mask; mask &= mask - 1) {
@@ -157,6 +168,7 @@ def pair_block(
     other_node_worlds: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
     symmetric: int,
+    keep_apart: int,
     counts: wp.array[wp.int64],
     overlap_count: int,
     near_count: int,
@@ -165,7 +177,8 @@ def pair_block(
     """Enqueues the pairs of a block's elements with those of a tree that share no corner and come near.
 
     A pair whose boxes overlap over the time of the motion is counted, and enqueued unless an axis separates the two at
-    the start and at the end, on the same side. With ``symmetric`` both are of one tree, and each pair comes once, the
-    smaller number first.
+    the start and at the end, on the same side; with ``keep_apart`` it is enqueued even then. Pairs of which neither
+    element has changed are left out. With ``symmetric`` both are of one tree, and each pair comes once, the smaller
+    number first.
     """
     ...

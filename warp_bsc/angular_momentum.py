@@ -1,4 +1,7 @@
-"""Angular momentum: what displacements have added to it is taken back, by a turn of all that has collided."""
+"""Angular momentum: what displacements have added to it is taken back, by a turn of all that has collided.
+
+Only in worlds in which all that has collided is free: elsewhere it is not conserved.
+"""
 
 import warp as wp
 
@@ -6,11 +9,11 @@ from .constraints import PROJECTED, Constraints, Vertices, relative, to_double, 
 
 __all__ = ["SUMS", "sum_bodies", "sum_torques", "turn_vertices"]
 
-SUMS = 14
-"""Sums of a world: of the torque, of mass, mass times position, its six second moments, and mass times the square of
-the change of velocity."""
+SUMS = 15
+"""Sums of a world: of the torque, of mass, mass times position, its six second moments, mass times the square of the
+change of velocity, and of contacts with what is not free."""
 
-_MASS, _FIRST, _SECOND, _SQUARE = (wp.constant(i) for i in (3, 4, 7, 13))
+_MASS, _FIRST, _SECOND, _SQUARE, _HELD = (wp.constant(i) for i in (3, 4, 7, 13, 14))
 _UNITS = wp.constant(wp.float64(2.0**32))
 """Sums are of integers in these units of kg, m and s, so that they are the same in any order."""
 _LIMIT = wp.constant(wp.float64(0.1))
@@ -31,6 +34,11 @@ def _turns(vertices: Vertices, vertex: int) -> bool:
     return vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] == PROJECTED
 
 
+@wp.func
+def _is_acting(constraints: Constraints, i: int) -> bool:
+    return wp.length_sq(constraints.displacing[i]) + wp.length_sq(constraints.impulse[i]) > _ZERO
+
+
 @wp.kernel(**_KERNEL)
 def sum_torques(vertices: Vertices, constraints: Constraints, sums: wp.array2d[wp.int64]):
     """Sums up what contacts between free bodies have done to the angular momentum.
@@ -43,13 +51,18 @@ def sum_torques(vertices: Vertices, constraints: Constraints, sums: wp.array2d[w
         return
     corners = constraints.vertices[i]
     weights = constraints.weights[i]
+    world = vertices.world[corners[0]]
+    if sums[world, _HELD] != wp.int64(0) or not _is_acting(constraints, i):
+        return
+    on_plane = corners[0] == corners[1]
     for j in range(4):
-        if weights[j] != _ZERO and not _turns(vertices, corners[j]):
+        if on_plane or (weights[j] != _ZERO and not _turns(vertices, corners[j])):
+            sums[world, _HELD] = wp.int64(1)
             return
     torque = wp.cross(constraints.displacing[i], relative(weights, corners, vertices.wanted_velocity))
     torque += wp.cross(relative(weights, corners, vertices.x1), constraints.impulse[i])
     for axis in range(3):
-        _add(sums, vertices.world[corners[0]], axis, torque[axis])
+        _add(sums, world, axis, torque[axis])
 
 
 @wp.kernel(**_KERNEL)
@@ -59,6 +72,8 @@ def sum_bodies(vertices: Vertices, sums: wp.array2d[wp.int64]):
     if not _turns(vertices, vertex):
         return
     world = vertices.world[vertex]
+    if sums[world, _HELD] != wp.int64(0):
+        return
     mass = _ONE / wp.float64(vertices.inverse_mass[vertex])
     x = to_double(vertices.x1[vertex])
     change = to_double(vertices.velocity[vertex]) - to_double(vertices.wanted_velocity[vertex])
@@ -85,7 +100,7 @@ def turn_vertices(vertices: Vertices, sums: wp.array2d[wp.int64]):
     vertex = wp.tid()
     world = vertices.world[vertex]
     torque = _sum(sums, world, 0)
-    if not _turns(vertices, vertex) or wp.dot(torque, torque) == _ZERO:
+    if not _turns(vertices, vertex) or sums[world, _HELD] != wp.int64(0) or wp.dot(torque, torque) == _ZERO:
         return
     mass = wp.float64(sums[world, _MASS]) / _UNITS
     centre = _sum(sums, world, _FIRST) / mass

@@ -59,6 +59,7 @@ def _kernels(dtype):
         numbers: wp.array[int],
         worlds: wp.array[int],
         order: wp.array[int],
+        changed: wp.array[int],
         boxes: wp.array3d[wp.float32],
         elements: wp.array2d[int],
         nodes: wp.array3d[wp.float32],
@@ -68,6 +69,7 @@ def _kernels(dtype):
         count = wp.min(8, corners.shape[0] - 8 * block)
         low = wp.vec3(wp.inf)
         high = wp.vec3(-wp.inf)
+        changed_lanes = int(0)
         for lane in range(count):
             i = order[8 * block + lane]
             low0 = wp.vec3(wp.inf)
@@ -79,6 +81,8 @@ def _kernels(dtype):
             for corner in range(corners.shape[1]):
                 vertex = corners[i, corner]
                 elements[block, 8 + 8 * corner + lane] = vertex
+                if not changed or changed[vertex] != 0:
+                    changed_lanes = changed_lanes | (1 << lane)
                 start = rounded(x0[vertex])
                 end = rounded(x1[vertex])
                 low0 = wp.min(low0, start)
@@ -92,6 +96,7 @@ def _kernels(dtype):
                 boxes[block, 4 * axis + 3, lane] = high1[axis]
             low = wp.min(low, wp.min(low0, low1))
             high = wp.max(high, wp.max(high0, high1))
+        elements[block, 40] = changed_lanes
         for axis in range(3):
             nodes[block / 8, 2 * axis, block % 8] = low[axis]
             nodes[block / 8, 2 * axis + 1, block % 8] = high[axis]
@@ -114,6 +119,7 @@ def _pair_blocks(
     other_node_worlds: wp.array[int],
     level_starts: wp.array[int],
     symmetric: int,
+    keep_apart: int,
     counts: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
 ):
@@ -129,6 +135,7 @@ def _pair_blocks(
         other_node_worlds,
         level_starts,
         symmetric,
+        keep_apart,
         counts,
         _CANDIDATES,
         _NEAR,
@@ -167,7 +174,7 @@ class _Tree:
         # empty boxes, which overlap nothing, where there are less than eight; worlds of no element
         empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
         self._boxes = wp.array(np.tile(empty, (blocks, 6, 8)), dtype=wp.float32, device=device)
-        self._elements = wp.full((blocks, 40), -1, dtype=int, device=device)
+        self._elements = wp.full((blocks, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
 
@@ -186,10 +193,16 @@ class _Tree:
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
 
-    def fit(self, x0, x1):
-        """Boxes the elements of a motion, Warp arrays of vec3 or vec3d, in the order that they are in."""
+    def fit(self, x0, x1, changed=None):
+        """Boxes the elements of a motion, in the order that they are in.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            changed: Which vertices have changed, array of int, None for all.
+        """
         _, fill_blocks = _kernels(x0.dtype)
-        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order]
+        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed]
         outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
         device = self._corners.device
         launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
@@ -200,13 +213,14 @@ class _Tree:
             _join(worlds[start:end, :1, 0], worlds[end:above, :1])
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
-    def pair(self, other, counts, pairs):
+    def pair(self, other, counts, pairs, *, keep_apart=False):
         """Enqueues pairs of elements of this tree and of another or the same, see :func:`.kernels.blocks.pair_block`.
 
         Args:
             other: The other tree.
             counts: By :class:`Count`, array of int64.
             pairs: Queue of the pairs that come near, array of vec2i.
+            keep_apart: Whether to enqueue those as well that an axis separates.
         """
         inputs = [
             self._boxes.flatten(),
@@ -219,6 +233,7 @@ class _Tree:
             other._node_worlds.flatten(),
             other._level_starts,
             other is self,
+            keep_apart,
             counts,
         ]
         launch_over(_pair_blocks, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
@@ -249,7 +264,9 @@ class BlockBroadPhase:
     def grow(self, count):
         """Nothing, as there is nothing that could."""
 
-    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False):
+    def pair_elements(
+        self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False, changed=None
+    ):
         """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
 
         Args:
@@ -261,10 +278,16 @@ class BlockBroadPhase:
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
             refit: Whether to keep the order of the run before, which is as right, but slows down what follows if much
                 has moved.
+            changed: Nonzero for each vertex that pairs are wanted of, array of int; None for all pairs.
         """
-        _build([self._vertices, self._edges, self._faces], x0, x1, refit)
+        _build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge)
+
+    def pair_overlapping_elements(self, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
+        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_apart=True)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_apart=True)
 
     def pair_edges_with_faces(self, x, counts, pairs):
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
@@ -278,12 +301,12 @@ class BlockBroadPhase:
         self._edges.pair(self._faces, counts, pairs)
 
 
-def _build(trees, x0, x1, refit):
+def _build(trees, x0, x1, refit, changed=None):
     """Builds trees for a motion, sorted on one grid around all of it, or refits them."""
     if not refit:
         _sort(trees, x0, x1)
     for tree in trees:
-        tree.fit(x0, x1)
+        tree.fit(x0, x1, changed)
 
 
 def _sort(trees, x0, x1):

@@ -19,17 +19,27 @@ _CHUNK = wp.constant(16)
 _KERNEL = {"enable_backward": False, "module": "unique"}
 
 
+@wp.func
+def _has_changed(changed: wp.array[int], faces: wp.array2d[int], face: int):
+    return changed[faces[face, 0]] + changed[faces[face, 1]] + changed[faces[face, 2]] != 0
+
+
 @wp.kernel(**_KERNEL)
 def _pair_faces(
     bvh: wp.uint64,
     lowers: wp.array[wp.vec3],
     uppers: wp.array[wp.vec3],
     worlds: wp.array[int],
+    faces: wp.array2d[int],
+    changed: wp.array[int],
     count: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
 ):
     """Slots are taken by the chunk, because one atomic for each pair takes longer than the traversal."""
     face = wp.tid()
+    if changed:
+        if not _has_changed(changed, faces, face):
+            return
     root = int(-1)
     if worlds:
         root = wp.bvh_get_group_root(bvh, worlds[face])
@@ -38,7 +48,10 @@ def _pair_faces(
     slot = wp.int64(0)
     end = wp.int64(0)
     while wp.bvh_query_next(query, other):
-        if face < other:
+        wanted = face < other
+        if changed and other < face:
+            wanted = not _has_changed(changed, faces, other)
+        if wanted:
             if slot == end:
                 slot = take_slots(count, 0, _CHUNK)
                 end = slot + wp.int64(_CHUNK)
@@ -143,10 +156,10 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
-def _overlapping_vertices(mesh: _Mesh, face: int, other: int):
+def _overlapping_vertices(mesh: _Mesh, face: int, other: int, keep_apart: bool):
     """Which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
-    Those that no axis separates are bits 3 to 5 as well.
+    Those that no axis separates, or all with ``keep_apart``, are bits 3 to 5 as well.
     """
     owned = mesh.owned[face]
     low = mesh.face_lowers[other]
@@ -159,16 +172,16 @@ def _overlapping_vertices(mesh: _Mesh, face: int, other: int):
             if boxes_overlap(_low(mesh.vertex_boxes, vertex), _high(mesh.vertex_boxes, vertex), low, high):
                 if not _has_vertex(mesh.faces, other, vertex):
                     found = found | (1 << corner)
-                    if not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
+                    if keep_apart or not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
                         found = found | (8 << corner)
     return found
 
 
 @wp.func
-def _overlapping_edges(mesh: _Mesh, face: int, other: int):
+def _overlapping_edges(mesh: _Mesh, face: int, other: int, keep_apart: bool):
     """Which edges of a face and of another, each of its own, have overlapping boxes: bit 3 i + j for sides i and j.
 
-    Those that no axis separates are bits 9 to 17 as well.
+    Those that no axis separates, or all with ``keep_apart``, are bits 9 to 17 as well.
     """
     owned = mesh.owned[face]
     other_owned = mesh.owned[other]
@@ -193,7 +206,7 @@ def _overlapping_edges(mesh: _Mesh, face: int, other: int):
                             if a != c and a != d and b != c and b != d:
                                 bit = 3 * side + other_side
                                 found = found | (1 << bit)
-                                if not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
+                                if keep_apart or not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
                                     found = found | (512 << bit)
     return found
 
@@ -218,6 +231,7 @@ def _pair_elements(
     mesh: _Mesh,
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
+    keep_apart: bool,
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
     edge_edge_counts: wp.array[wp.int64],
@@ -233,8 +247,9 @@ def _pair_elements(
     vertices = int(0)
     edges = int(0)
     if face >= 0:
-        vertices = _overlapping_vertices(mesh, face, other) | (_overlapping_vertices(mesh, other, face) << 6)
-        edges = _overlapping_edges(mesh, face, other)
+        vertices = _overlapping_vertices(mesh, face, other, keep_apart)
+        vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_apart) << 6)
+        edges = _overlapping_edges(mesh, face, other, keep_apart)
     take_slots(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
     take_slots(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
     # of the rest only what no axis separates
@@ -343,7 +358,9 @@ class BvhBroadPhase:
         if count > self.capacity:
             self.queues = [wp.empty(roomy(count), dtype=wp.vec2i, device=self._device)]
 
-    def pair_elements(self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False):
+    def pair_elements(
+        self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False, changed=None
+    ):
         """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
 
         Args:
@@ -355,9 +372,15 @@ class BvhBroadPhase:
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
             refit: Whether to keep the hierarchy of the run before and only refit its boxes, which is as right and
                 allocates nothing, but slows down what follows if much has moved.
+            changed: Nonzero for each vertex that pairs are wanted of, array of int, of whose faces all pairs are
+                found; None for all.
         """
-        self._pair_faces(x0, x1, refit)
-        self._launch_over_pairs(_pair_elements, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_faces(x0, x1, refit, changed)
+        self._launch_over_pairs(_pair_elements, False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+
+    def pair_overlapping_elements(self, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
+        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+        self._launch_over_pairs(_pair_elements, True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_edges_with_faces(self, x, counts, pairs):
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
@@ -370,7 +393,7 @@ class BvhBroadPhase:
         self._pair_faces(x, x, False)
         self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
 
-    def _pair_faces(self, x0, x1, refit):
+    def _pair_faces(self, x0, x1, refit, changed=None):
         """Boxes all elements, and enqueues the pairs of faces whose swept boxes overlap, each once."""
         faces = len(self._mesh.faces)
         if faces == 0:
@@ -383,7 +406,7 @@ class BvhBroadPhase:
             self._bvh.refit()
         else:
             self._bvh.rebuild()
-        inputs = [self._bvh.id, *boxes, self._worlds, self._count, *self.queues]
+        inputs = [self._bvh.id, *boxes, self._worlds, self._mesh.faces, changed, self._count, *self.queues]
         wp.launch(_pair_faces, faces, inputs=inputs, device=self._device)
 
     def _launch_over_pairs(self, kernel, *arguments):

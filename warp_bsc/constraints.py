@@ -2,16 +2,20 @@
 
 import warp as wp
 
-from .kernels.queues import is_filled
+from .kernels.queues import is_filled, take_slot
 from .kernels.signs import FREE
 from .narrow_phase import Count
 
 __all__ = [
     "ACTIVE",
+    "ANOTHER",
+    "BATCH",
     "CERTIFIED",
     "FIRST_HITS",
     "FROZEN_NOW",
     "HITS",
+    "ITERATIONS",
+    "NUMBER",
     "PROJECTED",
     "PROJECTIONS",
     "REMAINING",
@@ -28,10 +32,13 @@ __all__ = [
     "add_contact",
     "change_velocities",
     "collect_contacts",
-    "count_accelerating",
-    "count_displacing",
     "displace",
+    "enlist_accelerating",
+    "enlist_displacing",
+    "feasible",
     "is_projecting",
+    "is_slow",
+    "longest_path",
     "move_vertices",
     "relative",
     "start_impulses",
@@ -52,6 +59,12 @@ ACTIVE, ROUND, CERTIFIED, HITS, FIRST_HITS, REMAINING, FROZEN_NOW, UNDETECTED, S
 certified, contacts counted so far in a detection, those of the first, those of the last, how many vertices this round
 has frozen, and whether a detection was incomplete; and how many places there are."""
 
+ITERATIONS, BATCH = wp.constant(40), wp.constant(8)
+"""Iterations over constraints at most, in each round on positions, and at the end on velocities; and how many there are
+before it is asked whether any constraint still acts."""
+ANOTHER, NUMBER = wp.constant(0), wp.constant(1)
+"""Places in the array that steers the iterations."""
+
 TIMES = wp.constant(wp.float64(2.0**30))
 """Units of time in a step, in which times are integers."""
 
@@ -59,12 +72,22 @@ _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new contacts grows from round to round: what is in a jam moves further."""
 _WIDEST = wp.constant(wp.float64(5.0))
 """How often the separation it grows to at most."""
+_SLOW = wp.constant(wp.float64(0.5))
+"""How far what is slow moves at most, as a share of the shortest side of the elements."""
+_RECOVERY = wp.constant(wp.float64(0.25))
+"""How much of the separation that slow ones lack they are given in a step, as a share of how far they wanted to move:
+what is given more than it falls in a step hops, and slides meanwhile."""
 _RELAXATION = wp.constant(wp.float64(1.5))
-"""How many of the constraints that share a vertex count as one, as they mostly ask for the same."""
+"""How many of the constraints that share a vertex count as one where they only push: mostly they ask for the same."""
+_PUSHING_MOMENTUM = wp.constant(wp.float64(0.5))
+"""How much of its last step a multiplier that only pushes takes again at most."""
+_SLIDING = wp.constant(wp.float64(0.999))
+"""From which share of what friction can hold on something slides."""
+_CREEP = wp.constant(wp.float64(0.1))
+"""How far what friction holds may move, as a share of the tolerance: this adds up over steps."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Sums are of integers in these units of a metre, so that they are the same in any order."""
 _CONTACTS = wp.constant(int(Count.CONTACTS))
-_TINY = wp.constant(wp.float64(1e-300))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -87,6 +110,7 @@ class Vertices:
     displacement: wp.array2d[wp.int64]  # from where it wanted to be, summed over its constraints
     velocity_change: wp.array2d[wp.int64]
     time: wp.array[int]  # of its first contact
+    changed: wp.array[int]  # whether it may have other contacts than those that the last detection found
     done: wp.array[int]  # what has been done to it, in bits
     movable: int  # no contact counts that has vertices from here on only
 
@@ -97,6 +121,7 @@ class Progress:
 
     steer: wp.array[int]
     contact_round: wp.array[int]  # of each world, the round after which it last had a contact
+    iteration: wp.array[int]  # whether there is another batch of iterations, and the number of the iteration
 
 
 @wp.struct
@@ -128,7 +153,12 @@ class Constraints:
     friction: wp.array[float]  # coefficient
     urgency: wp.array[wp.float64]  # share of its violation that a whole step's approach is
     displacing: wp.array[wp.vec3d]  # what it does to displacements, times mass [kg m]
+    slow: wp.array[int]  # 1 where it is of what moves little, see is_slow
     impulse: wp.array[wp.vec3d]  # and to velocities [kg m/s]
+    reached: wp.array[wp.vec3d]  # either of the two after the last iteration, without momentum
+    iteration: wp.array[int]  # in which it acted last
+    acting: wp.array[int]  # list of those that act
+    acting_count: wp.array[wp.int64]
 
 
 @wp.func
@@ -180,6 +210,38 @@ def _weights(contacts: Contacts, i: int) -> wp.vec4d:
 
 
 @wp.func
+def _side(vertices: Vertices, a: int, b: int) -> wp.float64:
+    return wp.length(to_double(vertices.x0[a]) - to_double(vertices.x0[b]))
+
+
+@wp.func
+def longest_path(vertices: Vertices, corners: wp.vec4i) -> wp.float64:
+    """How far the one of the four vertices wanted to move that wanted to move furthest [m]."""
+    path = _ZERO
+    for j in range(4):
+        wanted = to_double(vertices.wanted_x1[corners[j]]) - to_double(vertices.x0[corners[j]])
+        path = wp.max(path, wp.length(wanted))
+    return path
+
+
+@wp.func
+def is_slow(vertices: Vertices, corners: wp.vec4i, edges: int) -> int:
+    """1 where two elements move so little for their size that one direction holds for all of the step, else 0."""
+    size = _side(vertices, corners[2], corners[3])
+    if edges == 1:
+        size = wp.min(size, _side(vertices, corners[0], corners[1]))
+    else:
+        size = wp.min(size, _side(vertices, corners[1], corners[2]))
+    return wp.where(longest_path(vertices, corners) <= _SLOW * size, 1, 0)
+
+
+@wp.func
+def feasible(asked: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
+    """The separation to ask of what is slow: hardly more than at the start, as standing still should nearly do."""
+    return wp.min(asked, wp.max(start, wp.min(separation, start + _RECOVERY * path)))
+
+
+@wp.func
 def widened(separation: wp.float64, progress: Progress) -> wp.float64:
     """The separation that is asked for in a round."""
     return separation * wp.min(wp.pow(_WIDENING, wp.float64(progress.steer[ROUND])), _WIDEST)
@@ -210,6 +272,7 @@ def add_constraint(
     normal: wp.vec3d,
     separation: wp.float64,
     friction: float,
+    slow: int,
 ):
     """Adds a constraint that does nothing yet, if there is room."""
     i = wp.atomic_add(constraints.count, 0, 1)
@@ -219,10 +282,16 @@ def add_constraint(
         constraints.normal[i] = normal
         constraints.separation[i] = separation
         constraints.friction[i] = friction
+        constraints.slow[i] = slow
         path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
-        constraints.urgency[i] = wp.dot(normal, path) / wp.min(_gap(vertices, constraints, i), -_TINY)
+        lack = -_gap(vertices, constraints, i)
+        constraints.urgency[i] = _ONE
+        if lack > _ZERO:
+            constraints.urgency[i] = wp.clamp(-wp.dot(normal, path) / lack, _ZERO, _ONE)
         constraints.displacing[i] = wp.vec3d()
         constraints.impulse[i] = wp.vec3d()
+        constraints.reached[i] = wp.vec3d()
+        constraints.iteration[i] = -2
 
 
 @wp.kernel(**_KERNEL)
@@ -237,17 +306,18 @@ def collect_contacts(
     if wp.min(corners) >= vertices.movable:
         return
     add_contact(progress, vertices.world[corners[0]])
+    for j in range(4):
+        vertices.changed[corners[j]] = 1
     if progress.steer[ROUND] < PROJECTIONS:
         friction = wp.sqrt(vertices.friction[corners[0]] * vertices.friction[corners[3]])
-        add_constraint(
-            vertices,
-            constraints,
-            corners,
-            _weights(contacts, i),
-            contacts.normal[i],
-            widened(separation, progress),
-            friction,
-        )
+        weights = _weights(contacts, i)
+        normal = contacts.normal[i]
+        asked = widened(separation, progress)
+        slow = is_slow(vertices, corners, contacts.edges)
+        if slow == 1:
+            start = wp.dot(normal, relative(weights, corners, vertices.x0))
+            asked = feasible(asked, start, separation, longest_path(vertices, corners))
+        add_constraint(vertices, constraints, corners, weights, normal, asked, friction, slow)
     else:
         time = int(wp.floor(TIMES * contacts.toi[i]))
         for j in range(4):
@@ -271,11 +341,11 @@ def _is_pushing(multiplier: wp.vec3d, normal: wp.vec3d) -> bool:
 
 
 @wp.func
-def _mobility(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
+def _mobility(vertices: Vertices, constraints: Constraints, i: int, relaxation: wp.float64) -> wp.float64:
     mobility = _ZERO
     for j in range(4):
         vertex = constraints.vertices[i][j]
-        parts = wp.max(wp.float64(vertices.active[vertex]) / _RELAXATION, _ONE)
+        parts = wp.max(wp.float64(vertices.active[vertex]) / relaxation, _ONE)
         share = wp.float64(vertices.inverse_mass[vertex]) * parts
         mobility += constraints.weights[i][j] * constraints.weights[i][j] * share
     return mobility
@@ -319,44 +389,114 @@ def _spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, s
             _add(sums, vertex, share * x)
 
 
+@wp.func
+def _takes_back(constraints: Constraints, progress: Progress, i: int) -> bool:
+    """Whether a constraint takes back what it has done too much, which leaves things nearest to what was wanted.
+
+    What is fast only pushes after the first round, which makes room where contacts come back.
+    """
+    return progress.steer[ROUND] == 1 or constraints.slow[i] == 1
+
+
+@wp.func
+def _is_held(
+    multiplier: wp.vec3d, normal: wp.vec3d, motion: wp.vec3d, friction: wp.float64, tolerance: wp.float64
+) -> bool:
+    """Whether friction does what it can: there is no motion across the normal, or it slides."""
+    along = wp.dot(multiplier, normal)
+    if wp.length(multiplier - along * normal) >= _SLIDING * friction * along:
+        return True
+    return wp.length(motion - wp.dot(motion, normal) * normal) <= _CREEP * tolerance
+
+
+@wp.func
+def _enlist(vertices: Vertices, constraints: Constraints, i: int):
+    """Puts a constraint on the list of those that act in this iteration, and counts it for its vertices."""
+    constraints.acting[int(take_slot(constraints.acting_count, 0))] = i
+    for j in range(4):
+        wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+
+
+@wp.func
+def _momentum(constraints: Constraints, progress: Progress, i: int) -> wp.float64:
+    """How much of its last step a multiplier takes again: ever more (Nesterov), but nothing at the end."""
+    iteration = progress.iteration[NUMBER]
+    last = constraints.iteration[i]
+    constraints.iteration[i] = iteration
+    if last != iteration - 1 or iteration == ITERATIONS - 1:
+        return _ZERO
+    return wp.float64(iteration) / wp.float64(iteration + 3)
+
+
+@wp.func
+def _finish_iteration(constraints: Constraints, progress: Progress):
+    """Decides whether there is another batch."""
+    iteration = progress.iteration[NUMBER] + 1
+    acting = constraints.acting_count[0] > wp.int64(0)
+    progress.iteration[NUMBER] = iteration
+    progress.iteration[ANOTHER] = wp.where(acting and iteration < ITERATIONS, 1, 0)
+    constraints.acting_count[0] = wp.int64(0)
+
+
+@wp.func
+def _path(vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+    weights = constraints.weights[i]
+    corners = constraints.vertices[i]
+    return relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
+
+
 @wp.kernel(**_KERNEL)
-def count_displacing(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """Counts the constraints of each vertex that are active for positions: those that are violated."""
+def enlist_displacing(vertices: Vertices, constraints: Constraints, progress: Progress, tolerance: wp.float64):
+    """Lists the constraints that act on positions: those violated, and those that may take something back.
+
+    What is settled but for the tolerance costs nothing, and moves nothing.
+    """
     i = wp.tid()
-    if i < constraints.count[0] and is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
-        if _gap(vertices, constraints, i) < _ZERO:
-            for j in range(4):
-                wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+    if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
+        return
+    gap = _gap(vertices, constraints, i)
+    acts = gap < -tolerance
+    if not acts and _takes_back(constraints, progress, i):
+        done = constraints.displacing[i]
+        if wp.length_sq(done) > _ZERO:
+            friction = wp.float64(constraints.friction[i])
+            path = _path(vertices, constraints, i)
+            acts = gap > tolerance or not _is_held(done, constraints.normal[i], path, friction, tolerance)
+    if acts:
+        _enlist(vertices, constraints, i)
 
 
 @wp.kernel(**_KERNEL)
 def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
     """An iteration over constraints on positions.
 
-    All take a step at once: the mass of a vertex is split among those that are active (Tonge et al. 2012), which
-    converges, and conserves momentum, because what a contact does to its two sides is opposite and equal.
+    All take a step at once: the mass of a vertex is split among those that act (Tonge et al. 2012), which converges,
+    and conserves momentum, because what a contact does to its two sides is opposite and equal. Momentum of the
+    multipliers (Nesterov; Mazhar et al. 2015) takes it through a stack in few iterations.
     """
-    i = wp.tid()
-    if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
+    place = wp.tid()
+    if wp.int64(place) >= constraints.acting_count[0]:
         return
-    gap = _gap(vertices, constraints, i)
-    if gap >= _ZERO:
-        return
-    mobility = _mobility(vertices, constraints, i)
+    i = constraints.acting[place]
+    relaxation = _ONE
+    momentum = _momentum(constraints, progress, i)
+    if not _takes_back(constraints, progress, i):
+        relaxation = _RELAXATION
+        momentum = wp.min(momentum, _PUSHING_MOMENTUM)
+    mobility = _mobility(vertices, constraints, i, relaxation)
     if mobility <= _ZERO:
         return
-    weights = constraints.weights[i]
-    corners = constraints.vertices[i]
-    path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
     old = constraints.displacing[i]
-    new = updated(
+    reached = updated(
         old,
         constraints.normal[i],
-        gap,
-        path,
+        _gap(vertices, constraints, i),
+        _path(vertices, constraints, i),
         mobility,
         wp.float64(constraints.friction[i]),
     )
+    new = reached + momentum * (reached - constraints.reached[i])
+    constraints.reached[i] = reached
     constraints.displacing[i] = new
     _spread(vertices, constraints, i, new - old, vertices.displacement)
 
@@ -370,14 +510,17 @@ def _moved(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
 
 
 @wp.kernel(**_KERNEL)
-def move_vertices(vertices: Vertices):
-    """Does to each vertex what its constraints ask for."""
+def move_vertices(vertices: Vertices, constraints: Constraints, progress: Progress):
+    """Does to each vertex what its constraints ask for, which ends the iteration."""
     vertex = wp.tid()
+    if vertex == 0:
+        _finish_iteration(constraints, progress)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0
     if vertices.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = _moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+        vertices.changed[vertex] = 1
         vertices.done[vertex] = vertices.done[vertex] | PROJECTED
 
 
@@ -388,44 +531,60 @@ def start_impulses(vertices: Vertices, constraints: Constraints, dt: wp.float64)
     Then angular momentum is that of the contacts as well, whose two sides meet in a point (only) at that time.
     """
     i = wp.tid()
-    if i < constraints.count[0] and _is_pushing(constraints.displacing[i], constraints.normal[i]):
-        constraints.impulse[i] = constraints.displacing[i] * (wp.max(constraints.urgency[i], _ZERO) / dt)
+    if i >= constraints.count[0]:
+        return
+    if _is_pushing(constraints.displacing[i], constraints.normal[i]):
+        constraints.impulse[i] = constraints.displacing[i] * (constraints.urgency[i] / dt)
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         _spread(vertices, constraints, i, constraints.impulse[i], vertices.velocity_change)
-
-
-@wp.func
-def _accelerates(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> bool:
-    """Whether a constraint has an impulse, or should: where it has displaced something that still is at it."""
-    if _is_pushing(constraints.impulse[i], constraints.normal[i]):
-        return True
-    if not _is_pushing(constraints.displacing[i], constraints.normal[i]):
-        return False
-    at_it = _gap(vertices, constraints, i) <= constraints.separation[i]
-    return at_it and _parting(vertices, constraints, i, restitution) < _ZERO
+    constraints.reached[i] = constraints.impulse[i]
+    constraints.iteration[i] = -2
 
 
 @wp.kernel(**_KERNEL)
-def count_accelerating(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
-    """Counts the constraints of each vertex that are active for velocities."""
+def enlist_accelerating(
+    vertices: Vertices,
+    constraints: Constraints,
+    restitution: wp.float64,
+    tolerance: wp.float64,
+    dt: wp.float64,
+):
+    """Lists the constraints that act on velocities: of those that have displaced something that still is at it."""
     i = wp.tid()
-    if i < constraints.count[0] and _accelerates(vertices, constraints, i, restitution):
-        for j in range(4):
-            wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
-
-
-@wp.kernel(**_KERNEL)
-def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.float64):
-    """An iteration over constraints on velocities."""
-    i = wp.tid()
-    if i >= constraints.count[0] or not _accelerates(vertices, constraints, i, restitution):
+    if i >= constraints.count[0]:
         return
-    mobility = _mobility(vertices, constraints, i)
+    impulse = constraints.impulse[i]
+    if wp.length_sq(impulse) == _ZERO:
+        if not _is_pushing(constraints.displacing[i], constraints.normal[i]):
+            return
+        if _gap(vertices, constraints, i) > constraints.separation[i]:
+            return
+    tolerance /= dt
+    normal = constraints.normal[i]
+    excess = _parting(vertices, constraints, i, restitution)
+    acts = excess < -tolerance
+    if not acts and wp.length_sq(impulse) > _ZERO:
+        velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
+        friction = wp.float64(constraints.friction[i])
+        acts = excess > tolerance or not _is_held(impulse, normal, velocity, friction, tolerance)
+    if acts:
+        _enlist(vertices, constraints, i)
+
+
+@wp.kernel(**_KERNEL)
+def accelerate(vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64):
+    """An iteration over constraints on velocities, see :func:`displace`."""
+    place = wp.tid()
+    if wp.int64(place) >= constraints.acting_count[0]:
+        return
+    i = constraints.acting[place]
+    momentum = _momentum(constraints, progress, i)
+    mobility = _mobility(vertices, constraints, i, _ONE)
     if mobility <= _ZERO:
         return
     old = constraints.impulse[i]
-    new = updated(
+    reached = updated(
         old,
         constraints.normal[i],
         _parting(vertices, constraints, i, restitution),
@@ -433,14 +592,18 @@ def accelerate(vertices: Vertices, constraints: Constraints, restitution: wp.flo
         mobility,
         wp.float64(constraints.friction[i]),
     )
+    new = reached + momentum * (reached - constraints.reached[i])
+    constraints.reached[i] = reached
     constraints.impulse[i] = new
     _spread(vertices, constraints, i, new - old, vertices.velocity_change)
 
 
 @wp.kernel(**_KERNEL)
-def change_velocities(vertices: Vertices):
-    """Gives each vertex that has not been truncated the velocity that its constraints ask for."""
+def change_velocities(vertices: Vertices, constraints: Constraints, progress: Progress):
+    """Gives each vertex that was not truncated the velocity that its constraints ask for, which ends the iteration."""
     vertex = wp.tid()
+    if vertex == 0:
+        _finish_iteration(constraints, progress)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0

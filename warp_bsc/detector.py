@@ -356,7 +356,7 @@ class CollisionDetector:
         edge_edge.sort()
         wp.wait_stream(self._side_stream)
 
-    def find_contacts(self, x0, x1, *, refit=False):
+    def find_contacts(self, x0, x1, *, refit=False, changed=None):
         """Launches a detection without sorting, on one stream, for those who respond to it on the device.
 
         Args:
@@ -364,6 +364,8 @@ class CollisionDetector:
             x1: Positions at the end, of the same type.
             refit: Whether the hierarchy of the detection before will do, because little has moved since. Then this can
                 be captured in the body of a conditional node.
+            changed: Nonzero for each vertex whose motion has changed since the detection before, or that was in a
+                contact then: the other pairs have no contact again, and are not asked. Warp array of int; None for all.
 
         Returns:
             The narrow phases of vertex-face and edge-edge pairs, whose ``unsorted`` are the contacts.
@@ -374,10 +376,29 @@ class CollisionDetector:
         counts.zero_()
         self._count_not_finite(x0, x1)
         queues = vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near
-        self._broad_phase.pair_elements(x0, x1, *queues, refit=refit)
+        self._broad_phase.pair_elements(x0, x1, *queues, refit=refit, changed=changed)
         for narrow_phase, elements in ((vertex_face, self.mesh.device_faces), (edge_edge, self.mesh.device_edges)):
             narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance)
-        return vertex_face, edge_edge
+        return self.narrow_phases
+
+    @property
+    def narrow_phases(self):
+        """The narrow phases of vertex-face and of edge-edge pairs."""
+        return self._vertex_face, self._edge_edge
+
+    def find_candidates(self):
+        """Finds all pairs again whose swept boxes overlapped in the last detection, and does nothing more with them.
+
+        Returns:
+            The narrow phases of vertex-face and edge-edge pairs, whose ``near`` are the pairs.
+        """
+        counts, vertex_face, edge_edge = self.counts, self._vertex_face, self._edge_edge
+        self._run += 1
+        counts[_VERTEX_FACE:].zero_()
+        self._broad_phase.pair_overlapping_elements(
+            vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near
+        )
+        return self.narrow_phases
 
     def grow(self):
         """Makes queues larger that were too small; returns whether any was. Asks the device."""

@@ -102,6 +102,7 @@ def collect_penetrations(
             wp.atomic_add(progress.steer, FIRST_HITS, 1)
         elif before >= -error_before:
             add_contact(progress, world)
+            vertices.changed[vertex] = 1
         if progress.steer[ROUND] < PROJECTIONS:
             plane = half_spaces.end[i]
             add_constraint(
@@ -112,6 +113,7 @@ def collect_penetrations(
                 wp.vec3d(plane[0], plane[1], plane[2]),
                 plane[3] + widened(separation, progress),
                 wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
+                1,
             )
         else:
             part = wp.max(before, _ZERO) / wp.max(before - after, _TINY)

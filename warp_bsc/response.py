@@ -6,6 +6,8 @@ import warp as wp
 from .angular_momentum import SUMS, sum_bodies, sum_torques, turn_vertices
 from .constraints import (
     ACTIVE,
+    ANOTHER,
+    BATCH,
     CERTIFIED,
     FIRST_HITS,
     FROZEN_NOW,
@@ -23,9 +25,9 @@ from .constraints import (
     accelerate,
     change_velocities,
     collect_contacts,
-    count_accelerating,
-    count_displacing,
     displace,
+    enlist_accelerating,
+    enlist_displacing,
     move_vertices,
     start_impulses,
     to_double,
@@ -33,16 +35,17 @@ from .constraints import (
 )
 from .detector import CollisionDetector
 from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces
-from .narrow_phase import Count
+from .narrow_phase import Count, roomy
+from .near_pairs import NearPairs, collect_near_pairs, forget_near_pairs
 
 __all__ = ["FROZEN", "TRUNCATED", "Response"]
 
 _TRUNCATIONS = wp.constant(8)
 """Rounds of truncation, after which what still collides stands still."""
 
-_ITERATIONS = 48
-"""Iterations over all constraints, in each round on positions, and at the end on velocities."""
-_ROUNDS_OF_ROOM = 4
+_TOLERANCE = 0.1
+"""How precisely constraints are solved, as a share of the separation."""
+_ROUNDS_OF_ROOM = 2
 """For the contacts of how many rounds there is room."""
 _SHARE = wp.constant(wp.float64(0.9))
 """Which part of the way to its first contact a truncated vertex goes."""
@@ -95,10 +98,12 @@ def _truncate_vertices(vertices: Vertices, progress: Progress, dt: wp.float64):
         x0 = to_double(vertices.x0[vertex])
         path = _SHARE * time * (to_double(vertices.x1[vertex]) - x0)
         vertices.x1[vertex] = to_single(x0 + path)
+        vertices.changed[vertex] = 1
         vertices.velocity[vertex] = to_single(path / dt)
         vertices.done[vertex] = vertices.done[vertex] | TRUNCATED
     elif vertices.done[vertex] & FROZEN == 0:
         vertices.x1[vertex] = vertices.x0[vertex]
+        vertices.changed[vertex] = 1
         vertices.velocity[vertex] = wp.vec3()
         vertices.done[vertex] = vertices.done[vertex] | FROZEN
         wp.atomic_add(progress.steer, FROZEN_NOW, 1)
@@ -146,7 +151,8 @@ class Response:
         for name in ("x0", "x1", "velocity", "wanted_x1", "wanted_velocity"):
             setattr(vertices, name, wp.zeros(n, dtype=wp.vec3, device=device))
         vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
-        vertices.active, vertices.done = (wp.zeros(n, dtype=int, device=device) for _ in range(2))
+        for name in ("active", "done", "changed"):
+            setattr(vertices, name, wp.zeros(n, dtype=int, device=device))
         for name in ("displacement", "velocity_change"):
             setattr(vertices, name, wp.zeros((n, 3), dtype=wp.int64, device=device))
         vertices.time = wp.full(n, int(_NEVER), dtype=int, device=device)
@@ -154,6 +160,8 @@ class Response:
         self._progress = progress = Progress()
         progress.steer = self.steer = wp.zeros(int(STEER), dtype=int, device=device)
         self._another_round = self.steer[int(ACTIVE) : int(ACTIVE) + 1]
+        progress.iteration = wp.zeros(2, dtype=int, device=device)
+        self._another_batch = progress.iteration[int(ANOTHER) : int(ANOTHER) + 1]
         progress.contact_round = wp.zeros(max(1, mesh.model.world_count), dtype=int, device=device)
         self._turn = wp.zeros((max(1, mesh.model.world_count), SUMS), dtype=wp.int64, device=device)
         self._half_spaces = half_spaces = HalfSpaces()
@@ -163,6 +171,7 @@ class Response:
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self._most_penetrations = vertices.movable * int(planes_of_a_world)
+        self._kept = wp.zeros(1, dtype=int, device=device)
         self._constraints = self._with_room(0)
         self._retired = []
 
@@ -200,14 +209,16 @@ class Response:
         self.steer.zero_()
         self._progress.contact_round.fill_(-1)
         self._constraints.count.zero_()
-        for sums in (vertices.displacement, vertices.velocity_change, vertices.done):
+        for sums in (vertices.displacement, vertices.velocity_change, vertices.done, vertices.changed):
             sums.zero_()
         vertices.time.fill_(int(_NEVER))
         if self._most_penetrations:  # what only lies on a plane needs no second detection
-            self._reserve(self._most_penetrations)
+            self._reserve(self._most_contacts)
             self._collect_penetrations(ahead=True)
-            self._displace(1)
+            self._start_iterations()
+            self._displace()
         self._detect(refit=False)
+        wp.capture_if(self._another_round, self._collect_near_pairs)
         wp.capture_while(self._another_round, self._round, dt=dt)
         wp.capture_if(self._constraints.count, self._change_velocities, dt=dt)
         wp.launch(_stand_still, vertices.movable, inputs=[vertices, self._progress], device=self._device)
@@ -216,36 +227,77 @@ class Response:
         inputs = [self.vertices, self._half_spaces, self._constraints, self._progress, self._separation, ahead]
         wp.launch(collect_penetrations, self.vertices.movable, inputs=inputs, device=self._device)
 
-    def _displace(self, iterations):
-        """Moves vertices to where the constraints let them be."""
-        vertices = self.vertices
-        inputs = [vertices, self._constraints, self._progress]
-        for _ in range(iterations):
-            self._launch_over_constraints(count_displacing, inputs)
-            self._launch_over_constraints(displace, inputs)
-            wp.launch(move_vertices, vertices.movable, inputs=[vertices], device=self._device)
+    def _collect_near_pairs(self):
+        """Makes constraints of what is near, where something has been hit."""
+        detector, vertices = self.detector, self.vertices
+        while True:
+            narrow_phases = detector.find_candidates()
+            if self._device.is_capturing or not detector.grow():
+                break
+        wp.copy(self._kept, self._constraints.count)
+        while True:
+            for narrow_phase, elements in self._with_elements(narrow_phases):
+                near = NearPairs()
+                near.edges = int(narrow_phase.kind == "edge_edge")
+                near.elements, near.pairs, near.counts = elements, narrow_phase.near, narrow_phase.counts
+                inputs = [vertices, near, self._constraints, self._progress, self._separation]
+                self._launch_over(collect_near_pairs, near.pairs, near.counts, Count.NEAR, inputs)
+            if self._device.is_capturing or not self._reserve_near():
+                break
+        inputs = [self._constraints, self._kept, self._most_contacts, detector.counts, detector.capacities]
+        wp.launch(forget_near_pairs, 1, inputs=inputs, device=self._device)
+
+    def _displace(self):
+        """An iteration over constraints on positions."""
+        vertices, constraints, progress = self.vertices, self._constraints, self._progress
+        inputs = [vertices, constraints, progress]
+        self._launch_over_constraints(enlist_displacing, [*inputs, _TOLERANCE * self._separation])
+        self._launch_over(displace, constraints.acting, constraints.acting_count, 0, inputs)
+        wp.launch(move_vertices, vertices.movable, inputs=inputs, device=self._device)
+
+    def _accelerate(self, dt):
+        """An iteration over constraints on velocities."""
+        constraints, progress = self._constraints, self._progress
+        inputs = [self.vertices, constraints]
+        tolerance = _TOLERANCE * self._separation
+        self._launch_over_constraints(enlist_accelerating, [*inputs, self._restitution, tolerance, dt])
+        inputs = [*inputs, progress, self._restitution]
+        self._launch_over(accelerate, constraints.acting, constraints.acting_count, 0, inputs)
+        self._change()
+
+    def _change(self):
+        inputs = [self.vertices, self._constraints, self._progress]
+        wp.launch(change_velocities, self.vertices.movable, inputs=inputs, device=self._device)
+
+    def _iterate(self, iteration, **options):
+        """Iterates until no constraint acts any more, or long enough."""
+
+        def batch():
+            for _ in range(BATCH):
+                iteration(**options)
+
+        self._start_iterations()
+        wp.capture_while(self._another_batch, batch)
+
+    def _start_iterations(self):
+        self._progress.iteration.zero_()
+        self._another_batch.fill_(1)
 
     def _change_velocities(self, dt):
         """Makes velocities of what the constraints that have displaced something let them be."""
         vertices = self.vertices
         inputs = [vertices, self._constraints]
         self._launch_over_constraints(start_impulses, [*inputs, dt])
-        self._change(vertices)
-        for _ in range(_ITERATIONS):
-            self._launch_over_constraints(count_accelerating, [*inputs, self._restitution])
-            self._launch_over_constraints(accelerate, [*inputs, self._restitution])
-            self._change(vertices)
+        self._change()
+        self._iterate(self._accelerate, dt=dt)
         self._turn.zero_()
         self._launch_over_constraints(sum_torques, [*inputs, self._turn])
         for kernel in (sum_bodies, turn_vertices):
             wp.launch(kernel, vertices.movable, inputs=[vertices, self._turn], device=self._device)
 
-    def _change(self, vertices):
-        wp.launch(change_velocities, vertices.movable, inputs=[vertices], device=self._device)
-
     def _round(self, dt):
         """One round: what the contacts ask for, and whether there still are some."""
-        self._displace(_ITERATIONS)
+        self._iterate(self._displace)
         inputs = [self.vertices, self._progress, dt]
         wp.launch(_truncate_vertices, self.vertices.movable, inputs=inputs, device=self._device)
         self._detect(refit=True)
@@ -254,27 +306,35 @@ class Response:
         """Detects the motion as it is now, and decides what that means."""
         detector, vertices, progress = self.detector, self.vertices, self._progress
         while True:
-            narrow_phases = detector.find_contacts(vertices.x0, vertices.x1, refit=refit)
+            changed = vertices.changed if refit else None
+            narrow_phases = detector.find_contacts(vertices.x0, vertices.x1, refit=refit, changed=changed)
             if self._device.is_capturing or not detector.grow():
                 break
-        self._reserve(self._most_penetrations + sum(len(narrow_phase.unsorted.pairs) for narrow_phase in narrow_phases))
-        for narrow_phase, elements in zip(
-            narrow_phases, (detector.mesh.device_faces, detector.mesh.device_edges), strict=True
-        ):
+        vertices.changed.zero_()
+        self._reserve(self._most_contacts)
+        wp.launch(_forget_if_full, 1, inputs=[self._constraints, self._most_contacts], device=self._device)
+        for narrow_phase, elements in self._with_elements(narrow_phases):
             found = narrow_phase.unsorted
             contacts = Contacts()
             contacts.edges = int(narrow_phase.kind == "edge_edge")
             contacts.elements, contacts.counts = elements, narrow_phase.counts
             contacts.pairs, contacts.status, contacts.toi = found.pairs, found.status, found.toi
             contacts.coordinates, contacts.normal = found.coordinates, found.normal
-            entries = len(found.pairs)
-            if self._device.is_cpu:
-                entries = min(entries, int(contacts.counts.numpy()[Count.CONTACTS]))
             inputs = [vertices, contacts, self._constraints, progress, self._separation]
-            wp.launch(collect_contacts, entries, inputs=inputs, device=self._device)
+            self._launch_over(collect_contacts, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
         wp.launch(_decide, 1, inputs=[progress, detector.counts, detector.capacities], device=self._device)
+
+    def _with_elements(self, narrow_phases):
+        """Each narrow phase with the vertices of its second elements."""
+        mesh = self.detector.mesh
+        return zip(narrow_phases, (mesh.device_faces, mesh.device_edges), strict=True)
+
+    @property
+    def _most_contacts(self):
+        """How many contacts a detection may find as its queues are."""
+        return self._most_penetrations + sum(len(n.unsorted.pairs) for n in self.detector.narrow_phases)
 
     def _with_room(self, room):
         """Constraints, none yet."""
@@ -287,25 +347,43 @@ class Response:
             wp.empty(room, dtype=wp.float64, device=self._device) for _ in range(2)
         )
         constraints.friction = wp.empty(room, dtype=float, device=self._device)
-        constraints.displacing, constraints.impulse = (
-            wp.empty(room, dtype=wp.vec3d, device=self._device) for _ in range(2)
+        constraints.acting_count = wp.zeros(1, dtype=wp.int64, device=self._device)
+        constraints.slow, constraints.iteration, constraints.acting = (
+            wp.empty(room, dtype=int, device=self._device) for _ in range(3)
+        )
+        constraints.displacing, constraints.impulse, constraints.reached = (
+            wp.empty(room, dtype=wp.vec3d, device=self._device) for _ in range(3)
         )
         return constraints
 
-    def _reserve(self, needed):
-        """Makes room for so many more constraints; a CUDA graph forgets those that there are if need be."""
+    def _reserve(self, needed, *, rounds=_ROUNDS_OF_ROOM):
+        """Makes room for so many more constraints, and as many in some rounds; a CUDA graph has what room it has."""
         old = self._constraints
-        if not self._device.is_capturing:
-            filled = int(old.count.numpy()[0])
-            if len(old.vertices) < filled + needed:
-                self._constraints = new = self._with_room(2 * filled + _ROUNDS_OF_ROOM * needed)
-                for name in Constraints.vars:
-                    wp.copy(getattr(new, name), getattr(old, name), count=len(getattr(old, name)))
-                self._retired.append(old)  # a CUDA graph may still write to it
-        wp.launch(_forget_if_full, 1, inputs=[self._constraints, needed], device=self._device)
+        if self._device.is_capturing:
+            return
+        filled = int(old.count.numpy()[0])
+        if len(old.vertices) < filled + needed:
+            self._constraints = new = self._with_room(filled + rounds * needed)
+            for name in Constraints.vars if filled else ():
+                array = getattr(old, name)
+                wp.copy(getattr(new, name), array, count=min(filled, len(array)))
+            self._retired.append(old)  # a CUDA graph may still write to it
+
+    def _reserve_near(self):
+        """Makes room for the near pairs, without them, if there was too little, and says so. Asks the device."""
+        kept, found = (int(count.numpy()[0]) for count in (self._kept, self._constraints.count))
+        if found + self._most_contacts <= len(self._constraints.vertices):
+            return False
+        wp.copy(self._constraints.count, self._kept)
+        self._reserve(self._most_contacts + roomy(found - kept))
+        return True
+
+    def _launch_over(self, kernel, queue, counts, count, inputs):
+        """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU."""
+        entries = len(queue)
+        if self._device.is_cpu:
+            entries = min(entries, int(counts.numpy()[count]))
+        wp.launch(kernel, entries, inputs=inputs, device=self._device)
 
     def _launch_over_constraints(self, kernel, inputs):
-        entries = len(self._constraints.vertices)
-        if self._device.is_cpu:
-            entries = min(entries, int(self._constraints.count.numpy()[0]))
-        wp.launch(kernel, entries, inputs=inputs, device=self._device)
+        self._launch_over(kernel, self._constraints.vertices, self._constraints.count, 0, inputs)

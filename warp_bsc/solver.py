@@ -12,7 +12,7 @@ from .response import FROZEN, TRUNCATED, Response
 
 __all__ = ["SolverCCD", "SolverReport"]
 
-_SEPARATION = 1e-3
+_SEPARATION = 5e-3
 """Default distance that contacts are moved apart, as a share of the median length of an edge."""
 
 _STEPS, _UNCERTIFIED_STEPS, _TRUNCATED_STEPS, _FROZEN_STEPS, _TOTALS = (wp.constant(i) for i in range(5))
@@ -184,7 +184,7 @@ class SolverCCD(SolverBase):
 
         Args:
             solver: Any Newton solver that moves particles.
-            separation: How far contacts are moved apart [m]; default: a thousandth of the median length of an edge.
+            separation: How far contacts are moved apart [m]; default: 0.005 of the median length of an edge.
             friction: Coefficient of particles; default: the model's ``particle_mu``. That of shapes is their
                 material's, that of a contact the geometric mean.
             restitution: Which part of the approaching velocity comes back, in [0, 1]; default: the model's
