@@ -123,9 +123,9 @@ class Response:
     """Moves the vertices of a motion until it is certified to be free of collisions, on the device.
 
     Rounds of projection come first: each contact is moved apart at the end of the step, and the new motion is detected
-    again. What still collides after many has its path truncated before its first contact, a few times, and then stands
-    still, which ends, because what stood apart and stands still does not collide. Where a detection is incomplete,
-    everything stands still, and the motion is not certified.
+    again, as far as it has changed. What still collides after many has its path truncated before its first contact, a
+    few times, and then stands still, which ends, because what stood apart and stands still does not collide. Where a
+    detection is incomplete, everything stands still, and the motion is not certified.
 
     Attributes:
         detector: What it detects with.
@@ -356,14 +356,14 @@ class Response:
         )
         return constraints
 
-    def _reserve(self, needed, *, rounds=_ROUNDS_OF_ROOM):
+    def _reserve(self, needed):
         """Makes room for so many more constraints, and as many in some rounds; a CUDA graph has what room it has."""
         old = self._constraints
         if self._device.is_capturing:
             return
         filled = int(old.count.numpy()[0])
         if len(old.vertices) < filled + needed:
-            self._constraints = new = self._with_room(filled + rounds * needed)
+            self._constraints = new = self._with_room(filled + _ROUNDS_OF_ROOM * needed)
             for name in Constraints.vars if filled else ():
                 array = getattr(old, name)
                 wp.copy(getattr(new, name), array, count=min(filled, len(array)))
