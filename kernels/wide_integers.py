@@ -18,24 +18,16 @@ def integer(limbs):
     return wp.types.vector(length=limbs, dtype=wp.uint64)
 
 
-# r = a b - c d, each factor taken as unsigned, then corrected for the sign bits: a number below zero stands for itself
-# plus 2^(64 limbs), which has added the other factor that much higher.
-_MINOR = """
-    constexpr int A = sizeof(a) / 8, B = sizeof(b) / 8;
-    ret_type r;
-    constexpr int R = sizeof(r) / 8;
-    wp::uint64 product[2][R];
-    for (int term = 0; term < 2; ++term) {
-        const auto& x = term == 0 ? a : c;
-        const auto& y = term == 0 ? b : d;
-        wp::uint64* p = product[term];
+# p = x y for signed x, y: each taken as unsigned, then corrected, because a number below zero stands for itself plus
+# 2^(64 limbs), which has added the other factor that much higher
+_MULTIPLY = """
+    const auto multiply = [](const auto& x, const auto& y, wp::uint64* p) {
+        constexpr int A = sizeof(x) / 8, B = sizeof(y) / 8, R = sizeof(ret_type) / 8;
         for (int i = 0; i < R; ++i)
             p[i] = 0;
         for (int i = 0; i < A; ++i) {
             wp::uint64 carry = 0;
-            for (int j = 0; j < B; ++j) {
-                if (i + j >= R)
-                    break;
+            for (int j = 0; j < B && i + j < R; ++j) {
 #if defined(__CUDA_ARCH__)
                 wp::uint64 low = x[i] * y[j];
                 wp::uint64 high = __umul64hi(x[i], y[j]);
@@ -57,24 +49,38 @@ _MINOR = """
         const wp::uint64 x_mask = 0 - (x[A - 1] >> 63), y_mask = 0 - (y[B - 1] >> 63);
         wp::uint64 x_borrow = 0, y_borrow = 0;
         for (int i = A; i < R && i < A + B; ++i) {
-            const wp::uint64 s = y[i - A] & x_mask;
-            const wp::uint64 difference = p[i] - s - x_borrow;
-            x_borrow = (p[i] < s) | ((p[i] == s) & x_borrow);
-            p[i] = difference;
+            const wp::uint64 s = y[i - A] & x_mask, old = p[i];
+            p[i] = old - s - x_borrow;
+            x_borrow = (old < s) | ((old == s) & x_borrow);
         }
         for (int i = B; i < R && i < A + B; ++i) {
-            const wp::uint64 s = x[i - B] & y_mask;
-            const wp::uint64 difference = p[i] - s - y_borrow;
-            y_borrow = (p[i] < s) | ((p[i] == s) & y_borrow);
-            p[i] = difference;
+            const wp::uint64 s = x[i - B] & y_mask, old = p[i];
+            p[i] = old - s - y_borrow;
+            y_borrow = (old < s) | ((old == s) & y_borrow);
         }
-    }
+    };
+"""
+
+_PRODUCT = f"""{_MULTIPLY}
+    wp::uint64 p[sizeof(ret_type) / 8];
+    multiply(a, b, p);
+    ret_type r;
+    for (int i = 0; i < (int)(sizeof(r) / 8); ++i)
+        r[i] = p[i];
+    return r;
+"""
+
+_MINOR = f"""{_MULTIPLY}
+    constexpr int R = sizeof(ret_type) / 8;
+    wp::uint64 p[R], q[R];
+    multiply(a, b, p);
+    multiply(c, d, q);
+    ret_type r;
     wp::uint64 borrow = 0;
-    for (int i = 0; i < R; ++i) {
-        const wp::uint64 x = product[0][i], y = product[1][i];
-        r[i] = x - y - borrow;
-        borrow = (x < y) | ((x == y) & borrow);
-    }
+    for (int i = 0; i < R; ++i) {{
+        r[i] = p[i] - q[i] - borrow;
+        borrow = (p[i] < q[i]) | ((p[i] == q[i]) & borrow);
+    }}
     return r;
 """
 
@@ -209,6 +215,11 @@ for _limbs in LIMBS:
         """The product of an integer and a factor that is not negative."""
         ...
 
+    @wp.func_native(snippet=_returning(_FROM_DOUBLE, _limbs))
+    def from_double(x: wp.float64, exponent: int, like: _Single) -> _Single:
+        """The integer x / 2^exponent, as wide as another one."""
+        ...
+
     @wp.func_native(snippet=_returning(_SHIFT, _limbs))
     def shift(a: _Single, bits: int) -> _Single:
         """The integer times 2^bits."""
@@ -221,13 +232,23 @@ for _limbs in LIMBS:
             """The same integer, twice as wide."""
             ...
 
+        @wp.func_native(snippet=_returning(_PRODUCT, 2 * _limbs))
+        def product(a: _Single, b: _Single) -> _Double:
+            """The product a b, twice as wide as its factors."""
+            ...
+
+        @wp.func_native(snippet=_returning(_PRODUCT, 2 * _limbs))
+        def product(a: _Double, b: _Single) -> _Double:  # noqa: F811 (an overload)
+            """The product a b, as wide as its wider factor."""
+            ...
+
         @wp.func_native(snippet=_returning(_MINOR, 2 * _limbs))
         def minor(a: _Single, b: _Single, c: _Single, d: _Single) -> _Double:
             """The determinant a b - c d, twice as wide as its factors."""
             ...
 
         @wp.func_native(snippet=_returning(_MINOR, 2 * _limbs))
-        def minor(a: _Double, b: _Single, c: _Double, d: _Single) -> _Double:
+        def minor(a: _Double, b: _Single, c: _Double, d: _Single) -> _Double:  # noqa: F811 (an overload)
             """The determinant a b - c d, as wide as its wider factors."""
             ...
 

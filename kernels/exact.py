@@ -1,0 +1,529 @@
+"""Exact decision of a query in wide integers: first contact, with every degenerate case (paper, BSC-exact).
+
+One question
+------------
+The differences of points of the two features fill a triangle with the corners p - a, p - b, p - c (vertex-face), or a
+parallelogram with the corners c - a, c - b, d - b, d - a in this order (edge-edge). The features meet when this polygon
+contains the origin. Its corners move linearly. Let
+
+    V = P . (Q x R)  for its first, second and last corner: a cubic, zero when polygon and origin are in one plane;
+    C_e = A x B  for each of its edges, from corner A to the next one B: three quadratics, by axis.
+
+Those are, up to sign, the coplanarity Y and the inside tests of :mod:`polynomials`: the areas of the triangles that the
+origin forms with the edges. At a time at which V = 0:
+
+- for any axis, if components of two C_e have strictly opposite signs, there is no contact;
+- else, if any of them is not zero, there is contact;
+- if all are zero for all axes, the polygon's normal, a sum of some C_e, is zero. It has collapsed to a segment or to a
+  point, and is the union of its edges.
+
+An edge contains the origin when C_e = 0, so that A and B are parallel, and A_i B_i <= 0 along every axis i.
+
+The times to look at
+--------------------
+If V is not identically zero, these are its roots. Those inside the step are compared with the roots of the components
+of C_e, see :mod:`algebraic`, which gives the components' signs. Where all are zero, all edges are asked for **any**
+contact with the origin during the step, each of which is contact of the features as well.
+
+If V is identically zero, the motion is planar, in a plane that may turn: the first contact is at t = 0, or with an
+edge. For were the polygon not collapsed then, and the origin strictly inside, it would have been inside before. So the
+start is looked at, and all edges are asked.
+
+An edge asks likewise. If a component of C_e is not identically zero, contact is at a root of it, at which the other two
+are zero and A_i B_i <= 0. If all are, A and B are parallel all the time, and A . B, which is positive at the start if
+there is no contact, is so until the first contact.
+
+Integers
+--------
+Scaling an axis changes no answer. So along each axis coordinates are integers once they are divided by their lowest
+set bit, and so are the corners: B bits, |x| < 2^B, the axis with the most of them counting. Then, in z = t / (1 - t),
+the outer coefficients of a component of C_e have two products of coordinates, below 2^(2B+1), and the middle one has
+four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt(3) 2^3B by Hadamard's inequality, thus
+2^(3B+3), and the inner ones are three of them each, below 15.6 * 2^3B. With these, in units of the power of 2^B,
+
+    g   = a P - p3 z q      52      < 2^6,   5B: 2 * 15.6 + 5.2 * 4
+    K0                      124.8   < 2^7,   7B: 2 * 10.4 + 2 * 52, of V' as well
+    K1, J                   291.2   < 2^9,   7B: 2 * 41.6 + 4 * 52; of V' 249.6
+    K0^2 - K1 J             77,900  < 2^17, 14B: 124.8^2 + 249.6^2 for V'; 51,900 for V itself
+    Hessian of V            487     < 2^9,   6B: 15.6^2 + 3 * 5.2 * 15.6
+    discriminant of V       1.2e6   < 2^21, 12B
+    turning point minus root        < 2^11,  9B
+
+and one bit more for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
+8 L, all fits for
+
+    B <= min((512 L - 18) / 14, (256 L - 10) / 7):  35 bits in one limb, 71 in two, 291 in eight.
+
+Single precision never takes more than 278, its whole range.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .algebraic import (
+    count_cubic_roots,
+    count_quadratic_roots,
+    last_sign,
+    order,
+    root_time,
+    signs_at_roots,
+)
+from .polynomials import VERTEX_FACE
+from .wide_integers import LIMBS, add, integer, lowest_bit, minor, product, sign, subtract, times, top_bit, widen
+
+NONE = wp.constant(wp.float64(2.0))
+"""Time of impact where there is no contact."""
+
+BITS = {1: 35, 2: 71, 8: 291}
+"""Largest B by the number of limbs of a coordinate."""
+
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
+_2 = wp.constant(wp.uint64(2))
+_3 = wp.constant(wp.uint64(3))
+
+
+def polygon_type(limbs):
+    """The type of polygons with coordinates of so many limbs: x, y, z of each corner at the start, then at the end."""
+    return wp.types.vector(length=24 * limbs, dtype=wp.uint64)
+
+
+_FROM_POINTS = """
+    // both points of the difference that each corner is; 0 to 3: the points of the query in order
+    const int first[2][4] = {{0, 0, 0, 0}, {2, 2, 3, 3}}, second[2][4] = {{1, 2, 3, 3}, {0, 1, 1, 0}};
+    const wp::vec_t<3, wp::float64> points[2][4] = {{a0, b0, c0, d0}, {a1, b1, c1, d1}};
+    constexpr int L = LIMBS;
+    wp::vec_t<24 * L, wp::uint64> r;
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int end = 0; end < 2; ++end) {
+            wp::uint64 x[4][L];
+            for (int point = 0; point < 4; ++point) {
+                union { wp::float64 value; wp::uint64 bits; } word;
+                word.value = points[end][point][axis];
+                const int field = (int)((word.bits >> 52) & 2047);
+                wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
+                if (field > 0)
+                    mantissa |= 1ull << 52;
+                int shift = (field > 0 ? field : 1) - 1075 - exponents[axis];
+                if (shift < 0) {
+                    mantissa = shift > -64 ? mantissa >> -shift : 0;
+                    shift = 0;
+                }
+                const wp::uint64 mask = 0 - (word.bits >> 63);
+                wp::uint64 carry = word.bits >> 63;
+                for (int i = 0; i < L; ++i) {
+                    const int from = 64 * i - shift;  // bit of the mantissa that is the lowest of this limb
+                    wp::uint64 limb = 0;
+                    if (from > -64 && from <= 0)
+                        limb = mantissa << -from;
+                    else if (from > 0 && from < 64)
+                        limb = mantissa >> from;
+                    x[point][i] = (limb ^ mask) + carry;
+                    carry &= x[point][i] == 0;
+                }
+            }
+            for (int corner = 0; corner < 4; ++corner) {
+                const wp::uint64 *p = x[first[edges][corner]], *q = x[second[edges][corner]];
+                wp::uint64 borrow = 0;
+                for (int i = 0; i < L; ++i) {
+                    r[((end * 4 + corner) * 3 + axis) * L + i] = p[i] - q[i] - borrow;
+                    borrow = (p[i] < q[i]) | ((p[i] == q[i]) & borrow);
+                }
+            }
+        }
+    }
+    return r;
+"""
+
+for _limbs in LIMBS[:4]:
+    _Polygon = polygon_type(_limbs)
+    _Integer = integer(_limbs)
+
+    @wp.func_native(snippet=_FROM_POINTS.replace("LIMBS", str(_limbs)))
+    def polygon_of(
+        edges: bool,
+        a0: wp.vec3d,
+        b0: wp.vec3d,
+        c0: wp.vec3d,
+        d0: wp.vec3d,
+        a1: wp.vec3d,
+        b1: wp.vec3d,
+        c1: wp.vec3d,
+        d1: wp.vec3d,
+        exponents: wp.vec3i,
+        like: _Integer,
+    ) -> _Polygon:
+        """The polygon of a query with coordinates as wide as another integer, modulo 2 to that width.
+
+        Args:
+            edges: Whether it is an edge-edge query; the polygon of a vertex-face query has its last corner twice.
+            a0: The four points in order, at the start.
+            b0: Second point.
+            c0: Third point.
+            d0: Fourth point.
+            a1: The same points at the end.
+            b1: Second point.
+            c1: Third point.
+            d1: Fourth point.
+            exponents: By axis, exponent of a power of two that all coordinates are multiples of.
+            like: Any integer of the width wanted.
+        """
+        ...
+
+    @wp.func_native(
+        snippet=f"""
+    wp::vec_t<{_limbs}, wp::uint64> r;
+    for (int i = 0; i < {_limbs}; ++i)
+        r[i] = polygon[((end * 4 + corner) * 3 + axis) * {_limbs} + i];
+    return r;"""
+    )
+    def coordinate(polygon: _Polygon, corner: int, end: int, axis: int) -> _Integer:
+        """A coordinate of a corner at the start (0) or at the end (1)."""
+        ...
+
+
+@wp.func
+def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+    """Exponents of the lowest bits of two points, by axis."""
+    return wp.min(
+        wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2])),
+        wp.vec3i(lowest_bit(y[0]), lowest_bit(y[1]), lowest_bit(y[2])),
+    )
+
+
+@wp.func
+def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+    """Powers of two that the difference of two points is below, by axis; rounding does not take it there."""
+    d = x - y
+    return wp.vec3i(top_bit(d[0]), top_bit(d[1]), top_bit(d[2]))
+
+
+@wp.func
+def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
+    """Powers of two that the corners of the polygon are below at one time, by axis."""
+    if kind == VERTEX_FACE:
+        return wp.max(_top(a, b), wp.max(_top(a, c), _top(a, d)))
+    return wp.max(wp.max(_top(c, a), _top(c, b)), wp.max(_top(d, a), _top(d, b)))
+
+
+@wp.func
+def spread(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+):
+    """The power of two to divide by along each axis, and the bits B of the corners after it."""
+    lowest = wp.min(wp.min(_lowest(a0, b0), _lowest(c0, d0)), wp.min(_lowest(a1, b1), _lowest(c1, d1)))
+    bits = wp.max(_widest(kind, a0, b0, c0, d0), _widest(kind, a1, b1, c1, d1)) - lowest
+    return lowest, wp.max(wp.max(bits), 0)
+
+
+@wp.func
+def cross_component(polygon: Any, first: int, second: int, axis: int):
+    """Coefficients in z of a component of the cross product of two corners."""
+    j = wp.where(axis == 2, 0, axis + 1)
+    k = wp.where(j == 2, 0, j + 1)
+    x0j = coordinate(polygon, first, 0, j)
+    x0k = coordinate(polygon, first, 0, k)
+    x1j = coordinate(polygon, first, 1, j)
+    x1k = coordinate(polygon, first, 1, k)
+    y0j = coordinate(polygon, second, 0, j)
+    y0k = coordinate(polygon, second, 0, k)
+    y1j = coordinate(polygon, second, 1, j)
+    y1k = coordinate(polygon, second, 1, k)
+    return (
+        minor(x0j, y0k, x0k, y0j),
+        add(minor(x0j, y1k, x0k, y1j), minor(x1j, y0k, x1k, y0j)),
+        minor(x1j, y1k, x1k, y1j),
+    )
+
+
+@wp.func
+def _sign_at_end(polygon: Any, first: int, second: int, axis: int, end: int) -> int:
+    """Sign of a component of the cross product of two corners at the start or at the end."""
+    j = wp.where(axis == 2, 0, axis + 1)
+    k = wp.where(j == 2, 0, j + 1)
+    xj = coordinate(polygon, first, end, j)
+    xk = coordinate(polygon, first, end, k)
+    yj = coordinate(polygon, second, end, j)
+    yk = coordinate(polygon, second, end, k)
+    return sign(minor(xj, yk, xk, yj))
+
+
+@wp.func
+def volume(polygon: Any, last: int):
+    """Coefficients in z of the cubic V, for the number of the last corner."""
+    n0, n1, n2 = cross_component(polygon, 1, last, 0)
+    start = coordinate(polygon, 0, 0, 0)
+    end = coordinate(polygon, 0, 1, 0)
+    v0 = product(n0, start)
+    v1 = add(product(n1, start), product(n0, end))
+    v2 = add(product(n2, start), product(n1, end))
+    v3 = product(n2, end)
+    axis = int(1)
+    while axis < 3:
+        n0, n1, n2 = cross_component(polygon, 1, last, axis)
+        start = coordinate(polygon, 0, 0, axis)
+        end = coordinate(polygon, 0, 1, axis)
+        v0 = add(v0, product(n0, start))
+        v1 = add(v1, add(product(n1, start), product(n0, end)))
+        v2 = add(v2, add(product(n2, start), product(n1, end)))
+        v3 = add(v3, product(n2, end))
+        axis += 1
+    return v0, v1, v2, v3
+
+
+@wp.func
+def _next(corner: int, corners: int) -> int:
+    """The corner after another one."""
+    return wp.where(corner + 1 == corners, 0, corner + 1)
+
+
+@wp.func
+def _touches_at_end(polygon: Any, corners: int, end: int) -> int:
+    """Whether the polygon, coplanar with the origin at one end of the step, contains it there: 1, 0, or -1 if collapsed.
+    """
+    axis = int(0)
+    while axis < 3:
+        low = int(0)
+        high = int(0)
+        corner = int(0)
+        while corner < corners:
+            s = _sign_at_end(polygon, corner, _next(corner, corners), axis, end)
+            low = wp.min(low, s)
+            high = wp.max(high, s)
+            corner += 1
+        if low < 0 and high > 0:
+            return 0
+        if low < 0 or high > 0:
+            return 1
+        axis += 1
+    return -1
+
+
+@wp.func
+def _edge_touches_at_end(polygon: Any, first: int, second: int, end: int) -> bool:
+    """Whether the edge between two corners contains the origin at one end of the step."""
+    axis = int(0)
+    while axis < 3:
+        if _sign_at_end(polygon, first, second, axis, end) != 0:
+            return False
+        if sign(coordinate(polygon, first, end, axis)) * sign(coordinate(polygon, second, end, axis)) > 0:
+            return False
+        axis += 1
+    return True
+
+
+@wp.func
+def _between_at_roots(polygon: Any, first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int):
+    """Whether the edge contains the origin at the positive roots of a component of its cross product.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        axis: Of the component.
+        c0: Coefficients of the component in z, here and next.
+        c1: Of z.
+        c2: Of z^2.
+        roots: How many positive roots it has, with multiplicity, 1 or 2.
+
+    Returns:
+        Two Booleans, for the smaller root first; of one root, twice.
+    """
+    at_first = bool(True)
+    at_second = bool(True)
+    zero = subtract(c0, c0)
+    i = int(0)
+    while i < 3 and (at_first or at_second):
+        if i != axis:
+            p0, p1, p2 = cross_component(polygon, first, second, i)
+            s = signs_at_roots(p0, p1, p2, zero, c0, c1, c2, roots)
+            at_first = at_first and s[0] == 0
+            at_second = at_second and s[1] == 0
+        i += 1
+    i = int(0)
+    while i < 3 and (at_first or at_second):
+        a0 = widen(coordinate(polygon, first, 0, i))
+        a1 = widen(coordinate(polygon, first, 1, i))
+        b0 = widen(coordinate(polygon, second, 0, i))
+        b1 = widen(coordinate(polygon, second, 1, i))
+        a = signs_at_roots(a0, a1, zero, zero, c0, c1, c2, roots)
+        b = signs_at_roots(b0, b1, zero, zero, c0, c1, c2, roots)
+        at_first = at_first and a[0] * b[0] <= 0
+        at_second = at_second and a[1] * b[1] <= 0
+        i += 1
+    return at_first, at_second
+
+
+@wp.func(inline=False)
+def edge_contact(polygon: Any, first: int, second: int, digits: int) -> wp.float64:
+    """When an edge of the polygon first contains the origin: a multiple of 2^-digits not after it, or NONE.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        digits: Binary digits of the time, at most 38.
+    """
+    if _edge_touches_at_end(polygon, first, second, 0):
+        return _0
+    result = NONE
+    if _edge_touches_at_end(polygon, first, second, 1):
+        result = _1
+    axis = int(0)
+    while axis < 3:
+        c0, c1, c2 = cross_component(polygon, first, second, axis)
+        if sign(c0) != 0 or sign(c1) != 0 or sign(c2) != 0:
+            roots = count_quadratic_roots(c0, c1, c2)
+            if roots > 0:
+                at_first, at_second = _between_at_roots(polygon, first, second, axis, c0, c1, c2, roots)
+                if at_first or at_second:
+                    # the only positive root is the third of a cubic, two are the second and the third
+                    index = wp.where(roots == 2 and at_first, 1, 2)
+                    return root_time(c0, c1, c2, subtract(c0, c0), roots, index, digits)
+            return result
+        axis += 1
+    # parallel all the time: A . B, a quadratic
+    a0 = coordinate(polygon, first, 0, 0)
+    a1 = coordinate(polygon, first, 1, 0)
+    b0 = coordinate(polygon, second, 0, 0)
+    b1 = coordinate(polygon, second, 1, 0)
+    d0 = product(a0, b0)
+    d1 = add(product(a0, b1), product(a1, b0))
+    d2 = product(a1, b1)
+    axis = int(1)
+    while axis < 3:
+        a0 = coordinate(polygon, first, 0, axis)
+        a1 = coordinate(polygon, first, 1, axis)
+        b0 = coordinate(polygon, second, 0, axis)
+        b1 = coordinate(polygon, second, 1, axis)
+        d0 = add(d0, product(a0, b0))
+        d1 = add(d1, add(product(a0, b1), product(a1, b0)))
+        d2 = add(d2, product(a1, b1))
+        axis += 1
+    roots = count_quadratic_roots(d0, d1, d2)
+    if roots > 0:
+        return root_time(d0, d1, d2, subtract(d0, d0), roots, 3 - roots, digits)
+    return result
+
+
+@wp.func(inline=False)
+def _component_signs(
+    polygon: Any, first: int, second: int, axis: int, v0: Any, v1: Any, v2: Any, v3: Any, roots: int, constant: bool
+) -> wp.vec3i:
+    """Signs of a component of the cross product of an edge's corners at the roots of V.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        axis: Of the component.
+        v0: Coefficients of V in z, here and next.
+        v1: Of z.
+        v2: Of z^2.
+        v3: Of z^3.
+        roots: How many positive roots V has, with multiplicity.
+        constant: Whether to answer for those components only that have no positive root, or only for those that do.
+
+    Returns:
+        The signs at the roots a1 <= a2 <= a3 of V, of which the last ones are positive; zeros where not asked.
+    """
+    c0, c1, c2 = cross_component(polygon, first, second, axis)
+    turns = count_quadratic_roots(c0, c1, c2)
+    if (turns == 0) != constant:
+        return wp.vec3i(0, 0, 0)
+    s = last_sign(sign(c0), sign(c1), sign(c2), 0)
+    signs = wp.vec3i(s, s, s)
+    if turns == 0:
+        return signs
+    end = last_sign(sign(v0), sign(v1), sign(v2), sign(v3))
+    value = end * signs_at_roots(v0, v1, v2, v3, c0, c1, c2, turns)
+    slope = wp.vec2i(0, 0)
+    bend = wp.vec2i(0, 0)
+    if roots > 1:
+        zero = subtract(v0, v0)
+        slope = end * signs_at_roots(v1, times(v2, _2), times(v3, _3), zero, c0, c1, c2, turns)
+        bend = end * signs_at_roots(v2, times(v3, _3), zero, zero, c0, c1, c2, turns)
+    # the sign is the last one beyond all roots of the component, and changes at each of them
+    signs = wp.cw_mul(signs, -order(roots, value[0], slope[0], bend[0]))
+    if turns == 2:
+        signs = wp.cw_mul(signs, -order(roots, value[1], slope[1], bend[1]))
+    return signs
+
+
+@wp.func
+def first_contact_exactly(kind: int, polygon: Any, timed: bool, digits: int) -> wp.float64:
+    """Whether a query collides, and when first: a multiple of 2^-digits not after it, closer than that to it, or NONE.
+
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE.
+        polygon: The polygon of the query, of at most BITS.
+        timed: Whether the time is asked for; else it is any time at most 1 where the query collides.
+        digits: Binary digits of the time, at most 38.
+    """
+    corners = wp.where(kind == VERTEX_FACE, 3, 4)
+    v0, v1, v2, v3 = volume(polygon, corners - 1)
+    s0 = sign(v0)
+    s3 = sign(v3)
+    collapses = s0 == 0 and s3 == 0 and sign(v1) == 0 and sign(v2) == 0
+    toi = NONE
+    if s0 == 0:
+        touches = _touches_at_end(polygon, corners, 0)
+        if touches > 0:
+            return _0
+        collapses = collapses or touches < 0
+    if s3 == 0:
+        touches = _touches_at_end(polygon, corners, 1)
+        if touches > 0:
+            toi = _1
+            if not timed:
+                return toi
+        collapses = collapses or touches < 0
+
+    roots = count_cubic_roots(v0, v1, v2, v3)
+    is_open = wp.vec3i(wp.where(roots == 3, 1, 0), wp.where(roots > 1, 1, 0), wp.where(roots > 0, 1, 0))
+    hit = wp.vec3i(0, 0, 0)
+    axis = int(0)
+    while axis < 3 and wp.max(is_open) > 0:
+        low = wp.vec3i(0, 0, 0)
+        high = wp.vec3i(0, 0, 0)
+        # components without roots first: they cost little, and opposite signs settle all
+        step = int(0)
+        while step < 2 * corners:
+            if wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
+                corner = wp.where(step < corners, step, step - corners)
+                signs = _component_signs(
+                    polygon, corner, _next(corner, corners), axis, v0, v1, v2, v3, roots, step < corners
+                )
+                low = wp.min(low, signs)
+                high = wp.max(high, signs)
+            step += 1
+        one_sign = wp.cw_mul(is_open, high - low)  # 0: all are zero, 1: one weak sign, 2: opposite signs
+        hit += wp.vec3i(
+            wp.where(one_sign[0] == 1, 1, 0), wp.where(one_sign[1] == 1, 1, 0), wp.where(one_sign[2] == 1, 1, 0)
+        )
+        is_open = wp.vec3i(
+            wp.where(one_sign[0] == 0, is_open[0], 0),
+            wp.where(one_sign[1] == 0, is_open[1], 0),
+            wp.where(one_sign[2] == 0, is_open[2], 0),
+        )
+        axis += 1
+    if wp.max(hit) > 0:
+        if not timed:
+            return _0
+        index = wp.where(hit[0] > 0, 0, wp.where(hit[1] > 0, 1, 2))
+        toi = wp.min(toi, root_time(v0, v1, v2, v3, roots, index, digits))
+    if collapses or wp.max(is_open) > 0:
+        corner = int(0)
+        while corner < corners:
+            toi = wp.min(toi, edge_contact(polygon, corner, _next(corner, corners), digits))
+            corner += 1
+    return toi
