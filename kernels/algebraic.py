@@ -59,7 +59,7 @@ def last_sign(s0: int, s1: int, s2: int, s3: int) -> int:
     return wp.where(s3 != 0, s3, wp.where(s2 != 0, s2, wp.where(s1 != 0, s1, s0)))
 
 
-@wp.func
+@wp.func(inline=False)
 def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
     """Number of positive roots of a quadratic, with multiplicity: 0, 1 or 2; 0 for the zero polynomial."""
     changes = sign_changes(sign(c0), sign(c1), sign(c2), 0)
@@ -68,7 +68,7 @@ def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
     return changes
 
 
-@wp.func
+@wp.func(inline=False)
 def count_cubic_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
     """Number of positive roots of a cubic, with multiplicity: 0 to 3; 0 for the zero polynomial.
 
@@ -155,7 +155,7 @@ def order(roots: int, value: int, slope: int, bend: int) -> wp.vec3i:
     return wp.vec3i(1, -value, -1)
 
 
-@wp.func
+@wp.func(inline=False)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
     """Sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
     m1 = subtract(p1, times(p0, _3))
@@ -166,7 +166,7 @@ def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: i
     return sign(add(times(value, time), shift(widen(p0), 3 * digits)))
 
 
-@wp.func
+@wp.func(inline=False)
 def root_time(c0: Any, c1: Any, c2: Any, c3: Any, roots: int, index: int, digits: int) -> wp.float64:
     """The last multiple of 2^-digits that is not after a root of a cubic, as a time t in [0, 1).
 

@@ -225,7 +225,7 @@ def spread(
     return lowest, wp.max(wp.max(bits), 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def cross_component(polygon: Any, first: int, second: int, axis: int):
     """Coefficients in z of a component of the cross product of two corners."""
     j = wp.where(axis == 2, 0, axis + 1)
@@ -257,7 +257,7 @@ def _sign_at_end(polygon: Any, first: int, second: int, axis: int, end: int) -> 
     return sign(minor(xj, yk, xk, yj))
 
 
-@wp.func
+@wp.func(inline=False)
 def volume(polygon: Any, last: int):
     """Coefficients in z of the cubic V, for the number of the last corner."""
     n0, n1, n2 = cross_component(polygon, 1, last, 0)
@@ -286,7 +286,7 @@ def _next(corner: int, corners: int) -> int:
     return wp.where(corner + 1 == corners, 0, corner + 1)
 
 
-@wp.func
+@wp.func(inline=False)
 def _touches_at_end(polygon: Any, corners: int, end: int) -> int:
     """Whether the polygon, coplanar with the origin at one end of the step, contains it there: 1, 0, or -1 if collapsed.
     """
@@ -308,7 +308,7 @@ def _touches_at_end(polygon: Any, corners: int, end: int) -> int:
     return -1
 
 
-@wp.func
+@wp.func(inline=False)
 def _edge_touches_at_end(polygon: Any, first: int, second: int, end: int) -> bool:
     """Whether the edge between two corners contains the origin at one end of the step."""
     axis = int(0)
@@ -321,7 +321,7 @@ def _edge_touches_at_end(polygon: Any, first: int, second: int, end: int) -> boo
     return True
 
 
-@wp.func
+@wp.func(inline=False)
 def _between_at_roots(polygon: Any, first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int):
     """Whether the edge contains the origin at the positive roots of a component of its cross product.
 

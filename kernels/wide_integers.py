@@ -25,9 +25,15 @@ _MULTIPLY = """
         constexpr int A = sizeof(x) / 8, B = sizeof(y) / 8, R = sizeof(ret_type) / 8;
         for (int i = 0; i < R; ++i)
             p[i] = 0;
+        // small ones without loops: an index that varies would put them into local memory on a GPU
+        constexpr bool small = A * B <= 64;
+#pragma unroll(small ? A : 1)
         for (int i = 0; i < A; ++i) {
             wp::uint64 carry = 0;
-            for (int j = 0; j < B && i + j < R; ++j) {
+#pragma unroll(small ? B : 1)
+            for (int j = 0; j < B; ++j) {
+                if (i + j >= R)
+                    break;
 #if defined(__CUDA_ARCH__)
                 wp::uint64 low = x[i] * y[j];
                 wp::uint64 high = __umul64hi(x[i], y[j]);
