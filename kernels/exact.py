@@ -84,17 +84,11 @@ _2 = wp.constant(wp.uint64(2))
 _3 = wp.constant(wp.uint64(3))
 
 
-def polygon_type(limbs):
-    """The type of polygons with coordinates of so many limbs: x, y, z of each corner at the start, then at the end."""
-    return wp.types.vector(length=24 * limbs, dtype=wp.uint64)
-
-
 _FROM_POINTS = """
     // both points of the difference that each corner is; 0 to 3: the points of the query in order
     const int first[2][4] = {{0, 0, 0, 0}, {2, 2, 3, 3}}, second[2][4] = {{1, 2, 3, 3}, {0, 1, 1, 0}};
     const wp::vec_t<3, wp::float64> points[2][4] = {{a0, b0, c0, d0}, {a1, b1, c1, d1}};
-    constexpr int L = LIMBS;
-    wp::vec_t<24 * L, wp::uint64> r;
+    constexpr int L = sizeof(*polygon.data) / 8;
     for (int axis = 0; axis < 3; ++axis) {
         for (int end = 0; end < 2; ++end) {
             wp::uint64 x[4][L];
@@ -127,21 +121,19 @@ _FROM_POINTS = """
                 const wp::uint64 *p = x[first[edges][corner]], *q = x[second[edges][corner]];
                 wp::uint64 borrow = 0;
                 for (int i = 0; i < L; ++i) {
-                    r[((end * 4 + corner) * 3 + axis) * L + i] = p[i] - q[i] - borrow;
+                    polygon.data[(end * 4 + corner) * 3 + axis][i] = p[i] - q[i] - borrow;
                     borrow = (p[i] < q[i]) | ((p[i] == q[i]) & borrow);
                 }
             }
         }
     }
-    return r;
 """
 
-for _limbs in LIMBS[:4]:
-    _Polygon = polygon_type(_limbs)
+for _limbs in BITS:
     _Integer = integer(_limbs)
 
-    @wp.func_native(snippet=_FROM_POINTS.replace("LIMBS", str(_limbs)))
-    def polygon_of(
+    @wp.func_native(snippet=_FROM_POINTS)
+    def make_polygon(
         edges: bool,
         a0: wp.vec3d,
         b0: wp.vec3d,
@@ -152,9 +144,9 @@ for _limbs in LIMBS[:4]:
         c1: wp.vec3d,
         d1: wp.vec3d,
         exponents: wp.vec3i,
-        like: _Integer,
-    ) -> _Polygon:
-        """The polygon of a query with coordinates as wide as another integer, modulo 2 to that width.
+        polygon: wp.array[_Integer],
+    ):
+        """Fills the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
 
         Args:
             edges: Whether it is an edge-edge query; the polygon of a vertex-face query has its last corner twice.
@@ -167,20 +159,15 @@ for _limbs in LIMBS[:4]:
             c1: Third point.
             d1: Fourth point.
             exponents: By axis, exponent of a power of two that all coordinates are multiples of.
-            like: Any integer of the width wanted.
+            polygon: Array of 24 integers to write to.
         """
         ...
 
-    @wp.func_native(
-        snippet=f"""
-    wp::vec_t<{_limbs}, wp::uint64> r;
-    for (int i = 0; i < {_limbs}; ++i)
-        r[i] = polygon[((end * 4 + corner) * 3 + axis) * {_limbs} + i];
-    return r;"""
-    )
-    def coordinate(polygon: _Polygon, corner: int, end: int, axis: int) -> _Integer:
-        """A coordinate of a corner at the start (0) or at the end (1)."""
-        ...
+
+@wp.func
+def coordinate(polygon: wp.array[Any], corner: int, end: int, axis: int):
+    """A coordinate of a corner at the start (0) or at the end (1)."""
+    return polygon[(end * 4 + corner) * 3 + axis]
 
 
 @wp.func
@@ -226,7 +213,7 @@ def spread(
 
 
 @wp.func(inline=False)
-def cross_component(polygon: Any, first: int, second: int, axis: int):
+def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
     """Coefficients in z of a component of the cross product of two corners."""
     j = wp.where(axis == 2, 0, axis + 1)
     k = wp.where(j == 2, 0, j + 1)
@@ -246,7 +233,7 @@ def cross_component(polygon: Any, first: int, second: int, axis: int):
 
 
 @wp.func
-def _sign_at_end(polygon: Any, first: int, second: int, axis: int, end: int) -> int:
+def _sign_at_end(polygon: wp.array[Any], first: int, second: int, axis: int, end: int) -> int:
     """Sign of a component of the cross product of two corners at the start or at the end."""
     j = wp.where(axis == 2, 0, axis + 1)
     k = wp.where(j == 2, 0, j + 1)
@@ -258,7 +245,7 @@ def _sign_at_end(polygon: Any, first: int, second: int, axis: int, end: int) -> 
 
 
 @wp.func(inline=False)
-def volume(polygon: Any, last: int):
+def volume(polygon: wp.array[Any], last: int):
     """Coefficients in z of the cubic V, for the number of the last corner."""
     n0, n1, n2 = cross_component(polygon, 1, last, 0)
     start = coordinate(polygon, 0, 0, 0)
@@ -287,7 +274,7 @@ def _next(corner: int, corners: int) -> int:
 
 
 @wp.func(inline=False)
-def _touches_at_end(polygon: Any, corners: int, end: int) -> int:
+def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
     """Whether the polygon, coplanar with the origin at one end of the step, contains it there: 1, 0, or -1 if collapsed.
     """
     axis = int(0)
@@ -309,7 +296,7 @@ def _touches_at_end(polygon: Any, corners: int, end: int) -> int:
 
 
 @wp.func(inline=False)
-def _edge_touches_at_end(polygon: Any, first: int, second: int, end: int) -> bool:
+def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: int) -> bool:
     """Whether the edge between two corners contains the origin at one end of the step."""
     axis = int(0)
     while axis < 3:
@@ -322,7 +309,7 @@ def _edge_touches_at_end(polygon: Any, first: int, second: int, end: int) -> boo
 
 
 @wp.func(inline=False)
-def _between_at_roots(polygon: Any, first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int):
+def _between_at_roots(polygon: wp.array[Any], first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int):
     """Whether the edge contains the origin at the positive roots of a component of its cross product.
 
     Args:
@@ -364,7 +351,7 @@ def _between_at_roots(polygon: Any, first: int, second: int, axis: int, c0: Any,
 
 
 @wp.func(inline=False)
-def edge_contact(polygon: Any, first: int, second: int, digits: int) -> wp.float64:
+def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -> wp.float64:
     """When an edge of the polygon first contains the origin: a multiple of 2^-digits not after it, or NONE.
 
     Args:
@@ -417,7 +404,7 @@ def edge_contact(polygon: Any, first: int, second: int, digits: int) -> wp.float
 
 @wp.func(inline=False)
 def _component_signs(
-    polygon: Any, first: int, second: int, axis: int, v0: Any, v1: Any, v2: Any, v3: Any, roots: int, constant: bool
+    polygon: wp.array[Any], first: int, second: int, axis: int, v0: Any, v1: Any, v2: Any, v3: Any, roots: int, constant: bool
 ) -> wp.vec3i:
     """Signs of a component of the cross product of an edge's corners at the roots of V.
 
@@ -460,7 +447,7 @@ def _component_signs(
 
 
 @wp.func
-def first_contact_exactly(kind: int, polygon: Any, timed: bool, digits: int) -> wp.float64:
+def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits: int) -> wp.float64:
     """Whether a query collides, and when first: a multiple of 2^-digits not after it, closer than that to it, or NONE.
 
     Args:
