@@ -75,7 +75,7 @@ from .wide_integers import LIMBS, add, integer, lowest_bit, minor, product, sign
 NONE = wp.constant(wp.float64(2.0))
 """Time of impact where there is no contact."""
 
-BITS = {1: 35, 2: 71, 8: 291}
+BITS = {1: 35, 2: 71, 4: 144, 8: 291}
 """Largest B by the number of limbs of a coordinate."""
 
 _0 = wp.constant(wp.float64(0.0))
@@ -514,3 +514,12 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
             toi = wp.min(toi, edge_contact(polygon, corner, _next(corner, corners), digits))
             corner += 1
     return toi
+
+
+for _limbs in BITS:
+    _Integer = integer(_limbs)
+
+    @wp.func
+    def decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
+        """As :func:`first_contact_exactly`; taking an array of a known type keeps it from being copied at each call."""
+        return first_contact_exactly(kind, polygon, timed, digits)
