@@ -69,13 +69,16 @@ from .algebraic import (
     root_time,
     signs_at_roots,
 )
-from .polynomials import VERTEX_FACE
+from .polynomials import EDGE_EDGE, VERTEX_FACE
 from .wide_integers import LIMBS, add, integer, lowest_bit, minor, product, sign, subtract, times, top_bit, widen
 
 NONE = wp.constant(wp.float64(2.0))
 """Time of impact where there is no contact."""
 
-BITS = {1: 35, 2: 71, 4: 144, 8: 291}
+TOO_WIDE = wp.constant(wp.float64(-1.0))
+"""In place of a time of impact: the exponents of the query are too far apart for the width asked for."""
+
+BITS = {1: 35, 2: 71, 8: 291}
 """Largest B by the number of limbs of a coordinate."""
 
 _0 = wp.constant(wp.float64(0.0))
@@ -523,3 +526,71 @@ for _limbs in BITS:
     def decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
         """As :func:`first_contact_exactly`; taking an array of a known type keeps it from being copied at each call."""
         return first_contact_exactly(kind, polygon, timed, digits)
+
+
+_ONE_LIMB, _TWO_LIMBS, _EIGHT_LIMBS = (integer(limbs) for limbs in BITS)
+_ONE_LIMB_BITS, _TWO_LIMBS_BITS, _EIGHT_LIMBS_BITS = (wp.constant(bits) for bits in BITS.values())
+
+
+@wp.func
+def decide_narrow(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    timed: bool,
+    digits: int,
+) -> wp.float64:
+    """First contact of a query in one or two limbs, or TOO_WIDE.
+
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE.
+        a0: The four points in order, at the start; finite.
+        b0: Second point.
+        c0: Third point.
+        d0: Fourth point.
+        a1: The same points at the end.
+        b1: Second point.
+        c1: Third point.
+        d1: Fourth point.
+        timed: As for :func:`first_contact_exactly`.
+        digits: As for :func:`first_contact_exactly`.
+    """
+    exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+    if bits <= _ONE_LIMB_BITS:
+        narrow = wp.zeros(shape=(24,), dtype=_ONE_LIMB)
+        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, narrow)
+        return decide(kind, narrow, timed, digits)
+    if bits <= _TWO_LIMBS_BITS:
+        wider = wp.zeros(shape=(24,), dtype=_TWO_LIMBS)
+        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, wider)
+        return decide(kind, wider, timed, digits)
+    return TOO_WIDE
+
+
+@wp.func
+def decide_wide(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    timed: bool,
+    digits: int,
+) -> wp.float64:
+    """As :func:`decide_narrow`, in eight limbs: every query in single precision, few in double are TOO_WIDE."""
+    exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+    if bits > _EIGHT_LIMBS_BITS:
+        return TOO_WIDE
+    widest = wp.zeros(shape=(24,), dtype=_EIGHT_LIMBS)
+    make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, widest)
+    return decide(kind, widest, timed, digits)
