@@ -1,8 +1,8 @@
 """Signs and order of algebraic numbers: roots of quadratics and cubics, in exact integers (paper, 4.1 and 4.2).
 
 A polynomial over the step is taken in z = t / (1 - t), which maps the inside of the step to z > 0: the Bernstein
-coefficients of a cubic times 1, 3, 3, 1 are its coefficients in z, and the sign of its value is the same. Its ends t = 0
-and t = 1 are z = 0 and infinity, where the signs of the first and of the last coefficient count.
+coefficients of a cubic times 1, 3, 3, 1 are its coefficients in z, and the sign of its value is the same. The ends
+t = 0 and t = 1 are z = 0 and infinity, where the signs of the first and of the last coefficient count.
 
 **Number of positive roots.** Descartes: as many as changes of sign along the coefficients, or fewer by an even number.
 So 0 and 1 change say it. Two or three changes allow at most one or no negative root, so that all roots are real, with
@@ -25,9 +25,9 @@ point is on is told by the signs of f' and f'' there (Thom's encoding), its side
 of f. A quadratic is such a cubic without the first piece, a1 being at minus infinity. So the signs of f, f' and f'' at
 the roots of q tell the order of the roots of f and of q, and hence the sign of q at the roots of f.
 
-Widths. With coefficients of q below 2^(2B+2), the outer ones below 2^(2B+1), and of P below 2^(3B+5), as
-:mod:`exact` has them (the constants are derived there): g below 2^(5B+6), K and J below 2^(7B+9), and
-K0^2 - K1 J below 2^(14B+17).
+Widths: with coefficients of q below 2^(2B+2), the outer ones below 2^(2B+1), and of P below 2^(3B+5), as those of
+:mod:`polygon` are, which derives the constants, g is below 2^(5B+6), K and J are below 2^(7B+9), and K0^2 - K1 J is
+below 2^(14B+17).
 """
 
 from typing import Any

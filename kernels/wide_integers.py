@@ -160,41 +160,10 @@ _SHIFT = """
     return r;
 """
 
-# every finite double is a 53-bit integer times a power of two not below 2^-1074
-_FROM_DOUBLE = """
-    ret_type r;
-    union { wp::float64 value; wp::uint64 bits; } word;
-    word.value = x;
-    const int field = (int)((word.bits >> 52) & 2047);
-    wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
-    if (field > 0)
-        mantissa |= 1ull << 52;
-    const int shift = (field > 0 ? field : 1) - 1075 - exponent;
-    const bool negative = word.bits >> 63;
-    const int limbs = shift > 0 ? shift >> 6 : 0, rest = shift > 0 ? shift & 63 : 0;
-    if (shift < 0)
-        mantissa = shift > -64 ? mantissa >> -shift : 0;
-    wp::uint64 carry = negative;
-    for (int i = 0; i < (int)(sizeof(r) / 8); ++i) {
-        wp::uint64 limb = 0;
-        if (i == limbs)
-            limb = mantissa << rest;
-        else if (i == limbs + 1 && rest > 0)
-            limb = mantissa >> (64 - rest);
-        if (negative)
-            limb = ~limb;
-        r[i] = limb + carry;
-        carry = r[i] < carry;
-    }
-    return r;
-"""
-
 
 def _returning(snippet, limbs):
     """A snippet with the type that it returns filled in."""
     return f"    using ret_type = wp::vec_t<{limbs}, wp::uint64>;{snippet}"
-
-
 
 
 for _limbs in LIMBS:
@@ -219,11 +188,6 @@ for _limbs in LIMBS:
     @wp.func_native(snippet=_returning(_TIMES, _limbs))
     def times(a: _Single, factor: wp.uint64) -> _Single:
         """The product of an integer and a factor that is not negative."""
-        ...
-
-    @wp.func_native(snippet=_returning(_FROM_DOUBLE, _limbs))
-    def from_double(x: wp.float64, exponent: int, like: _Single) -> _Single:
-        """The integer x / 2^exponent, as wide as another one."""
         ...
 
     @wp.func_native(snippet=_returning(_SHIFT, _limbs))

@@ -24,6 +24,7 @@ __all__ = ["launch_exact_stage"]
 _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
 """Without fused operations every device computes the same bits."""
 
+
 @functools.cache
 def _kernels(dtype):
     """The kernels for one type of position: in one or two limbs, and in eight, each in a module of its own."""

@@ -289,8 +289,8 @@ class Contacts:
     Attributes:
         pairs: (vertex, face) or (edge, edge), array of vec2i.
         status: What floating point could certify, HIT or UNSURE, array of int8.
-        answers: The same after exact arithmetic, if the method asks for that: FREE, HIT, or UNSURE for what it leaves to
-            the host, array of int8.
+        answers: The same after exact arithmetic, if the method asks for that: FREE, HIT, or UNSURE for what it leaves
+            to the host, array of int8.
         localized: Whether the time is within the tolerance, array of bool.
         toi: Time of impact as a share of the step, array of float64.
         coordinates: Contact coordinates, array of vec3d.
@@ -312,7 +312,7 @@ class Contacts:
         return [self.pairs, self.status, self.answers, self.localized, self.toi, self.coordinates, self.normal]
 
     def read(self, count):
-        """The first ``count`` contacts as NumPy arrays by name; ``hit`` is all of them that are not shown to be free."""
+        """The first ``count`` contacts as NumPy arrays by name; ``hit`` is all of them not shown to be free."""
         names = ["pairs", "status", "answers", "localized", "toi", "coordinates", "normal"]
         contacts = {name: array[: int(count)].numpy().copy() for name, array in zip(names, self.arrays, strict=True)}
         contacts["hit"] = contacts["answers"] != FREE
