@@ -155,6 +155,42 @@ def order(roots: int, value: int, slope: int, bend: int) -> wp.vec3i:
     return wp.vec3i(1, -value, -1)
 
 
+@wp.func
+def signs_at_cubic_roots(
+    c0: Any, c1: Any, c2: Any, turns: int, v0: Any, v1: Any, v2: Any, v3: Any, roots: int
+) -> wp.vec3i:
+    """Signs of a quadratic q at the roots a1 <= a2 <= a3 of a cubic, of which the last ones are positive and asked for.
+
+    Args:
+        c0: Coefficients of q in z, here and next.
+        c1: Of z.
+        c2: Of z^2.
+        turns: How many positive roots q has, with multiplicity.
+        v0: Coefficients of the cubic in z, here and next.
+        v1: Of z.
+        v2: Of z^2.
+        v3: Of z^3.
+        roots: How many positive roots the cubic has, with multiplicity, at least 1.
+    """
+    s = last_sign(sign(c0), sign(c1), sign(c2), 0)
+    signs = wp.vec3i(s, s, s)
+    if turns == 0:
+        return signs
+    end = last_sign(sign(v0), sign(v1), sign(v2), sign(v3))
+    value = end * signs_at_roots(v0, v1, v2, v3, c0, c1, c2, turns)
+    slope = wp.vec2i(0, 0)
+    bend = wp.vec2i(0, 0)
+    if roots > 1:
+        zero = subtract(v0, v0)
+        slope = end * signs_at_roots(v1, times(v2, _2), times(v3, _3), zero, c0, c1, c2, turns)
+        bend = end * signs_at_roots(v2, times(v3, _3), zero, zero, c0, c1, c2, turns)
+    # the sign is the last one beyond all roots of q, and changes at each of them
+    signs = wp.cw_mul(signs, -order(roots, value[0], slope[0], bend[0]))
+    if turns == 2:
+        signs = wp.cw_mul(signs, -order(roots, value[1], slope[1], bend[1]))
+    return signs
+
+
 @wp.func(inline=False)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
     """Sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""

@@ -38,17 +38,10 @@ from typing import Any
 
 import warp as wp
 
-from .algebraic import (
-    count_cubic_roots,
-    count_quadratic_roots,
-    last_sign,
-    order,
-    root_time,
-    signs_at_roots,
-)
+from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
 from .polygon import BITS, coordinate, cross_component, make_polygon, sign_at_end, spread, volume
 from .polynomials import EDGE_EDGE, VERTEX_FACE
-from .wide_integers import add, integer, product, sign, subtract, times, widen
+from .wide_integers import add, integer, product, sign, subtract, widen
 
 NONE = wp.constant(wp.float64(2.0))
 """Time of impact where there is no contact."""
@@ -58,8 +51,6 @@ TOO_WIDE = wp.constant(wp.float64(-1.0))
 
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
-_2 = wp.constant(wp.uint64(2))
-_3 = wp.constant(wp.uint64(3))
 
 
 @wp.func
@@ -232,23 +223,7 @@ def _component_signs(
     turns = count_quadratic_roots(c0, c1, c2)
     if (turns == 0) != constant:
         return wp.vec3i(0, 0, 0)
-    s = last_sign(sign(c0), sign(c1), sign(c2), 0)
-    signs = wp.vec3i(s, s, s)
-    if turns == 0:
-        return signs
-    end = last_sign(sign(v0), sign(v1), sign(v2), sign(v3))
-    value = end * signs_at_roots(v0, v1, v2, v3, c0, c1, c2, turns)
-    slope = wp.vec2i(0, 0)
-    bend = wp.vec2i(0, 0)
-    if roots > 1:
-        zero = subtract(v0, v0)
-        slope = end * signs_at_roots(v1, times(v2, _2), times(v3, _3), zero, c0, c1, c2, turns)
-        bend = end * signs_at_roots(v2, times(v3, _3), zero, zero, c0, c1, c2, turns)
-    # the sign is the last one beyond all roots of the component, and changes at each of them
-    signs = wp.cw_mul(signs, -order(roots, value[0], slope[0], bend[0]))
-    if turns == 2:
-        signs = wp.cw_mul(signs, -order(roots, value[1], slope[1], bend[1]))
-    return signs
+    return signs_at_cubic_roots(c0, c1, c2, turns, v0, v1, v2, v3, roots)
 
 
 @wp.func

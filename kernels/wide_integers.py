@@ -250,9 +250,10 @@ def lowest_bit(x: wp.float64) -> int:
     snippet="""
     union { wp::float64 value; wp::uint64 bits; } word;
     word.value = x;
-    return x == 0.0 ? -4096 : (int)((word.bits >> 52) & 2047) - 1022;
+    const int field = (int)((word.bits >> 52) & 2047);
+    return x == 0.0 ? -4096 : field == 2047 ? 8192 : field - 1022;
 """
 )
 def top_bit(x: wp.float64) -> int:
-    """An e with |x| < 2^e, the smallest one unless x is subnormal; -4096 of 0."""
+    """An e with |x| < 2^e, the smallest one unless x is subnormal; -4096 of 0, 8192 of what is not finite."""
     ...
