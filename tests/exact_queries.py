@@ -44,7 +44,7 @@ def _kernel(limbs):
     return decide_queries
 
 
-def decide_exactly(kind, points, limbs, *, timed=False, digits=20):
+def decide_exactly(kind, points, limbs, *, timed=False, digits=20, device=None):
     """Decides queries in integers of so many limbs a coordinate, one thread each.
 
     Args:
@@ -53,15 +53,16 @@ def decide_exactly(kind, points, limbs, *, timed=False, digits=20):
         limbs: Width, a key of ``BITS``.
         timed: Whether to find times.
         digits: Binary digits of the times.
+        device: Warp device; default: Warp's default.
 
     Returns:
         Times (2 of free queries, negative ones of those too wide), float64 of shape [n], and the bits that each
         query's coordinates take, int of shape [n].
     """
     n = len(points)
-    time = wp.zeros(n, dtype=wp.float64)
-    bits = wp.zeros(n, dtype=int)
-    points = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d)
+    time = wp.zeros(n, dtype=wp.float64, device=device)
+    bits = wp.zeros(n, dtype=int, device=device)
+    points = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
     inputs = [int(kind == "edge_edge"), points, timed, digits]
-    wp.launch(_kernel(limbs), n, inputs=inputs, outputs=[time, bits])
+    wp.launch(_kernel(limbs), n, inputs=inputs, outputs=[time, bits], device=device)
     return time.numpy(), bits.numpy()
