@@ -7,6 +7,9 @@ from benchmark_data import data_folder, load_cloth_funnel_queries, load_queries
 from certify import KINDS
 from exact_queries import decide_exactly
 from generators import GENERATORS, _weights, _with_gap
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from test_wide_integers import to_integers
 
 import warp_bsc as bsc
@@ -71,6 +74,24 @@ def test_motion_in_a_turning_plane(kind):
     assert 100 < truth.sum() < 500
     for limbs in BITS:
         assert_true(kind, points, limbs)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=25)
+@given(
+    coordinates=arrays(np.int64, (40, 8, 3), elements=st.integers(-3, 3)),
+    axes=st.permutations(range(3)),
+    data=st.data(),
+)
+def test_answers_do_not_depend_on_names_scales_or_the_direction_of_time(kind, coordinates, axes, data):
+    points = coordinates.astype(np.float64)
+    hit = decide_exactly(kind, points, 1)[0] < 2.0
+    assert np.array_equal(hit, getattr(checker, kind)(points))
+    order = [0, 2, 3, 1] if kind == "vertex_face" else [3, 2, 0, 1]
+    renamed = points.reshape(-1, 2, 4, 3)[:, ::-1, order][..., axes].reshape(-1, 8, 3)
+    assert np.array_equal(decide_exactly(kind, renamed, 1)[0] < 2.0, hit)
+    scale = 2.0 ** np.array(data.draw(st.tuples(*[st.integers(-900, 900)] * 3)))
+    assert np.array_equal(decide_exactly(kind, points * scale, 1)[0] < 2.0, hit)
 
 
 @needs_data
