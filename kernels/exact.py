@@ -34,6 +34,7 @@ are zero and A_i B_i <= 0. If all are, A and B are parallel all the time, and A 
 there is no contact, is so until the first contact.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
@@ -300,74 +301,51 @@ for _limbs in BITS:
     _Integer = integer(_limbs)
 
     @wp.func
-    def decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
+    def _decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
         """As :func:`first_contact_exactly`; taking an array of a known type keeps it from being copied at each call."""
         return first_contact_exactly(kind, polygon, timed, digits)
 
 
-_ONE_LIMB, _TWO_LIMBS, _EIGHT_LIMBS = (integer(limbs) for limbs in BITS)
-_ONE_LIMB_BITS, _TWO_LIMBS_BITS, _EIGHT_LIMBS_BITS = (wp.constant(bits) for bits in BITS.values())
+@functools.cache
+def decide_in(limbs):
+    """The device function that decides queries in integers of so many limbs a coordinate, a key of BITS."""
+    number = integer(limbs)
+    most = BITS[limbs]
 
+    @wp.func
+    def decide(
+        kind: int,
+        a0: wp.vec3d,
+        b0: wp.vec3d,
+        c0: wp.vec3d,
+        d0: wp.vec3d,
+        a1: wp.vec3d,
+        b1: wp.vec3d,
+        c1: wp.vec3d,
+        d1: wp.vec3d,
+        timed: bool,
+        digits: int,
+    ) -> wp.float64:
+        """First contact of a query, as :func:`first_contact_exactly` has it, or TOO_WIDE.
 
-@wp.func
-def decide_narrow(
-    kind: int,
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    timed: bool,
-    digits: int,
-) -> wp.float64:
-    """First contact of a query in one or two limbs, or TOO_WIDE.
+        Args:
+            kind: VERTEX_FACE or EDGE_EDGE.
+            a0: The four points in order, at the start.
+            b0: Second point.
+            c0: Third point.
+            d0: Fourth point.
+            a1: The same points at the end.
+            b1: Second point.
+            c1: Third point.
+            d1: Fourth point.
+            timed: Whether the time is asked for.
+            digits: Binary digits of the time, at most 38.
+        """
+        exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+        if bits > most:
+            return TOO_WIDE
+        polygon = wp.zeros(shape=(24,), dtype=number)
+        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        return _decide(kind, polygon, timed, digits)
 
-    Args:
-        kind: VERTEX_FACE or EDGE_EDGE.
-        a0: The four points in order, at the start; finite.
-        b0: Second point.
-        c0: Third point.
-        d0: Fourth point.
-        a1: The same points at the end.
-        b1: Second point.
-        c1: Third point.
-        d1: Fourth point.
-        timed: As for :func:`first_contact_exactly`.
-        digits: As for :func:`first_contact_exactly`.
-    """
-    exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
-    if bits <= _ONE_LIMB_BITS:
-        narrow = wp.zeros(shape=(24,), dtype=_ONE_LIMB)
-        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, narrow)
-        return decide(kind, narrow, timed, digits)
-    if bits <= _TWO_LIMBS_BITS:
-        wider = wp.zeros(shape=(24,), dtype=_TWO_LIMBS)
-        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, wider)
-        return decide(kind, wider, timed, digits)
-    return TOO_WIDE
-
-
-@wp.func
-def decide_wide(
-    kind: int,
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    timed: bool,
-    digits: int,
-) -> wp.float64:
-    """As :func:`decide_narrow`, in eight limbs: every query in single precision, few in double are TOO_WIDE."""
-    exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
-    if bits > _EIGHT_LIMBS_BITS:
-        return TOO_WIDE
-    widest = wp.zeros(shape=(24,), dtype=_EIGHT_LIMBS)
-    make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, widest)
-    return decide(kind, widest, timed, digits)
+    return decide

@@ -5,15 +5,13 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_bsc.kernels.exact import TOO_WIDE, decide
-from warp_bsc.kernels.polygon import BITS, make_polygon, spread
-from warp_bsc.kernels.wide_integers import integer
+from warp_bsc.kernels.exact import decide_in
+from warp_bsc.kernels.polygon import spread
 
 
 @functools.cache
 def _kernel(limbs):
-    number = integer(limbs)
-    most = BITS[limbs]
+    decide = decide_in(limbs)
 
     @wp.kernel(enable_backward=False, module="unique")
     def decide_queries(
@@ -33,13 +31,9 @@ def _kernel(limbs):
         b1 = points[i, 5]
         c1 = points[i, 6]
         d1 = points[i, 7]
-        exponents, width = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+        _, width = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
         bits[i] = width
-        time[i] = TOO_WIDE
-        if width <= most:
-            polygon = wp.zeros(shape=(24,), dtype=number)
-            make_polygon(kind == 1, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
-            time[i] = decide(kind, polygon, timed, digits)
+        time[i] = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
 
     return decide_queries
 

@@ -19,7 +19,7 @@ from .kernels.ccd import (
 )
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from .kernels.exact import NONE, decide_narrow
+from .kernels.exact import NONE, decide_in
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from .kernels.queues import take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -42,7 +42,7 @@ __all__ = [
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """What is measured, with the bytes of a query and its answer: the status only, one thread a query; with time of impact,
 coordinates and normal; the status only, a second kernel deciding what the culls of a first one leave; and the status
-only, by wide integers alone, of as many queries that floating point leaves open."""
+only, by exact integers alone, of one limb a coordinate, of as many queries that floating point leaves open."""
 
 SEED = 0
 """Of the random numbers."""
@@ -225,6 +225,8 @@ def _kernels(kind):
             answer = result.status
         status[i] = wp.int8(answer)
 
+    decide = decide_in(1)
+
     @wp.func
     def double(x: wp.vec3) -> wp.vec3d:
         return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
@@ -233,7 +235,7 @@ def _kernels(kind):
     def find_exact_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
-        time = decide_narrow(
+        time = decide(
             number,
             double(a0),
             double(b0),

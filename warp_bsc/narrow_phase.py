@@ -77,7 +77,8 @@ class Count(enum.IntEnum):
         FOUND: Those that are not certified free.
         UNSURE: Those of them that are not certified hits either.
         OPEN: Those of the found that exact arithmetic is to decide or, where that is asked for, to time.
-        WIDE: Those of them whose exponents are too far apart for two limbs.
+        WIDE: Those of them whose exponents are too far apart for one limb.
+        WIDER: Those of them whose exponents are too far apart for two limbs.
         WIDEST: Those of them whose exponents are too far apart for the device.
         REFUTED: Those of the found that exact arithmetic has decided to be free.
     """
@@ -90,8 +91,9 @@ class Count(enum.IntEnum):
     UNSURE = 5
     OPEN = 6
     WIDE = 7
-    WIDEST = 8
-    REFUTED = 9
+    WIDER = 8
+    WIDEST = 9
+    REFUTED = 10
 
 
 _NEAR = wp.constant(int(Count.NEAR))
@@ -432,7 +434,9 @@ class NarrowPhase:
                 tolerance=tolerance,
                 queues=self._undecided,
                 counts=counts,
-                places=[int(place) for place in (Count.OPEN, Count.WIDE, Count.WIDEST, Count.REFUTED)],
+                asked=int(Count.OPEN),
+                too_wide=[int(Count.WIDE), int(Count.WIDER), int(Count.WIDEST)],
+                refuted=int(Count.REFUTED),
                 contacts=[found.pairs, *found.arrays[2:]],
                 keys=self._keys,
                 last_key=1 << sum(self._bits),
