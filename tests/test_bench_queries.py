@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
+import warp_bsc as bsc
 from warp_bsc import bench_queries, checker
-from warp_bsc.bench_queries import MODES, benchmark_queries, generate_queries
+from warp_bsc.bench_queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
 from warp_bsc.cli import main
 from warp_bsc.query_file import KINDS
 
@@ -41,6 +42,21 @@ def test_queries_depend_on_neither_device_nor_count(kind, device):
     many, few = generate_queries(kind, 1000, device=device).numpy(), generate_queries(kind, 10, device="cpu").numpy()
     assert np.array_equal(many[:10], few)
     assert len(np.unique(many.reshape(1000, -1), axis=0)) == 1000
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_touching_queries_are_for_exact_arithmetic_to_decide(kind, device):
+    query = getattr(bsc, f"query_{kind.replace('-', '_')}")
+    points = generate_touching_queries(kind, 2000, device=device).numpy()
+    answer = query(points, toi=False, device=device)
+    assert answer.hit.all()
+    assert (answer.status == 2).mean() > 0.95
+
+
+def test_a_wrong_exact_answer_is_noticed(monkeypatch, device):
+    monkeypatch.setattr(bench_queries, "generate_touching_queries", generate_queries)
+    with pytest.raises(RuntimeError, match="of 1000 touching vertex-face queries were found to be free"):
+        benchmark_queries("vertex-face", count=1000, device=device, repeat=1)
 
 
 @pytest.mark.parametrize(("mode", "kernels"), [("impact", slice(1, 2)), ("queued", slice(2, 4))])

@@ -19,7 +19,8 @@ from .kernels.ccd import (
 )
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from .kernels.polynomials import coplanarity
+from .kernels.exact import NONE, decide_in
+from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from .kernels.queues import take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
@@ -35,11 +36,13 @@ __all__ = [
     "benchmark_queries",
     "check_query_count",
     "generate_queries",
+    "generate_touching_queries",
 ]
 
-MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1}
+MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """What is measured, with the bytes of a query and its answer: the status only, one thread a query; with time of impact,
-coordinates and normal; and the status only, a second kernel deciding what the culls of a first one leave."""
+coordinates and normal; the status only, a second kernel deciding what the culls of a first one leave; and the status
+only, by exact integers alone, of one limb a coordinate, of as many queries that floating point leaves open."""
 
 SEED = 0
 """Of the random numbers."""
@@ -118,10 +121,33 @@ def _generate_queries(first: int, seed: int, miss: float, first_points: int, poi
         points[i, 4 + j] = point + motion
 
 
+@wp.func
+def _rounded(x: wp.vec3) -> wp.vec3:
+    """The nearest multiples of 2^-8."""
+    return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
+
+
+@wp.kernel(**_KERNEL)
+def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
+    """Moves the first point of each query so that it is on an edge, from point ``other`` to the next, at half time.
+
+    After rounding all numbers are small multiples of 2^-11, so that this is exact.
+    """
+    i = first + wp.tid()
+    for j in range(8):
+        points[i, j] = _rounded(points[i, j])
+    start = 3.0 * points[i, other] + points[i, other + 1]
+    end = 3.0 * points[i, other + 4] + points[i, other + 5]
+    gap = 0.5 * (points[i, 0] + points[i, 4]) - 0.125 * (start + end)
+    points[i, 0] = points[i, 0] - gap
+    points[i, 4] = points[i, 4] - gap
+
+
 @functools.cache
 def _kernels(kind):
     """The kernels for one kind of query, each in a module of its own."""
     vertex_face = kind == "vertex-face"
+    number = VERTEX_FACE if vertex_face else EDGE_EDGE
     ccd = ccd_vertex_face if vertex_face else ccd_edge_edge
     first_impact = impact_vertex_face if vertex_face else impact_edge_edge
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
@@ -199,7 +225,32 @@ def _kernels(kind):
             answer = result.status
         status[i] = wp.int8(answer)
 
-    return find_status, find_impact, cull, classify_survivors
+    decide = decide_in(1)
+
+    @wp.func
+    def double(x: wp.vec3) -> wp.vec3d:
+        return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
+
+    @wp.kernel(**_KERNEL)
+    def find_exact_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+        i = first + wp.tid()
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        time = decide(
+            number,
+            double(a0),
+            double(b0),
+            double(c0),
+            double(d0),
+            double(a1),
+            double(b1),
+            double(c1),
+            double(d1),
+            False,
+            0,
+        )
+        status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
+
+    return find_status, find_impact, cull, classify_survivors, find_exact_status
 
 
 def check_query_count(count):
@@ -227,6 +278,17 @@ def generate_queries(kind, count, *, device=None) -> wp.array:
     return points
 
 
+def generate_touching_queries(kind, count, *, device=None) -> wp.array:
+    """Queries that touch an edge, or a vertex that edge, at half time: floating point leaves nearly all open.
+
+    Arguments and result as of :func:`generate_queries`, of which they are made.
+    """
+    points = generate_queries(kind, count, device=device)
+    other = 1 if kind == "vertex-face" else 2
+    launch_over(_make_touch, count, inputs=[other], outputs=[points], device=points.device)
+    return points
+
+
 def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBenchmark:
     """Measures how long random queries take, in each mode: replays of a CUDA graph, launches on the CPU.
 
@@ -243,14 +305,15 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
 
     Raises:
         ValueError: If there are too few or too many queries.
-        RuntimeError: If two modes find different answers.
+        RuntimeError: If two modes find different answers, or exact arithmetic none where features touch.
     """
     device = wp.get_device(device)
     if count is None:
         count = 2**24 if device.is_cuda else 2**18
     check_query_count(count)
-    find_status, find_impact, cull, classify_survivors = _kernels(kind)
+    find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
+    touching = generate_touching_queries(kind, count, device=device)
     # of no value that an answer has
     status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
     toi = wp.empty(count, dtype=wp.float64, device=device)
@@ -272,10 +335,17 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
         inputs = [points, TOLERANCE, survivors, counts]
         launch_over_queue(classify_survivors, survivors, counts, 0, inputs=inputs, outputs=[status["queued"]])
 
-    runs = {"status": run_status, "impact": run_impact, "queued": run_queued}
+    def run_exact():
+        outputs = [status["exact"]]
+        launch_over(find_exact_status, count, inputs=[touching], outputs=outputs, device=device, block_dim=64)
+
+    runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
     milliseconds = {mode: _median_milliseconds(runs[mode], device, repeat) for mode in MODES}
     answers = {mode: array.numpy() for mode, array in status.items()}
-    for mode in MODES:
+    missed = int((answers["exact"] != HIT).sum())
+    if missed:
+        raise RuntimeError(f"{missed} of {count} touching {kind} queries were found to be free")
+    for mode in runs.keys() - {"exact"}:
         different = int((answers[mode] != answers["status"]).sum())
         if different:
             raise RuntimeError(f"{different} of {count} {kind} queries were answered differently by mode {mode}")

@@ -67,6 +67,9 @@ class StageCounts:
         free: Candidates certified free, by the culls or later.
         hits: Candidates certified to collide.
         unsure: Candidates that floating point could not certify either way.
+        exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
+        host: Candidates whose exponents are too far apart for that. The host decides them, but not in a CUDA graph,
+            where they stay unsure.
     """
 
     candidates: int
@@ -74,6 +77,8 @@ class StageCounts:
     free: int
     hits: int
     unsure: int
+    exact: int
+    host: int
 
 
 @dataclass(frozen=True)
@@ -138,8 +143,9 @@ class Collisions:
         earliest_toi: The earliest time of impact, 2.0 if there is none.
         overflowed: Whether a queue was too small, so that collisions are missing. Only a detection in a CUDA graph can
             overflow: detect once outside a graph, which makes the queues larger, and capture again.
-        certified: Whether no collision of the motion can be missing. False for method "float", and if a queue
-            overflowed or a position was not finite in a CUDA graph.
+        certified: Whether no collision of the motion can be missing, and for method "exact" none is that is none. False
+            for method "float", and if a queue overflowed, a position was not finite, or a pair was left to the host in
+            a CUDA graph.
         stats: Counts and times of every stage.
     """
 
@@ -199,7 +205,7 @@ class CollisionDetector:
         Args:
             mesh: The :class:`CollisionMesh`.
             method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it
-                computes, "conservative" counts them as hits, "exact" decides them exactly, outside CUDA graphs.
+                computes, "conservative" counts them as hits, "exact" decides them exactly.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
 
         Raises:
@@ -271,8 +277,8 @@ class CollisionDetector:
             self._grow(counts)
         collisions = Collisions(self, clock)
         self._last = weakref.ref(collisions)
-        if self.method == "exact":
-            collisions._keep(x0, x1)  # now, while the positions are what they were
+        if counts[[_VERTEX_FACE + Count.WIDEST, _EDGE_EDGE + Count.WIDEST]].any():
+            collisions._keep(x0, x1)  # what is left to the host, now, while the positions are what they were
         return collisions
 
     def find_intersections(self, x):
@@ -436,7 +442,7 @@ class CollisionDetector:
 
         Args:
             clock: None in a CUDA graph.
-            positions: If given, contacts that floating point leaves open are decided exactly.
+            positions: If given, contacts that the device leaves open are decided.
         """
         counts = self.counts.numpy()
         overflowed = self._overflowed(counts)
@@ -444,7 +450,9 @@ class CollisionDetector:
             "overflowed": overflowed,
             "certified": self.method != "float" and not overflowed and not counts[_NOT_FINITE],
         }
-        milliseconds = {**clock.read(), "exact": 0.0} if clock else {}
+        milliseconds = clock.read() if clock else {}
+        if clock:
+            milliseconds["exact"] = milliseconds.pop("exact", 0.0)
         stage_counts = {}
         earliest = 2.0
         for narrow_phase, place, elements in (
@@ -453,9 +461,11 @@ class CollisionDetector:
         ):
             kind = narrow_phase.kind
             kind_counts = counts[place : place + len(Count)]
-            contacts = narrow_phase.contacts.read(kind_counts[Count.FOUND])
+            contacts = narrow_phase.contacts.read(kind_counts[Count.FOUND] - kind_counts[Count.REFUTED])
+            left = int(kind_counts[Count.WIDEST])
+            results["certified"] &= bool(positions) or not left
             if positions:
-                ask = (contacts["status"] == UNSURE) | ~contacts["localized"]
+                ask = (contacts["answers"] == UNSURE) | ~contacts["localized"]
                 start = time.perf_counter()
                 decide_exactly(kind, *positions, elements, contacts, ask)
                 milliseconds["exact"] += 1000.0 * (time.perf_counter() - start)
@@ -471,6 +481,8 @@ class CollisionDetector:
                 free=int(kind_counts[Count.CANDIDATES] - kind_counts[Count.FOUND]),
                 hits=int(kind_counts[Count.FOUND]) - unsure,
                 unsure=unsure,
+                exact=int(kind_counts[Count.OPEN]) - left if self.method == "exact" else 0,
+                host=left,
             )
         results["earliest_toi"] = earliest
         results["stats"] = DetectionStats(**stage_counts, milliseconds=milliseconds)

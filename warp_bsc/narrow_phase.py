@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from . import checker
+from .exact_stage import launch_exact_stage
 from .kernels.ccd import edge_edge_motion, vertex_face_motion
 from .kernels.classification import classify
 from .kernels.closest import contact_at
@@ -75,6 +76,11 @@ class Count(enum.IntEnum):
         CONTACTS: Those that classification leaves.
         FOUND: Those that are not certified free.
         UNSURE: Those of them that are not certified hits either.
+        OPEN: Those of the found that exact arithmetic is to decide or, where that is asked for, to time.
+        WIDE: Those of them whose exponents are too far apart for one limb.
+        WIDER: Those of them whose exponents are too far apart for two limbs.
+        WIDEST: Those of them whose exponents are too far apart for the device.
+        REFUTED: Those of the found that exact arithmetic has decided to be free.
     """
 
     CANDIDATES = 0
@@ -83,6 +89,11 @@ class Count(enum.IntEnum):
     CONTACTS = 3
     FOUND = 4
     UNSURE = 5
+    OPEN = 6
+    WIDE = 7
+    WIDER = 8
+    WIDEST = 9
+    REFUTED = 10
 
 
 _NEAR = wp.constant(int(Count.NEAR))
@@ -90,6 +101,7 @@ _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
+_OPEN = wp.constant(int(Count.OPEN))
 
 
 @functools.cache
@@ -178,6 +190,7 @@ def _kernels(kind, dtype):
         contacts: wp.array[wp.vec2i],
         counts: wp.array[wp.int64],
         status: wp.array[wp.int8],
+        answers: wp.array[wp.int8],
         localized: wp.array[wp.bool],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
@@ -186,6 +199,7 @@ def _kernels(kind, dtype):
         order: wp.array[int],
         first_bits: int,
         second_bits: int,
+        undecided: wp.array[int],
     ):
         i = first + wp.tid()
         if i >= contacts.shape[0]:
@@ -208,11 +222,14 @@ def _kernels(kind, dtype):
             toi[i] = result.toi
             coordinates[i] = result.coordinates
             normal[i] = result.normal
+        answers[i] = wp.int8(answer)
         if answer != FREE:
             keys[i] = (wp.int64(pair[0]) << wp.int64(second_bits)) | wp.int64(pair[1])
             take_slot(counts, _FOUND)
             if answer == UNSURE:
                 take_slot(counts, _UNSURE)
+            if answer == UNSURE or (timed and not localized[i]):
+                undecided[wp.int32(take_slot(counts, _OPEN))] = i
 
     @wp.kernel(**_KERNEL)
     def find_contact_points(
@@ -242,12 +259,14 @@ def _sort_contacts(
     counts: wp.array[wp.int64],
     order: wp.array[int],
     status: wp.array[wp.int8],
+    answers: wp.array[wp.int8],
     localized: wp.array[wp.bool],
     toi: wp.array[wp.float64],
     coordinates: wp.array[wp.vec3d],
     normal: wp.array[wp.vec3d],
     sorted_pairs: wp.array[wp.vec2i],
     sorted_status: wp.array[wp.int8],
+    sorted_answers: wp.array[wp.int8],
     sorted_localized: wp.array[wp.bool],
     sorted_toi: wp.array[wp.float64],
     sorted_coordinates: wp.array[wp.vec3d],
@@ -259,6 +278,7 @@ def _sort_contacts(
     source = order[i]
     sorted_pairs[i] = contacts[source]
     sorted_status[i] = status[source]
+    sorted_answers[i] = answers[source]
     sorted_localized[i] = localized[source]
     sorted_toi[i] = toi[source]
     sorted_coordinates[i] = coordinates[source]
@@ -271,6 +291,8 @@ class Contacts:
     Attributes:
         pairs: (vertex, face) or (edge, edge), array of vec2i.
         status: What floating point could certify, HIT or UNSURE, array of int8.
+        answers: The same after exact arithmetic, if the method asks for that: FREE, HIT, or UNSURE for what it leaves
+            to the host, array of int8.
         localized: Whether the time is within the tolerance, array of bool.
         toi: Time of impact as a share of the step, array of float64.
         coordinates: Contact coordinates, array of vec3d.
@@ -280,6 +302,7 @@ class Contacts:
     def __init__(self, capacity, device):
         self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
         self.status = wp.empty(capacity, dtype=wp.int8, device=device)
+        self.answers = wp.empty(capacity, dtype=wp.int8, device=device)
         self.localized = wp.zeros(capacity, dtype=wp.bool, device=device)
         self.toi = wp.empty(capacity, dtype=wp.float64, device=device)
         self.coordinates = wp.empty(capacity, dtype=wp.vec3d, device=device)
@@ -288,13 +311,13 @@ class Contacts:
     @property
     def arrays(self):
         """All arrays, in the order of the attributes."""
-        return [self.pairs, self.status, self.localized, self.toi, self.coordinates, self.normal]
+        return [self.pairs, self.status, self.answers, self.localized, self.toi, self.coordinates, self.normal]
 
     def read(self, count):
-        """The first ``count`` contacts as NumPy arrays by name, all of them hits until shown otherwise."""
-        names = ["pairs", "status", "localized", "toi", "coordinates", "normal"]
+        """The first ``count`` contacts as NumPy arrays by name; ``hit`` is all of them not shown to be free."""
+        names = ["pairs", "status", "answers", "localized", "toi", "coordinates", "normal"]
         contacts = {name: array[: int(count)].numpy().copy() for name, array in zip(names, self.arrays, strict=True)}
-        contacts["hit"] = np.ones(int(count), dtype=bool)
+        contacts["hit"] = contacts["answers"] != FREE
         return contacts
 
 
@@ -305,7 +328,7 @@ class NarrowPhase:
         near: Queue of the pairs to decide, to be filled by whoever finds them, array of vec2i.
         counts: Counts by :class:`Count`, array of int64.
         unsorted: The contacts, as many as ``counts[Count.CONTACTS]`` says, of which some have turned out to be free.
-        contacts: The contacts, sorted, as many as ``counts[Count.FOUND]`` says.
+        contacts: The contacts, sorted, as many as ``counts[Count.FOUND] - counts[Count.REFUTED]`` says.
     """
 
     def __init__(self, kind, counts, capacity, elements):
@@ -333,6 +356,7 @@ class NarrowPhase:
         self.contacts = Contacts(capacity, device)
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * capacity, dtype=int, device=device)
+        self._undecided = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
 
     @property
     def queues(self):
@@ -344,6 +368,7 @@ class NarrowPhase:
             *self.contacts.arrays,
             self._keys,
             self._order,
+            *self._undecided,
         ]
 
     @property
@@ -374,7 +399,7 @@ class NarrowPhase:
             x1: Positions at its end, of the same type.
             elements: Vertex indices of the faces (vertex_face) or edges (edge_edge), Warp array of int,
                 two-dimensional.
-            method: One of :data:`METHODS`; "exact" is left to :func:`decide_exactly`.
+            method: One of :data:`METHODS`; what is too wide for the device is left to :func:`decide_exactly`.
             timed: Whether to find times of impact, coordinates and normals.
             tolerance: Of the times of impact, as a share of the step.
             lap: Called with the name of each stage at its end.
@@ -394,11 +419,29 @@ class NarrowPhase:
         lap("classify")
 
         inputs = [*motion, timed, tolerance, found.pairs, counts]
-        outputs = [*found.arrays[1:], self._keys, self._order, *self._bits]
+        outputs = [*found.arrays[1:], self._keys, self._order, *self._bits, self._undecided[0]]
         launch_over_queue(
             find_impacts, found.pairs, counts, Count.CONTACTS, inputs=inputs, outputs=outputs, block_dim=32
         )
         lap("time of impact")
+        if method == "exact":
+            launch_exact_stage(
+                self.kind,
+                x0,
+                x1,
+                elements,
+                timed=timed,
+                tolerance=tolerance,
+                queues=self._undecided,
+                counts=counts,
+                asked=int(Count.OPEN),
+                too_wide=[int(Count.WIDE), int(Count.WIDER), int(Count.WIDEST)],
+                refuted=int(Count.REFUTED),
+                contacts=[found.pairs, *found.arrays[2:]],
+                keys=self._keys,
+                last_key=1 << sum(self._bits),
+            )
+            lap("exact")
 
     def sort(self):
         """Launches the sorting of the contacts, without asking the device anything."""

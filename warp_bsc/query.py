@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import checked_coordinates
-from .kernels.signs import HIT, UNSURE
+from .kernels.signs import FREE, HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
@@ -101,17 +101,21 @@ def _query(kind, points, method, timed, tolerance, device):
     def solve(method):
         while True:
             counts.assign([n if count == Count.NEAR else 0 for count in Count])
-            narrow_phase.run(x0, x1, elements, method=method, timed=timed, tolerance=tolerance)
-            narrow_phase.sort()
+            # exactly also the times of certified hits that floating point could not place
+            stages = "exact" if method == "conservative" and timed else method
+            narrow_phase.run(x0, x1, elements, method=stages, timed=timed, tolerance=tolerance)
             if not narrow_phase.overflowed(counts.numpy()):
                 break
             narrow_phase.grow(counts.numpy())
-        contacts = narrow_phase.contacts.read(counts.numpy()[Count.FOUND])
+        contacts = narrow_phase.unsorted.read(counts.numpy()[Count.CONTACTS])
+        found = contacts["status"] != FREE
+        contacts = {name: values[found] for name, values in contacts.items()}
+        if method == "conservative":
+            contacts["hit"][:] = True
         if method != "float":
-            # the times of certified hits that floating point could not place are found exactly as well
-            ask = (contacts["status"] == HIT) & ~contacts["localized"] & timed
+            ask = contacts["hit"] & ~contacts["localized"] & timed & (contacts["status"] == HIT)
             if method == "exact":
-                ask |= contacts["status"] == UNSURE
+                ask |= contacts["answers"] == UNSURE
             decide_exactly(kind, x0, x1, elements, contacts, ask, timed=timed)
         rows = contacts["pairs"][:, 1] if kind == "vertex_face" else contacts["pairs"][:, 0] // 2
         return contacts, rows
