@@ -1,0 +1,161 @@
+"""Every collision of a replay as JSON and as CSV, for programs."""
+
+import csv
+import io
+import json
+from dataclasses import asdict
+
+from .contacts import EDGE, KINDS
+from .outcome import Outcome
+from .output_file import StreamedFile
+
+__all__ = ["HitsCsv", "HitsJson"]
+
+
+class HitsJson(StreamedFile):
+    """A JSON file: facts of the scene, each interval with its contacts, then the sums."""
+
+    def __init__(self, path, *, scene, method: str, device: str):
+        """Opens the file.
+
+        Args:
+            path: Its place.
+            scene: The scene.
+            method: The method that is used.
+            device: The device that is used.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        super().__init__(path)
+        self._facts = {
+            "scene": scene.path,
+            "method": method,
+            "device": device,
+            "time_codes_per_second": scene.time_codes_per_second,
+            "meters_per_unit": scene.meters_per_unit,
+            "up_axis": scene.up_axis,
+            "vertices": scene.vertex_count,
+            "faces": scene.face_count,
+            "meshes": scene.names,
+        }
+        self._separator = ""
+
+    def head(self) -> str:
+        """The file up to the first interval."""
+        return json.dumps(self._facts)[:-1] + ', "intervals": ['
+
+    def record(self, interval, contacts) -> str:
+        """An interval with all of its contacts."""
+        separator, self._separator = self._separator, ","
+        fields = {
+            "index": interval.index,
+            "start": interval.start,
+            "end": interval.end,
+            "pairs_tested": interval.pairs_tested,
+            "hits": interval.hits,
+            "vertex_face_hits": interval.vertex_face_hits,
+            "edge_edge_hits": interval.edge_edge_hits,
+            "earliest": asdict(interval.earliest) if interval.earliest else None,
+            "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
+            "certified": interval.certified,
+            "stages": asdict(interval.stats),
+            "validation": asdict(interval.validation) if interval.validation else None,
+            "contacts": [
+                {
+                    "kind": KINDS[contacts.kind[row]],
+                    "meshes": names,
+                    "prims": prims,
+                    "elements": elements,
+                    "indices": indices,
+                    "time": time,
+                    "toi": toi,
+                    "position": position,
+                    "normal": normal,
+                }
+                for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
+            ],
+        }
+        return separator + "\n" + json.dumps(fields, allow_nan=False)
+
+    def tail(self, outcome: Outcome) -> str:
+        """The file from the last interval on."""
+        sums = {
+            "complete": outcome.is_complete,
+            "stopped": outcome.stopped,
+            "motion": outcome.motion,
+            "warnings": outcome.scene.warnings,
+            "hits": outcome.hits,
+            "certified": outcome.certified,
+            "mesh_pairs": _mesh_pairs_to_list(outcome.mesh_pairs),
+            "validation": outcome.validation,
+        }
+        return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
+
+
+class HitsCsv(StreamedFile):
+    """A CSV file: a row for each contact, and a last line that begins with # if some are missing."""
+
+    _COLUMNS = (
+        "interval", "start", "end", "kind",
+        "first_mesh", "first_prim", "first_element", "first_index", "first_index_2",
+        "second_mesh", "second_prim", "second_element", "second_index", "second_index_2",
+        "time", "toi", "x", "y", "z", "normal_x", "normal_y", "normal_z",
+    )  # fmt: skip
+
+    def head(self) -> str:
+        """The names of the columns."""
+        return _to_csv([self._COLUMNS])
+
+    def record(self, interval, contacts) -> str:
+        """The rows of an interval."""
+        return _to_csv(
+            [
+                interval.index, interval.start, interval.end, KINDS[contacts.kind[row]],
+                names[0], prims[0], elements[0], *_pad(indices[0]),
+                names[1], prims[1], elements[1], *_pad(indices[1]),
+                time, toi, *position, *normal,
+            ]
+            for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
+        )  # fmt: skip
+
+    def tail(self, outcome: Outcome) -> str:
+        """What is missing."""
+        if outcome.is_complete:
+            return ""
+        return f"# partial: {len(outcome.intervals)} of {outcome.interval_count} intervals; {outcome.stopped}\n"
+
+
+def _rows(contacts):
+    """Each contact's number, names of meshes, prims, elements, their indices, time, toi, position and normal."""
+    meshes = contacts.segment.meshes
+    columns = (contacts.meshes, contacts.indices, contacts.elements, contacts.time, contacts.toi)
+    columns += (contacts.position, contacts.normal)
+    for row, (pair, indices, elements, time, toi, position, normal) in enumerate(
+        zip(*(column.tolist() for column in columns), strict=True)
+    ):
+        yield (
+            row,
+            [meshes[mesh].name for mesh in pair],
+            [meshes[mesh].path for mesh in pair],
+            list(contacts.element_names(row)),
+            [both if element == EDGE else both[:1] for both, element in zip(indices, elements, strict=True)],
+            time,
+            toi,
+            position,
+            normal,
+        )
+
+
+def _pad(indices):
+    return (*indices, "") if len(indices) == 1 else indices
+
+
+def _to_csv(rows) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:
+    return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]
