@@ -152,6 +152,8 @@ def run_replay(scene: Scene, arguments, device) -> int:
                 output.finish(outcome)
             except OSError as failure:
                 error = error or OSError(f"{output.path}: not written: {failure}")
+        if error:
+            raise error
         if printed:
             with open(printed, encoding="utf-8") as file:
                 shutil.copyfileobj(file, sys.stdout)
@@ -159,10 +161,7 @@ def run_replay(scene: Scene, arguments, device) -> int:
             console = Console()
             print_replay(console, outcome)
             for output in outputs:
-                if output.path.exists():
-                    say(console, f"Wrote {output.path}.")
-    if error:
-        raise error
+                say(console, f"Wrote {output.path}.")
     if stopped:
         print("warp-bsc: interrupted", file=sys.stderr)
         return _INTERRUPTED

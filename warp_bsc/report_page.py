@@ -22,7 +22,7 @@ __all__ = ["ReportPage"]
 
 _MOST_FACES = 150_000  # in the view in 3D
 _MOST_CONTACTS = 20_000
-_LONGEST = 12  # rows of a table
+_LONGEST = 10  # rows of a table
 _MOST_LINES = 200  # of disagreements
 
 
@@ -113,10 +113,7 @@ def _data(outcome: Outcome, worst) -> dict:
                 "end": interval.end,
                 "hits": interval.hits,
                 "time": interval.earliest.time,
-                "what": " with ".join(
-                    f"{mesh}, {element}"
-                    for mesh, element in zip(interval.earliest.meshes, interval.earliest.elements, strict=True)
-                ),
+                "what": _describe(interval.earliest),
             }
             for interval in outcome.worst[:_LONGEST]
         ],
@@ -199,6 +196,11 @@ def _view(interval, contacts, scene) -> dict:
         "kinds": _packed(contacts.kind[rows], np.uint32),
         "toi": _packed(contacts.toi[rows], np.float32),
     }
+
+
+def _describe(contact):
+    (first, second), (first_element, second_element) = contact.meshes, contact.elements
+    return f"{first}, {first_element}, with {'its' if first == second else second + ','} {second_element}"
 
 
 def _title(outcome):

@@ -200,7 +200,9 @@ class Scene:
                     what = "appears" if old is None else "vanishes" if new is None else "changes its topology"
                     times_of.setdefault(what, []).append(time)
             for what, times in times_of.items():
-                first = f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
+                first = (
+                    f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
+                )
                 self._warnings.append(f"{mesh.name} {what} {first}: its motion is split there, jumps are not checked")
 
 

@@ -59,7 +59,9 @@ class Instance:
         """
         transforms = self._instancer.read_transforms(time)
         if self._index >= len(transforms):
-            raise ValueError(f"{self._where}: no valid transform for instance {self._index} at time {time.GetValue():g}")
+            raise ValueError(
+                f"{self._where}: no valid transform for instance {self._index} at time {time.GetValue():g}"
+            )
         cache = UsdGeom.XformCache(time)
         local, _ = cache.ComputeRelativeTransform(prim, self.root)
         instancer = self._instancer.prim
@@ -125,7 +127,9 @@ def find_instances(prim, parent: Instance | None, file) -> list[Instance]:
         raise ValueError(f"{where}: the point instancer contains itself")
     instancer = _Instancer(prim, parent.root if parent else None)
     stage = prim.GetStage()
-    roots = [stage.GetPrimAtPath(path) for path in UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets()]
+    roots = [
+        stage.GetPrimAtPath(path) for path in UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets()
+    ]
     numbers = UsdGeom.PointInstancer(prim).GetProtoIndicesAttr()
     times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, numbers.GetTimeSamples())]
     pairs = {pair for time in times for pair in enumerate(numbers.Get(time) or ())}

@@ -104,6 +104,7 @@ class UsdMesh:
         self._instance = instance
         self._skin = skin
         self._root = instance.root if instance else None
+        self._is_held = prim.GetStage().GetInterpolationType() == Usd.InterpolationTypeHeld
         self.purpose = str(self._mesh.ComputePurpose())
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
@@ -135,7 +136,9 @@ class UsdMesh:
             ValueError: If there are none.
         """
         code = as_time_code(time, before=before)
-        points = self._mesh.GetPointsAttr().Get(code)
+        # Elsewhere another number of points is an error, which the moment before would hide.
+        jumps = self._is_held or time in self.states
+        points = self._mesh.GetPointsAttr().Get(code if jumps else Usd.TimeCode(time))
         if not points:
             raise ValueError(f"{self._where}: the mesh has no points at time {time:g}")
         if self._skin:
@@ -248,7 +251,9 @@ class UsdMesh:
         if self._instance and not self._instance.is_present(time):
             return False
         # As where a fluid has not begun to flow.
-        values = [attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())]
+        values = [
+            attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())
+        ]
         return not all(value is not None and len(value) == 0 for value in values)
 
     def _topology_digest(self, time) -> bytes:

@@ -146,14 +146,14 @@ function showWorst(shown) {
   for (const values of [start, end])
     moving.push(values.filter((_, i) => shown.meshes[meshes[Math.floor(i / 3)]].moves));
   const whole = boxOf(moving), near = boxOf([contacts]);
-  near.radius = Math.max(near.radius * 1.6, whole.radius * 0.06);
+  near.radius = Math.max(near.radius * 1.6, whole.radius * 0.12);
   const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
   const state = { time: 0, playing: false, last: 0, asked: false };
   const FIELD = 0.62;
 
   function frame(box) {
     camera.center = turn(box.center);
-    camera.distance = (box.radius / Math.sin(FIELD / 2)) * Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
+    camera.distance = ((0.8 * box.radius) / Math.sin(FIELD / 2)) * Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
     ask();
   }
 
@@ -201,7 +201,7 @@ function showWorst(shown) {
       gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
     }
     set(points);
-    gl.uniform1f(gl.getUniformLocation(points, "size"), 13 * scale);
+    gl.uniform1f(gl.getUniformLocation(points, "size"), 15 * scale);
     gl.bindVertexArray(dots);
     gl.depthMask(false);
     // Contacts behind a surface shine through it faintly.
