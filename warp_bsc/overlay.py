@@ -64,7 +64,7 @@ class Overlay:
             raise ValueError(f"{path}: the scene is read from this file, the overlay must be another")
         self._scene = scene
         self._output = OutputFile(path)
-        self._spool = tempfile.TemporaryFile(buffering=0)
+        self._spool = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 (closed when discarded)
         self._samples = {}  # by prim and attribute: time, place in the spool and length of each
         self._times = []  # starts of the intervals that are whole
         self._colored = {}  # by the prim's path: the last sample of its colours
@@ -130,13 +130,6 @@ class Overlay:
         """Leave nothing behind, unless the file is finished."""
         self._spool.close()
         self._output.discard()
-
-    @property
-    def notes(self) -> list[str]:
-        """Sentences on what the overlay cannot show."""
-        if self._uncolored:
-            return ["the overlay colours no polygons of point instancers: their instances are one prim"]
-        return []
 
     def _sample(self, prim, name, time, value, polygons=0):
         """Let a sample of an attribute wait in the spool, with the number of a mesh's polygons if some are lit."""
@@ -209,11 +202,13 @@ class Overlay:
         start, end = scene.times[0], scene.times[-1]
         if stage.HasAuthoredTimeCodeRange():
             start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        doc = f"Collisions found by warp-bsc replay. {outcome.motion}"
+        if self._uncolored:
+            doc += " Polygons of point instancers are not coloured: their instances are one prim."
         source = Path(os.path.relpath(Path(scene.path).resolve(), self.path.parent.resolve())).as_posix()
         asset = source if source.startswith("../") else f"./{source}"
         complete = "true" if outcome.is_complete else "false"
         stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
-        interpolation = stage.GetInterpolationType().displayName.lower()
         return f"""#usda 1.0
 (
     customLayerData = {{
@@ -224,7 +219,7 @@ class Overlay:
         }}
     }}
     defaultPrim = {_quote(default)}
-    doc = {_quote("Collisions found by warp-bsc replay. " + outcome.motion)}
+    doc = {_quote(doc)}
     endTimeCode = {end!r}
     framesPerSecond = {stage.GetFramesPerSecond()!r}
     metersPerUnit = {UsdGeom.GetStageMetersPerUnit(stage)!r}

@@ -112,7 +112,7 @@ class Scene:
             ValueError: If the file is not USD, refers to something that cannot be opened, has no mesh or none that
                 moves, or a selection selects nothing. The message names the file, the prim and the time.
         """
-        from pxr import Usd, UsdGeom  # noqa: PLC0415 (slow)
+        from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
         from . import usd_meshes, usd_stage  # noqa: PLC0415 (import pxr)
 
@@ -145,11 +145,6 @@ class Scene:
                 for start, end in pairwise(self.times)
                 for part in range(subdivide)
             ] + self.times[-1:]
-        if self.stage.GetInterpolationType() == Usd.InterpolationTypeHeld:
-            self._warnings.append(
-                "interpolation is held: meshes rest between their samples and jump there; what they jump through "
-                "is not checked"
-            )
         self._note_changes()
         inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
         self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
@@ -160,9 +155,15 @@ class Scene:
 
     @property
     def warnings(self) -> list[str]:
-        """What is passed over or changed, a sentence each."""
-        welded = [f"vertices in one place at all times were welded: {self._welded}"] if self._welded else []
-        return self._warnings + welded
+        """What is passed over or changed, a sentence each; of what jumps, what has been read so far."""
+        warnings = list(self._warnings)
+        for mesh in self._usd_meshes:
+            if mesh.jump_times:
+                at = _times_in_words(sorted(mesh.jump_times))
+                warnings.append(f"{mesh.name} holds its place and jumps {at}: what it jumps through is not checked")
+        if self._welded:
+            warnings.append(f"vertices in one place at all times were welded: {self._welded}")
+        return warnings
 
     def interval(self, index: int) -> tuple[Segment, np.ndarray, np.ndarray]:
         """The motion from one time to the next.
@@ -200,10 +201,12 @@ class Scene:
                     what = "appears" if old is None else "vanishes" if new is None else "changes its topology"
                     times_of.setdefault(what, []).append(time)
             for what, times in times_of.items():
-                first = (
-                    f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
-                )
-                self._warnings.append(f"{mesh.name} {what} {first}: its motion is split there, jumps are not checked")
+                at = _times_in_words(times)
+                self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
+
+
+def _times_in_words(times) -> str:
+    return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
 
 
 def _state_at(mesh, time):

@@ -65,10 +65,7 @@ class Instance:
         cache = UsdGeom.XformCache(time)
         local, _ = cache.ComputeRelativeTransform(prim, self.root)
         instancer = self._instancer.prim
-        if self._parent:
-            above = self._parent.transform(instancer, time)
-        else:
-            above = cache.GetLocalToWorldTransform(instancer)
+        above = self._parent.transform(instancer, time) if self._parent else cache.GetLocalToWorldTransform(instancer)
         return local * transforms[self._index] * above
 
     def contains(self, prim) -> bool:

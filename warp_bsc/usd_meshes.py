@@ -92,6 +92,7 @@ class UsdMesh:
         states: What it is at first, at minus infinity, and from each time on at which that changes: None where it is
             invisible, not there or empty, else bytes that are others for another topology.
         turns: Whether a transform or a skeleton moves it, which is not linear between the samples.
+        jump_times: Time codes at which its transform was found to be held, and to jump there.
         is_placed: Whether its points are in world space as they are: its transform is the identity at all times.
     """
 
@@ -104,7 +105,6 @@ class UsdMesh:
         self._instance = instance
         self._skin = skin
         self._root = instance.root if instance else None
-        self._is_held = prim.GetStage().GetInterpolationType() == Usd.InterpolationTypeHeld
         self.purpose = str(self._mesh.ComputePurpose())
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
@@ -115,6 +115,7 @@ class UsdMesh:
         )
         self.states = self._find_states(breaks | (instance.break_times if instance else set()))
         self.times = sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set())
+        self.jump_times = set()
         self.turns = bool(skin and skin.times)
         first = self._transform(Usd.TimeCode.EarliestTime())
         self.is_placed = np.array_equal(first, np.eye(4))
@@ -137,8 +138,7 @@ class UsdMesh:
         """
         code = as_time_code(time, before=before)
         # Elsewhere another number of points is an error, which the moment before would hide.
-        jumps = self._is_held or time in self.states
-        points = self._mesh.GetPointsAttr().Get(code if jumps else Usd.TimeCode(time))
+        points = self._mesh.GetPointsAttr().Get(code if time in self.states else Usd.TimeCode(time))
         if not points:
             raise ValueError(f"{self._where}: the mesh has no points at time {time:g}")
         if self._skin:
@@ -169,6 +169,9 @@ class UsdMesh:
         positions = points[used].astype(dtype)
         if not self.is_placed:
             transform = self._transform(as_time_code(time, before=before))
+            if before and time not in self.states:
+                if not np.array_equal(transform, self._transform(Usd.TimeCode(time))):
+                    self.jump_times.add(time)
             with np.errstate(over="ignore", invalid="ignore"):  # raised below
                 positions = positions @ transform[:3, :3] + transform[3, :3]
         finite = np.isfinite(positions).all(axis=1)

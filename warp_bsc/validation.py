@@ -116,8 +116,8 @@ def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray
 def overlapping_boxes(first, second) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Find all pairs of boxes that overlap or touch, some at a time.
 
-    Boxes are sorted by size. Those of two sizes are put into a grid whose cells are as large as the larger ones, each by
-    its lowest corner: what overlaps is then in the same cell or in neighbours.
+    Boxes are sorted by size. Those of two sizes are put into a grid whose cells are as large as the larger ones, each
+    by its lowest corner: what overlaps is then in the same cell or in neighbours.
 
     Args:
         first: Lowest and highest corners of the boxes, two arrays of shape [n, 3].
