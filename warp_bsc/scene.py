@@ -67,15 +67,19 @@ class FrameRange:
         """
         start = samples[0] if self.start is None else self.start
         end = samples[-1] if self.end is None else self.end
+        low, high = max(start, samples[0]), min(end, samples[-1])
         if self.step is None:
-            times = {start, end, *(time for time in samples if start < time < end)}
+            times = {low, high, *samples}
         else:
-            steps = int(np.floor((end - start) / self.step + 1e-9)) if end > start else 0
-            times = {*(start + number * self.step for number in range(steps + 1))}
-            times |= {time for time in changes if start < time < end}
-        if start >= end or len(times) < 2:
-            raise ValueError(f"--frames: there are no two times from {start:g} to {end:g}")
-        return sorted(times)
+            first, last = math.ceil((low - start) / self.step), math.floor((high - start) / self.step + 1e-9)
+            times = {*(min(start + number * self.step, high) for number in range(first, last + 1)), *changes}
+        times = sorted(time for time in times if low <= time <= high)
+        if len(times) < 2:
+            raise ValueError(
+                f"--frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
+                f"{samples[-1]:g}"
+            )
+        return times
 
 
 class Scene:

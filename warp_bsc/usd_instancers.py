@@ -1,6 +1,6 @@
 """The instances of point instancers. Imports pxr: to be imported where it is used."""
 
-from pxr import Usd, UsdGeom
+from pxr import Gf, Usd, UsdGeom
 
 from .usd_stage import sample_times
 
@@ -20,12 +20,11 @@ class Instance:
         break_times: Time codes at which it may appear or vanish.
     """
 
-    def __init__(self, instancer, index, prototype, root, parent, file):
+    def __init__(self, instancer, index, prototype, root, parent):
         self._instancer = instancer  # an _Instancer
         self._index = index
         self._prototype = prototype
         self._parent = parent
-        self._where = f"{file}: {instancer.prim.GetPath()}"
         path = instancer.prim.GetPath()
         self.name = f"{parent.name_of(path) if parent else path}[{index}]"
         self.root = root
@@ -54,19 +53,18 @@ class Instance:
     def transform(self, prim, time: Usd.TimeCode):
         """The matrix that takes points of a prim of the prototype to world space, a ``Gf.Matrix4d``.
 
-        Raises:
-            ValueError: If the instancer's arrays do not fit each other.
+        None where the instance is not there, or the instancer's arrays do not fit each other.
         """
-        transforms = self._instancer.read_transforms(time)
-        if self._index >= len(transforms):
-            raise ValueError(
-                f"{self._where}: no valid transform for instance {self._index} at time {time.GetValue():g}"
-            )
+        placed = self._instancer.read_transform(self._index, time)
         cache = UsdGeom.XformCache(time)
-        local, _ = cache.ComputeRelativeTransform(prim, self.root)
         instancer = self._instancer.prim
         above = self._parent.transform(instancer, time) if self._parent else cache.GetLocalToWorldTransform(instancer)
-        return local * transforms[self._index] * above
+        if placed is None or above is None:
+            return None
+        local, _ = cache.ComputeRelativeTransform(prim, self.root)
+        if root := UsdGeom.Xformable(self.root):
+            local *= root.GetLocalTransformation(time)
+        return local * placed * above
 
     def contains(self, prim) -> bool:
         """Whether the instance is of, or inside one of, an instancer: such may not contain itself."""
@@ -91,15 +89,25 @@ class _Instancer:
             self._instancer.GetProtoIndicesAttr(), self._instancer.GetInvisibleIdsAttr(), self._instancer.GetIdsAttr()
         )
 
-    def read_transforms(self, time) -> list:
+    def read_transform(self, index, time):
+        """The matrix of an instance, None if it has none.
+
+        ``PointInstancer.ComputeInstanceTransformsAtTime`` does not know the moment before a time.
+        """
         if self._last[0] != time:
-            self._last = (
-                time,
-                self._instancer.ComputeInstanceTransformsAtTime(
-                    time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
-                ),
-            )
-        return self._last[1]
+            instancer = self._instancer
+            orientations = instancer.GetOrientationsfAttr().Get(time) or instancer.GetOrientationsAttr().Get(time)
+            arrays = instancer.GetPositionsAttr().Get(time), orientations, instancer.GetScalesAttr().Get(time)
+            self._last = time, arrays
+        positions, orientations, scales = self._last[1]
+        if not positions or any(index >= len(values) for values in self._last[1] if values):
+            return None
+        matrix = Gf.Matrix4d().SetTranslate(Gf.Vec3d(positions[index]))
+        if orientations:
+            matrix = Gf.Matrix4d().SetRotate(Gf.Quatd(orientations[index])) * matrix
+        if scales:
+            matrix = Gf.Matrix4d().SetScale(Gf.Vec3d(scales[index])) * matrix
+        return matrix
 
     def read_presence(self, time) -> tuple[list[int], list[bool]]:
         if self._last_presence[0] != time:
@@ -133,7 +141,7 @@ def find_instances(prim, parent: Instance | None, file) -> list[Instance]:
     for index, number in sorted(pairs):
         if not 0 <= number < len(roots) or not roots[number]:
             raise ValueError(f"{where}: instance {index} is of prototype {number}, which is not there")
-    return [Instance(instancer, index, number, roots[number], parent, file) for index, number in sorted(pairs)]
+    return [Instance(instancer, index, number, roots[number], parent) for index, number in sorted(pairs)]
 
 
 def transform_times(prim, root=None) -> set[float]:

@@ -117,12 +117,15 @@ class UsdMesh:
         self.times = sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set())
         self.jump_times = set()
         self.turns = bool(skin and skin.times)
-        first = self._transform(Usd.TimeCode.EarliestTime())
+        times = transform_times(self._frame, self._root) | (instance.times if instance else set())
+        codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted(times))]
+        # None where an instance is not there.
+        transforms = (transform for code in codes if (transform := self._find_transform(code)) is not None)
+        first = next(transforms, np.eye(4))
         self.is_placed = np.array_equal(first, np.eye(4))
-        transforms = transform_times(self._frame, self._root) | (instance.times if instance else set())
         # Some writers sample a transform at every time that never changes.
-        if any(not np.array_equal(self._transform(Usd.TimeCode(time)), first) for time in transforms):
-            self.times |= transforms
+        if any(not np.array_equal(transform, first) for transform in transforms):
+            self.times |= times
             self.turns = True
             self.is_placed = False
 
@@ -227,9 +230,16 @@ class UsdMesh:
 
     def _transform(self, time) -> np.ndarray:
         """The matrix that takes points, as rows, to world space, shape [4, 4]."""
-        if self._instance:
-            return np.array(self._instance.transform(self._frame, time))
-        return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
+        transform = self._find_transform(time)
+        if transform is None:
+            raise ValueError(f"{self._where}: its instancer has no valid transform for it at time {time.GetValue():g}")
+        return transform
+
+    def _find_transform(self, time) -> np.ndarray | None:
+        if not self._instance:
+            return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
+        transform = self._instance.transform(self._frame, time)
+        return None if transform is None else np.array(transform)
 
     def _read_topology(self, time) -> list[np.ndarray]:
         """Counts, indices and holes at a time."""
