@@ -39,7 +39,6 @@ class HitsJson(StreamedFile):
             "faces": scene.face_count,
             "meshes": scene.names,
         }
-        self._separator = ""
 
     def head(self) -> str:
         """The file up to the first interval."""
@@ -47,7 +46,6 @@ class HitsJson(StreamedFile):
 
     def record(self, interval, contacts) -> str:
         """An interval with all of its contacts."""
-        separator, self._separator = self._separator, ","
         fields = {
             "index": interval.index,
             "start": interval.start,
@@ -76,6 +74,7 @@ class HitsJson(StreamedFile):
                 for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
             ],
         }
+        separator = "," if self.record_count else ""
         return separator + "\n" + json.dumps(fields, allow_nan=False)
 
     def tail(self, outcome: Outcome) -> str:

@@ -85,11 +85,16 @@ class StreamedFile:
         self._output = OutputFile(path)
         self._ends = []  # of the head and of each record
 
+    @property
+    def record_count(self) -> int:
+        """How many records there are."""
+        return max(0, len(self._ends) - 1)
+
     def add(self, interval, contacts):
         """Append the record of an interval.
 
         Raises:
-            OSError: If there is no room for it. What was there before still is.
+            OSError: If there is no room for it. Only finishing the file is possible then.
         """
         if not self._ends:
             self._append(self.head())
@@ -102,13 +107,15 @@ class StreamedFile:
             outcome: All that was found, of which the last intervals may be missing in this file.
 
         Raises:
-            OSError: If there is no room even for the tail.
+            OSError: If there is no room even for the head and the tail.
         """
         if not self._ends:
+            self._output.truncate(0)
             self._append(self.head())
+        self._output.truncate(self._ends[-1])  # an interruption may have come in the middle of a record
         while True:
             try:
-                self._output.write(self.tail(outcome.first(len(self._ends) - 1)))
+                self._output.write(self.tail(outcome.first(self.record_count)))
                 break
             except OSError:
                 if len(self._ends) == 1:
@@ -122,9 +129,5 @@ class StreamedFile:
         self._output.discard()
 
     def _append(self, text):
-        try:
-            self._output.write(text)
-        except OSError:
-            self._output.truncate(self._ends[-1] if self._ends else 0)
-            raise
+        self._output.write(text)
         self._ends.append(self._output.tell())

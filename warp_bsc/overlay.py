@@ -100,7 +100,7 @@ class Overlay:
             "extent": _tuples(corners),
             "points": _tuples(points),
             "primvars:displayColor": _tuples(colors),
-            "primvars:toi": ", ".join(f"{toi:.9g}" for toi in contacts.toi),
+            "primvars:toi": ", ".join(f"{toi:.9g}" for toi in contacts.toi.astype(np.float32).tolist()),
             "primvars:elementA": ", ".join(_quote(first) for first, _ in elements),
             "primvars:elementB": ", ".join(_quote(second) for _, second in elements),
         }.items():

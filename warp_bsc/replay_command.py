@@ -138,10 +138,11 @@ def run_replay(scene: Scene, arguments, device) -> int:
         outputs, printed = _open_outputs(stack, scene, arguments, settings)
         intervals, stopped, error = [], "", None
         try:
-            for interval, contacts in _track(scene, arguments, device):
-                for output in outputs:
-                    output.add(interval, contacts)
-                intervals.append(interval)
+            with contextlib.closing(_track(scene, arguments, device)) as found:
+                for interval, contacts in found:
+                    intervals.append(interval)
+                    for output in outputs:
+                        output.add(interval, contacts)
         except KeyboardInterrupt:
             stopped = "interrupted"
         except (OSError, ValueError, MemoryError) as failure:
