@@ -1,18 +1,21 @@
 """The collisions of one interval as the artist knows them: prims, their own elements, places in world space."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from .segment import Segment
 
-__all__ = ["EDGE", "FACE", "KINDS", "VERTEX", "Contacts", "find_contacts"]
+__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "Contacts", "find_contacts"]
 
 KINDS = ("vertex-face", "edge-edge")
 """The kinds of contact, by their numbers."""
 
-VERTEX, FACE, EDGE = range(3)
-"""The kinds of element."""
+VERTEX, FACE, EDGE, DIAGONAL = range(4)
+"""The kinds of element; a diagonal is an edge of triangles that a polygon is cut into, and none of the prim's."""
+
+_WORDS = ("vertex", "face", "edge", "diagonal")
 
 
 @dataclass(frozen=True)
@@ -22,12 +25,13 @@ class Contacts:
     Attributes:
         segment: The meshes.
         kind: Index in :data:`KINDS`, shape [n].
-        elements: What the two are: :data:`VERTEX`, :data:`FACE` or :data:`EDGE`, shape [n, 2].
+        elements: What the two are: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape [n, 2].
         meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
         indices: The numbers of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the
-            polygon and -1 for a face, the points at both ends for an edge.
-        lit: Vertices of the segment for a vertex, and a face of it for faces and edges, shape [n, 2].
-        ends: The vertices of the segment at both ends for an edge, else -1, shape [n, 2, 2].
+            polygon and -1 for a face, the points at both ends for the others.
+        vertices: The vertices of the segment that the two have: one and -1 for a vertex, both ends for an edge, -1 for
+            a face, shape [n, 2, 2].
+        faces: The faces of the segment that the two are, else -1, shape [n, 2].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         position: Where they meet, in world space and the scene's unit of length, shape [n, 3].
@@ -39,8 +43,8 @@ class Contacts:
     elements: np.ndarray
     meshes: np.ndarray
     indices: np.ndarray
-    lit: np.ndarray
-    ends: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
     toi: np.ndarray
     time: np.ndarray
     position: np.ndarray
@@ -49,41 +53,37 @@ class Contacts:
     def __len__(self):
         return len(self.kind)
 
-    def names(self, row: int) -> tuple[str, str]:
-        """Names of the two meshes."""
-        first, second = (self.segment.meshes[mesh].name for mesh in self.meshes[row])
-        return first, second
+    @cached_property
+    def mesh_names(self) -> list[tuple[str, str]]:
+        """Names of the two meshes of each pair."""
+        names = [mesh.name for mesh in self.segment.meshes]
+        return [(names[first], names[second]) for first, second in self.meshes.tolist()]
 
-    def element_names(self, row: int) -> tuple[str, str]:
-        """The two elements in words, such as ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``.
+    @cached_property
+    def element_names(self) -> list[tuple[str, str]]:
+        """The two elements of each pair in words: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"``, ``"diagonal 0-2"``."""
 
-        A diagonal is an edge of the triangles that a polygon is cut into, and no edge of the prim's.
-        """
-        first, second = (self._element_name(row, side) for side in range(2))
-        return first, second
+        def name(element, indices):
+            first, second = indices
+            return f"{_WORDS[element]} {first}" if second < 0 else f"{_WORDS[element]} {first}-{second}"
 
-    def _element_name(self, row, side):
-        first, second = self.indices[row, side]
-        element = self.elements[row, side]
-        if element == VERTEX:
-            return f"vertex {first}"
-        if element == FACE:
-            return f"face {first}"
-        inside = self.segment.cuts_polygon(self.lit[row, side], (first, second))
-        return f"{'diagonal' if inside else 'edge'} {first}-{second}"
+        return [
+            (name(first, first_indices), name(second, second_indices))
+            for (first, second), (first_indices, second_indices) in zip(
+                self.elements.tolist(), self.indices.tolist(), strict=True
+            )
+        ]
+
+    @property
+    def colliding_faces(self) -> np.ndarray:
+        """The faces of the segment that collide, or have an edge that does, ascending."""
+        ends = self.vertices[self.elements >= EDGE]
+        return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
-        """The polygons that collide, that have an edge that does, or a vertex: by the mesh, ascending."""
-        segment = self.segment
-        vertices = self.lit[self.elements == VERTEX]
-        faces = np.concatenate(
-            [
-                self.lit[self.elements == FACE],
-                segment.faces_around(vertices),
-                segment.faces_at_edges(np.unique(self.ends[self.elements == EDGE], axis=0)),
-            ]
-        )
-        meshes, polygons = segment.locate_faces(np.unique(faces))
+        """The polygons that collide, or have an edge or a vertex that does: by the mesh, ascending."""
+        around = self.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
+        meshes, polygons = self.segment.locate_faces(np.union1d(self.colliding_faces, around))
         return {int(mesh): np.unique(polygons[meshes == mesh]) for mesh in np.unique(meshes)}
 
 
@@ -111,17 +111,18 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
     elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])
     meshes = np.zeros((n, 2), dtype=np.int64)
     indices = np.full((n, 2, 2), -1, dtype=np.int64)
-    lit = np.zeros((n, 2), dtype=np.int64)
-    all_ends = np.full((n, 2, 2), -1, dtype=np.int64)
+    all_vertices = np.full((n, 2, 2), -1, dtype=np.int64)
+    all_faces = np.full((n, 2), -1, dtype=np.int64)
 
     rows = slice(0, n_vertex_face)
     meshes[rows, 0], indices[rows, 0, 0] = segment.locate_vertices(vertices)
     meshes[rows, 1], indices[rows, 1, 0] = segment.locate_faces(faces)
-    lit[rows] = np.stack([vertices, faces], axis=1)
+    all_vertices[rows, 0, 0], all_faces[rows, 1] = vertices, faces
     rows = slice(n_vertex_face, n)
     for side in range(2):
-        meshes[rows, side], indices[rows, side], lit[rows, side] = segment.locate_edges(ends[:, side])
-    all_ends[rows] = ends
+        meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(ends[:, side])
+        elements[rows, side][diagonal] = DIAGONAL
+    all_vertices[rows] = ends
 
     toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
     normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
@@ -138,5 +139,16 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
 
     moves = np.array([part.moves for part in segment.meshes])
     counted = moves[meshes].any(axis=1) & selection.counted_pairs([part.path for part in segment.meshes], meshes)
-    arrays = (kind, elements, meshes, indices, lit, all_ends, toi, start + toi * (end - start), position, normal)
+    arrays = (
+        kind,
+        elements,
+        meshes,
+        indices,
+        all_vertices,
+        all_faces,
+        toi,
+        start + toi * (end - start),
+        position,
+        normal,
+    )
     return Contacts(segment, *(array[counted] for array in arrays))

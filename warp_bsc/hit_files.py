@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import asdict
 
-from .contacts import EDGE, KINDS
+from .contacts import KINDS
 from .outcome import Outcome
 from .output_file import StreamedFile
 
@@ -111,8 +111,8 @@ class HitsCsv(StreamedFile):
         return _to_csv(
             [
                 interval.index, interval.start, interval.end, KINDS[contacts.kind[row]],
-                names[0], prims[0], elements[0], *_pad(indices[0]),
-                names[1], prims[1], elements[1], *_pad(indices[1]),
+                names[0], prims[0], elements[0], *indices[0], *[""] * (2 - len(indices[0])),
+                names[1], prims[1], elements[1], *indices[1], *[""] * (2 - len(indices[1])),
                 time, toi, *position, *normal,
             ]
             for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
@@ -127,27 +127,13 @@ class HitsCsv(StreamedFile):
 
 def _rows(contacts):
     """Each contact's number, names of meshes, prims, elements, their indices, time, toi, position and normal."""
-    meshes = contacts.segment.meshes
-    columns = (contacts.meshes, contacts.indices, contacts.elements, contacts.time, contacts.toi)
-    columns += (contacts.position, contacts.normal)
-    for row, (pair, indices, elements, time, toi, position, normal) in enumerate(
-        zip(*(column.tolist() for column in columns), strict=True)
-    ):
-        yield (
-            row,
-            [meshes[mesh].name for mesh in pair],
-            [meshes[mesh].path for mesh in pair],
-            list(contacts.element_names(row)),
-            [both if element == EDGE else both[:1] for both, element in zip(indices, elements, strict=True)],
-            time,
-            toi,
-            position,
-            normal,
-        )
-
-
-def _pad(indices):
-    return (*indices, "") if len(indices) == 1 else indices
+    paths = [mesh.path for mesh in contacts.segment.meshes]
+    columns = (contacts.meshes, contacts.indices, contacts.time, contacts.toi, contacts.position, contacts.normal)
+    rows = zip(contacts.mesh_names, contacts.element_names, *(column.tolist() for column in columns), strict=True)
+    for row, (names, elements, pair, indices, time, toi, position, normal) in enumerate(rows):
+        prims = [paths[mesh] for mesh in pair]
+        numbers = [both[:1] if both[1] < 0 else both for both in indices]
+        yield row, names, prims, elements, numbers, time, toi, position, normal
 
 
 def _to_csv(rows) -> str:

@@ -90,11 +90,8 @@ class Overlay:
         corners = [points.min(axis=0) - size, points.max(axis=0) + size] if len(points) else np.zeros((2, 3))
         colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind].reshape(-1, 3)
         elements = [
-            [
-                f"{name} {element}"
-                for name, element in zip(contacts.names(row), contacts.element_names(row), strict=True)
-            ]
-            for row in range(len(contacts))
+            [f"{name} {element}" for name, element in zip(names, words, strict=True)]
+            for names, words in zip(contacts.mesh_names, contacts.element_names, strict=True)
         ]
         for name, value in {
             "extent": _tuples(corners),

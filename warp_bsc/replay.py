@@ -120,8 +120,8 @@ def _summarize(index, start, end, collisions, contacts, validation) -> Interval:
     if len(contacts):
         first = int(np.argmin(contacts.toi))
         earliest = Contact(
-            contacts.names(first),
-            contacts.element_names(first),
+            contacts.mesh_names[first],
+            contacts.element_names[first],
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )

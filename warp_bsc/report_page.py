@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .contacts import EDGE, FACE
 from .outcome import Outcome
 from .output_file import OutputFile
 
@@ -152,14 +151,7 @@ def _view(interval, contacts, scene) -> dict:
     end = segment.positions(interval.end, before=True).astype(np.float64)
     faces = segment.faces
     title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
-    lit = np.unique(
-        np.concatenate(
-            [
-                contacts.lit[contacts.elements == FACE],
-                segment.faces_at_edges(np.unique(contacts.ends[contacts.elements == EDGE], axis=0)),
-            ]
-        )
-    )
+    lit = contacts.colliding_faces
     shown = np.arange(len(faces))
     if len(faces) > _MOST_FACES:
         # Those nearest to the contacts' box.

@@ -131,34 +131,29 @@ class Segment:
         return meshes, polygons
 
     def locate_edges(self, ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of each edge its mesh, the numbers of its ends among the prim's points, and a face that it is an edge of.
+        """Of each edge its mesh, the numbers of its ends among the prim's points, and whether it is a diagonal.
 
         Args:
             ends: Vertices, the smaller first, shape [n, 2].
 
         Returns:
-            Indices of meshes, shape [n]; numbers of points, the smaller first, shape [n, 2]; and faces, shape [n].
+            Indices of meshes, shape [n]; numbers of points, the smaller first, shape [n, 2]; and whether the edge is a
+            diagonal, shape [n]: one inside a polygon, where triangles of it meet.
         """
         keys, sides = self._sides
-        face, corner = np.divmod(sides[np.searchsorted(keys, self._side_keys(ends))], 3)
+        wanted = self._side_keys(ends)
+        place = np.searchsorted(keys, wanted)
+        face, corner = np.divmod(sides[place], 3)
         # As the face has them: welded ends may be of an earlier mesh.
         unwelded = self._corners[face[:, None], np.stack([corner, (corner + 1) % 3], axis=1)]
         meshes, points = self._locate(unwelded)
-        return meshes[:, 0], np.sort(points, axis=1), face
 
-    def cuts_polygon(self, edges_face, points) -> bool:
-        """Whether an edge is inside a polygon, where triangles of it meet, and not one of the prim's own edges.
-
-        Args:
-            edges_face: A face of the edge.
-            points: The ends, numbers of points of the prim.
-        """
-        (number,), (polygon,) = self.locate_faces([edges_face])
-        mesh = self.meshes[number]
-        first, last = np.searchsorted(mesh.polygons, [polygon, polygon + 1])
-        start = mesh.faces.start
-        corners = mesh.points[self._corners[start + first : start + last] - mesh.vertices.start]
-        return int((corners[:, :, None] == points).any(axis=1).all(axis=1).sum()) > 1
+        # Triangles of one polygon follow one another.
+        following = np.minimum(place + 1, max(0, len(keys) - 1))
+        other = sides[following] // 3
+        same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
+        diagonal = (keys[following] == wanted) & (following > place) & same.all(axis=0)
+        return meshes[:, 0], np.sort(points, axis=1), diagonal
 
     def faces_around(self, vertices) -> np.ndarray:
         """The faces that have one of some vertices as a corner."""
@@ -171,7 +166,10 @@ class Segment:
         keys, sides = self._sides
         wanted = self._side_keys(ends)
         first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
-        return np.unique(np.concatenate([sides[a:b] for a, b in zip(first, last, strict=True)] or [sides[:0]]) // 3)
+        marked = np.zeros(len(keys) + 1, dtype=np.int64)
+        np.add.at(marked, first, 1)
+        np.add.at(marked, last, -1)
+        return np.unique(sides[np.cumsum(marked[:-1]) > 0] // 3)
 
     @cached_property
     def _sides(self):
