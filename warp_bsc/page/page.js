@@ -142,10 +142,10 @@ function fillText() {
   addTable(byId("pairs"), [["Meshes"], ["Collisions", true]],
     data.pairs.map(({ text, under, hits }) => [[text, under], count(hits)]), "No meshes collide.");
   if (data.more_pairs) add(byId("pairs"), "p", { class: "muted small" }, `and ${plural(data.more_pairs, "more pair")}`);
-  addTable(byId("worst"), [["Interval"], ["Collisions", true], ["First at", true]],
-    data.worst.map(({ start, end, hits, time, what }) => [[`${short(start)} → ${short(end)}`, what], count(hits), short(time)]),
+  addTable(byId("worst"), [["Interval"], ["Collisions", true], ["First at", true], ["Which is"]],
+    data.worst.map(({ start, end, hits, time, what }) => [`${short(start)} → ${short(end)}`, count(hits), short(time), what]),
     "No interval has collisions.");
-  addTable(byId("facts"), [["Scene"], [""]], data.facts, "");
+  addTable(byId("facts"), [["What"], ["Value"]], data.facts, "");
   data.notes.forEach((note) => add(byId("notes"), "li", {}, note));
   if (data.validation) {
     byId("validation-panel").hidden = false;

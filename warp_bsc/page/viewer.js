@@ -205,7 +205,7 @@ function showWorst(shown) {
     gl.bindVertexArray(dots);
     gl.depthMask(false);
     // Contacts behind a surface shine through it faintly.
-    for (const [test, fade] of [[gl.GREATER, 0.35], [gl.LEQUAL, 1]]) {
+    for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
       gl.uniform1f(gl.getUniformLocation(points, "fade"), fade);
       gl.drawArrays(gl.POINTS, 0, toi.length);
@@ -274,5 +274,5 @@ function showWorst(shown) {
   new ResizeObserver(ask).observe(canvas);
   state.time = shown.at;
   showTime();
-  frame(whole);
+  frame({ center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) });
 }
