@@ -337,6 +337,18 @@ def test_full_disk(tmp_path, capsys):
     assert "File too large" in capsys.readouterr().err
 
 
+def test_no_room_at_the_end_is_an_error(stage, tmp_path, capsys):
+    replay(stage)
+    size = (tmp_path / "overlay.usda").stat().st_size
+    capsys.readouterr()
+    with largest_file(size - 100):  # room for JSON and CSV, and for what waits of the overlay
+        assert main(["replay", save(stage), "--device", "cpu", "--overlay", str(tmp_path / "overlay.usda")]) == 2
+    assert "overlay.usda: not all of it is written" in capsys.readouterr().err
+    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    data = overlay.GetRootLayer().customLayerData["collisions"]
+    assert (data["complete"], data["intervals"], data["stopped"]) == (False, 2, "no room for more")
+
+
 def test_what_was_there_stays_until_the_new_is_whole(stage, tmp_path, monkeypatch):
     (tmp_path / "hits.json").write_text("old")
 

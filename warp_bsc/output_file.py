@@ -107,8 +107,10 @@ class StreamedFile:
             outcome: All that was found, of which the last intervals may be missing in this file.
 
         Raises:
-            OSError: If there is no room even for the head and the tail.
+            OSError: If there is no room. The last records have made room for the tail then, and the file is in its
+                place all the same, unless there is no room even for that.
         """
+        shortage = None
         if not self._ends:
             self._output.truncate(0)
             self._append(self.head())
@@ -117,12 +119,15 @@ class StreamedFile:
             try:
                 self._output.write(self.tail(outcome.first(self.record_count)))
                 break
-            except OSError:
-                if len(self._ends) == 1:
+            except OSError as error:
+                if self.record_count == 0:
                     raise
+                shortage = error
                 self._ends.pop()
                 self._output.truncate(self._ends[-1])
         self._output.commit()
+        if shortage:
+            raise shortage
 
     def discard(self):
         """Leave nothing behind, unless the file is finished."""

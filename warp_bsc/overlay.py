@@ -106,22 +106,27 @@ class Overlay:
         self._times.append(interval.start)
 
     def finish(self, outcome: Outcome):
-        """Write the layer and put it in its place. Where there is no room, the last intervals are left out.
+        """Write the layer and put it in its place.
 
         Raises:
-            OSError: If there is no room at all.
+            OSError: If there is no room. The last intervals are left out then, and the layer is in its place all the
+                same, unless there is no room even for that.
         """
+        shortage = None
         count = len(self._times)
         while True:
             try:
                 self._write(outcome.first(count))
                 break
-            except OSError:
+            except OSError as error:
                 if count == 0:
                     raise
+                shortage = error
                 count //= 2
                 self._output.truncate(0)
         self._output.commit()
+        if shortage:
+            raise shortage
 
     def discard(self):
         """Leave nothing behind, unless the file is finished."""

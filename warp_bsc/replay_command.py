@@ -152,7 +152,7 @@ def run_replay(scene: Scene, arguments, device) -> int:
             try:
                 output.finish(outcome)
             except OSError as failure:
-                error = error or OSError(f"{output.path}: not written: {failure}")
+                error = error or OSError(f"{output.path}: not all of it is written: {failure}")
         if error:
             raise error
         if printed:
