@@ -1,7 +1,6 @@
 """The collisions of one interval as the artist knows them: prims, their own elements, places in world space."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +14,7 @@ KINDS = ("vertex-face", "edge-edge")
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element; a diagonal is an edge of triangles that a polygon is cut into, and none of the prim's."""
 
+_CHUNK = 4096
 _WORDS = ("vertex", "face", "edge", "diagonal")
 
 
@@ -53,15 +53,17 @@ class Contacts:
     def __len__(self):
         return len(self.kind)
 
-    @cached_property
-    def mesh_names(self) -> list[tuple[str, str]]:
-        """Names of the two meshes of each pair."""
-        names = [mesh.name for mesh in self.segment.meshes]
-        return [(names[first], names[second]) for first, second in self.meshes.tolist()]
+    def chunks(self) -> list[slice]:
+        """All rows, some at a time: text of them takes many times the room that they do."""
+        return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
 
-    @cached_property
-    def element_names(self) -> list[tuple[str, str]]:
-        """The two elements of each pair in words: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"``, ``"diagonal 0-2"``."""
+    def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
+        """Names of the two meshes of some pairs."""
+        names = [mesh.name for mesh in self.segment.meshes]
+        return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
+
+    def element_names(self, rows: slice) -> list[tuple[str, str]]:
+        """The two elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
 
         def name(element, indices):
             first, second = indices
@@ -70,7 +72,7 @@ class Contacts:
         return [
             (name(first, first_indices), name(second, second_indices))
             for (first, second), (first_indices, second_indices) in zip(
-                self.elements.tolist(), self.indices.tolist(), strict=True
+                self.elements[rows].tolist(), self.indices[rows].tolist(), strict=True
             )
         ]
 

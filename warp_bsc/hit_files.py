@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 
 from .contacts import KINDS
@@ -10,6 +11,8 @@ from .outcome import Outcome
 from .output_file import StreamedFile
 
 __all__ = ["HitsCsv", "HitsJson"]
+
+_FIELDS = ("kind", "meshes", "prims", "elements", "indices", "time", "toi", "position", "normal")
 
 
 class HitsJson(StreamedFile):
@@ -44,7 +47,7 @@ class HitsJson(StreamedFile):
         """The file up to the first interval."""
         return json.dumps(self._facts)[:-1] + ', "intervals": ['
 
-    def record(self, interval, contacts) -> str:
+    def record(self, interval, contacts) -> Iterator[str]:
         """An interval with all of its contacts."""
         fields = {
             "index": interval.index,
@@ -59,23 +62,13 @@ class HitsJson(StreamedFile):
             "certified": interval.certified,
             "stages": asdict(interval.stats),
             "validation": asdict(interval.validation) if interval.validation else None,
-            "contacts": [
-                {
-                    "kind": KINDS[contacts.kind[row]],
-                    "meshes": names,
-                    "prims": prims,
-                    "elements": elements,
-                    "indices": indices,
-                    "time": time,
-                    "toi": toi,
-                    "position": position,
-                    "normal": normal,
-                }
-                for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
-            ],
         }
         separator = "," if self.record_count else ""
-        return separator + "\n" + json.dumps(fields, allow_nan=False)
+        yield separator + "\n" + json.dumps(fields, allow_nan=False)[:-1] + ', "contacts": ['
+        for number, rows in enumerate(contacts.chunks()):
+            chunk = json.dumps([dict(zip(_FIELDS, row, strict=True)) for row in _rows(contacts, rows)], allow_nan=False)
+            yield (", " if number else "") + chunk[1:-1]
+        yield "]}"
 
     def tail(self, outcome: Outcome) -> str:
         """The file from the last interval on."""
@@ -106,17 +99,19 @@ class HitsCsv(StreamedFile):
         """The names of the columns."""
         return _to_csv([self._COLUMNS])
 
-    def record(self, interval, contacts) -> str:
+    def record(self, interval, contacts) -> Iterator[str]:
         """The rows of an interval."""
-        return _to_csv(
-            [
-                interval.index, interval.start, interval.end, KINDS[contacts.kind[row]],
-                names[0], prims[0], elements[0], *indices[0], *[""] * (2 - len(indices[0])),
-                names[1], prims[1], elements[1], *indices[1], *[""] * (2 - len(indices[1])),
-                time, toi, *position, *normal,
-            ]
-            for row, names, prims, elements, indices, time, toi, position, normal in _rows(contacts)
-        )  # fmt: skip
+        where = [interval.index, interval.start, interval.end]
+        for rows in contacts.chunks():
+            yield _to_csv(
+                [
+                    *where, kind,
+                    names[0], prims[0], elements[0], *indices[0], *[""] * (2 - len(indices[0])),
+                    names[1], prims[1], elements[1], *indices[1], *[""] * (2 - len(indices[1])),
+                    time, toi, *position, *normal,
+                ]
+                for kind, names, prims, elements, indices, time, toi, position, normal in _rows(contacts, rows)
+            )  # fmt: skip
 
     def tail(self, outcome: Outcome) -> str:
         """What is missing."""
@@ -125,15 +120,17 @@ class HitsCsv(StreamedFile):
         return f"# partial: {len(outcome.intervals)} of {outcome.interval_count} intervals; {outcome.stopped}\n"
 
 
-def _rows(contacts):
-    """Each contact's number, names of meshes, prims, elements, their indices, time, toi, position and normal."""
+def _rows(contacts, rows):
+    """Of each of some contacts what :data:`_FIELDS` names."""
     paths = [mesh.path for mesh in contacts.segment.meshes]
-    columns = (contacts.meshes, contacts.indices, contacts.time, contacts.toi, contacts.position, contacts.normal)
-    rows = zip(contacts.mesh_names, contacts.element_names, *(column.tolist() for column in columns), strict=True)
-    for row, (names, elements, pair, indices, time, toi, position, normal) in enumerate(rows):
+    columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
+    columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]
+    for names, elements, kind, pair, indices, *measures in zip(
+        contacts.mesh_names(rows), contacts.element_names(rows), *columns, strict=True
+    ):
         prims = [paths[mesh] for mesh in pair]
         numbers = [both[:1] if both[1] < 0 else both for both in indices]
-        yield row, names, prims, elements, numbers, time, toi, position, normal
+        yield KINDS[kind], names, prims, elements, numbers, *measures
 
 
 def _to_csv(rows) -> str:

@@ -30,13 +30,13 @@ class OutputFile:
         self._temporary = Path(name)
         self._file = os.fdopen(handle, "wb", buffering=0)
 
-    def write(self, text: str):
+    def write(self, text: str | bytes):
         """Write all of a text.
 
         Raises:
             OSError: If there is no room; some of it may have been written then.
         """
-        rest = memoryview(text.encode())
+        rest = memoryview(text.encode() if isinstance(text, str) else text)
         while rest:
             rest = rest[self._file.write(rest) :]
 
@@ -97,7 +97,7 @@ class StreamedFile:
             OSError: If there is no room for it. Only finishing the file is possible then.
         """
         if not self._ends:
-            self._append(self.head())
+            self._append([self.head()])
         self._append(self.record(interval, contacts))
 
     def finish(self, outcome):
@@ -113,7 +113,7 @@ class StreamedFile:
         shortage = None
         if not self._ends:
             self._output.truncate(0)
-            self._append(self.head())
+            self._append([self.head()])
         self._output.truncate(self._ends[-1])  # an interruption may have come in the middle of a record
         while True:
             try:
@@ -133,6 +133,7 @@ class StreamedFile:
         """Leave nothing behind, unless the file is finished."""
         self._output.discard()
 
-    def _append(self, text):
-        self._output.write(text)
+    def _append(self, texts):
+        for text in texts:
+            self._output.write(text)
         self._ends.append(self._output.tell())

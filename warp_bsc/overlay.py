@@ -23,6 +23,8 @@ _UNLIT = (0.6, 0.6, 0.6)  # of a mesh without a colour
 _DISPLAY_COLOR = "primvars:displayColor"
 _POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
 
+_COPIED = 1 << 20  # bytes that are copied at once
+
 _CONTACTS = {
     "extent": ("float3[]", None),
     "points": ("point3f[]", None),
@@ -88,20 +90,18 @@ class Overlay:
         size = self._width / 2
         points = contacts.position.astype(np.float32)
         corners = [points.min(axis=0) - size, points.max(axis=0) + size] if len(points) else np.zeros((2, 3))
-        colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind].reshape(-1, 3)
-        elements = [
-            [f"{name} {element}" for name, element in zip(names, words, strict=True)]
-            for names, words in zip(contacts.mesh_names, contacts.element_names, strict=True)
-        ]
-        for name, value in {
-            "extent": _tuples(corners),
-            "points": _tuples(points),
-            "primvars:displayColor": _tuples(colors),
-            "primvars:toi": ", ".join(f"{toi:.9g}" for toi in contacts.toi.astype(np.float32).tolist()),
-            "primvars:elementA": ", ".join(_quote(first) for first, _ in elements),
-            "primvars:elementB": ", ".join(_quote(second) for _, second in elements),
+        colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind]
+        toi = contacts.toi.astype(np.float32)
+        chunks = contacts.chunks()
+        for name, texts in {
+            "extent": [_tuples(corners)],
+            "points": (_tuples(points[rows]) for rows in chunks),
+            "primvars:displayColor": (_tuples(colors[rows]) for rows in chunks),
+            "primvars:toi": (", ".join(f"{value:.9g}" for value in toi[rows].tolist()) for rows in chunks),
+            "primvars:elementA": (_element_texts(contacts, rows, 0) for rows in chunks),
+            "primvars:elementB": (_element_texts(contacts, rows, 1) for rows in chunks),
         }.items():
-            self._sample(prim, name, interval.start, value)
+            self._sample(prim, name, interval.start, texts)
         self._color(interval, contacts)
         self._times.append(interval.start)
 
@@ -133,14 +133,16 @@ class Overlay:
         self._spool.close()
         self._output.discard()
 
-    def _sample(self, prim, name, time, value, polygons=0):
+    def _sample(self, prim, name, time, texts, polygons=0):
         """Let a sample of an attribute wait in the spool, with the number of a mesh's polygons if some are lit."""
-        data = value.encode()
         place = self._spool.seek(0, os.SEEK_END)
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._spool.write(rest) :]
-        self._samples.setdefault((prim, name), []).append((time, place, len(data), polygons))
+        separator = ""
+        for text in texts:
+            rest = memoryview((separator + text).encode())
+            while rest:
+                rest = rest[self._spool.write(rest) :]
+            separator = ", "
+        self._samples.setdefault((prim, name), []).append((time, place, self._spool.tell() - place, polygons))
 
     def _color(self, interval, contacts):
         """Let the colours of all meshes wait that change at the start of an interval."""
@@ -170,7 +172,7 @@ class Overlay:
     def _sample_colors(self, path, time, state):
         count, lit = state
         text = _color_text(_unlit_colors(self._scene.stage, path, count, time), count, lit)
-        self._sample(path, _DISPLAY_COLOR, time, text, count if len(lit) else 0)
+        self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
 
     def _open_instances(self, path):
         """Note the instances that a prim is in: below these, only their prototype has colours."""
@@ -269,8 +271,11 @@ class Overlay:
             writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
         writer.write(".timeSamples = {\n")
         for time, place, length, _ in samples:
+            writer.write(f"{indent}    {time!r}: [")
             self._spool.seek(place)
-            writer.write(f"{indent}    {time!r}: [{self._spool.read(length).decode()}],\n")
+            for size in [_COPIED] * (length // _COPIED) + [length % _COPIED]:
+                writer.write_bytes(self._spool.read(size))
+            writer.write("],\n")
         for time, value in after:
             writer.write(f"{indent}    {time!r}: [{value}],\n")
         writer.write(f"{indent}}}\n")
@@ -284,13 +289,16 @@ class _Writer:
         self._waiting, self._length = [], 0
 
     def write(self, text):
-        self._waiting.append(text)
-        self._length += len(text)
-        if self._length > 1 << 20:
+        self.write_bytes(text.encode())
+
+    def write_bytes(self, data):
+        self._waiting.append(data)
+        self._length += len(data)
+        if self._length >= _COPIED:
             self.flush()
 
     def flush(self):
-        self._output.write("".join(self._waiting))
+        self._output.write(b"".join(self._waiting))
         self._waiting, self._length = [], 0
 
 
@@ -325,6 +333,12 @@ def _color_text(colors, count, lit) -> str:
     return ", ".join(texts[numbers])
 
 
+def _element_texts(contacts, rows, side) -> str:
+    """The first or the second elements of some contacts, with the names of their meshes."""
+    both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
+    return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
+
+
 def _tree(paths) -> dict:
     """Names of prims by those of their parents."""
     tree = {}
@@ -341,6 +355,8 @@ def _tuples(rows) -> str:
 
 def _quote(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    if escaped.isprintable():
+        return f'"{escaped}"'
     return '"' + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else "?" for c in escaped) + '"'
 
 

@@ -119,9 +119,10 @@ def _summarize(index, start, end, collisions, contacts, validation) -> Interval:
     earliest = None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
+        row = slice(first, first + 1)
         earliest = Contact(
-            contacts.mesh_names[first],
-            contacts.element_names[first],
+            contacts.mesh_names(row)[0],
+            contacts.element_names(row)[0],
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )

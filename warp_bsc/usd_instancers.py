@@ -109,9 +109,9 @@ class _Instancer:
             matrix = Gf.Matrix4d().SetScale(Gf.Vec3d(scales[index])) * matrix
         return matrix
 
-    def read_presence(self, time) -> tuple[list[int], list[bool]]:
+    def read_presence(self, time) -> tuple:
         if self._last_presence[0] != time:
-            numbers = list(self._instancer.GetProtoIndicesAttr().Get(time) or ())
+            numbers = self._instancer.GetProtoIndicesAttr().Get(time) or ()
             self._last_presence = time, (numbers, list(self._instancer.ComputeMaskAtTime(time)))
         return self._last_presence[1]
 
