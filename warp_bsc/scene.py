@@ -30,6 +30,7 @@ named in :attr:`Scene.warnings`, and so is what becomes of the motion.
 """
 
 import math
+import os
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -39,6 +40,12 @@ from .segment import Segment
 from .selection import Selection
 
 __all__ = ["FrameRange", "Scene"]
+
+# Mapped into memory, every page of a crate file that has been read counts as memory of this process, which would then
+# seem to grow with each frame. USD looks at this when it is loaded, and would else say so on standard error.
+if "USDC_USE_ASSET" not in os.environ:
+    os.environ["USDC_USE_ASSET"] = "1"
+    os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
 
 
 @dataclass(frozen=True)

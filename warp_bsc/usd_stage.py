@@ -1,13 +1,6 @@
 """Opens a USD file with everything that it refers to. Imports pxr: to be imported where it is used."""
 
-import os
 from pathlib import Path
-
-# Mapped into memory, every page of a crate file that has been read counts as memory of this process, which would then
-# seem to grow with each frame. USD looks at this once, when it is loaded, and would else say so on standard error.
-if "USDC_USE_ASSET" not in os.environ:
-    os.environ["USDC_USE_ASSET"] = "1"
-    os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
 
 from pxr import Tf, Usd, UsdUtils
 
