@@ -153,22 +153,22 @@ def _view(interval, contacts, scene) -> dict:
     title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
     lit = contacts.colliding_faces
     shown = np.arange(len(faces))
+    rows = np.arange(len(contacts))
     if len(faces) > _MOST_FACES:
-        # Those nearest to the contacts' box.
-        low, high = contacts.position.min(axis=0), contacts.position.max(axis=0)
-        places = start[faces].mean(axis=1)
-        distance = np.maximum(np.maximum(low - places, places - high), 0.0).max(axis=1)
-        distance[lit] = -1.0
+        # Those around one contact in the middle of all.
+        from_middle = np.abs(contacts.position - np.median(contacts.position, axis=0)).max(axis=1)
+        middle = contacts.position[np.argmin(from_middle)]
+        distance = np.abs(start[faces].mean(axis=1) - middle).max(axis=1)
         shown = np.sort(np.argpartition(distance, _MOST_FACES)[:_MOST_FACES])
-        title += f"; {_MOST_FACES:,} of {len(faces):,} triangles are shown"
+        rows = np.flatnonzero(np.abs(contacts.position - middle).max(axis=1) <= distance[shown].max())
+        title += f"; the {_MOST_FACES:,} of {len(faces):,} triangles around one of them are shown"
     lit = np.intersect1d(lit, shown)
     vertices, corners = np.unique(faces[shown], return_inverse=True)
     number = np.full(len(faces), -1)
     number[shown] = np.arange(len(shown))
     corners = corners.reshape(-1, 3)
-    rows = np.arange(len(contacts))
     if len(rows) > _MOST_CONTACTS:
-        rows = np.linspace(0, len(rows) - 1, _MOST_CONTACTS).astype(int)
+        rows = rows[np.linspace(0, len(rows) - 1, _MOST_CONTACTS).astype(int)]
         title += f"; {_MOST_CONTACTS:,} contacts are shown"
     center = (start[vertices].min(axis=0) + start[vertices].max(axis=0)) / 2
     mesh_of_vertex, _ = segment.locate_vertices(vertices)

@@ -138,8 +138,7 @@ def overlapping_boxes(first, second) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
     for size_a, a in by_size(*first).items():
         for size_b, b in by_size(*second).items():
-            # Twice as large, against rounding.
-            cell = smallest * 2.0 ** (max(size_a, size_b) + 1)
+            cell = smallest * 2.0 ** max(size_a, size_b) * (1.0 + 1e-6)  # cells are numbered with rounding
             cells_a = np.floor((first[0][a] - origin) / cell).astype(np.int64)
             cells_b = np.floor((second[0][b] - origin) / cell).astype(np.int64)
             keys = _cell_keys(cells_b)
@@ -150,9 +149,11 @@ def overlapping_boxes(first, second) -> Iterator[tuple[np.ndarray, np.ndarray]]:
                 begin, end = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
                 for rows, places in _expand(begin, end):
                     i, j = a[rows], b[order[places]]
-                    overlap = (first[0][i] <= second[1][j]) & (second[0][j] <= first[1][i])
-                    keep = overlap.all(axis=1)
-                    yield i[keep], j[keep]
+                    for axis in range(3):
+                        overlap = first[0][i, axis] <= second[1][j, axis]
+                        overlap &= second[0][j, axis] <= first[1][i, axis]
+                        i, j = i[overlap], j[overlap]
+                    yield i, j
 
 
 def _cell_keys(cells):

@@ -63,8 +63,8 @@ function niceStep(range, parts) {
 
 // Bars: {from, to, parts: [numbers, one a class], tip}.
 function addBars(parent, bars, classes, width, xLabel) {
-  const height = 230, left = 46, bottom = 40, top = 8, right = 20;
   const most = Math.max(1, ...bars.map((bar) => bar.parts.reduce((a, b) => a + b, 0)));
+  const height = 230, left = Math.max(46, 8 * count(most).length + 14), bottom = 40, top = 8, right = 20;
   const low = bars[0].from, high = bars[bars.length - 1].to;
   const x = (value) => left + ((value - low) / (high - low || 1)) * (width - left - right);
   const y = (value) => height - bottom - (value / most) * (height - bottom - top);

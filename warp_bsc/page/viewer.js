@@ -38,13 +38,14 @@ void main() {
 const POINT_COLOR = `#version 300 es
 precision highp float;
 in vec4 tint;
+uniform float core;
 out vec4 result;
 void main() {
   float from = length(gl_PointCoord - 0.5) * 2.0;
   float edge = fwidth(from);
   float disc = 1.0 - smoothstep(1.0 - edge, 1.0, from);
-  float core = 1.0 - smoothstep(0.68 - edge, 0.68, from);
-  result = vec4(mix(vec3(1.0), tint.rgb, core), tint.a * disc);
+  float inner = 1.0 - smoothstep(core - edge, core, from);
+  result = vec4(mix(vec3(1.0), tint.rgb, inner), tint.a * disc);
 }`;
 
 function decode(text, Type) {
@@ -201,7 +202,9 @@ function showWorst(shown) {
       gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
     }
     set(points);
-    gl.uniform1f(gl.getUniformLocation(points, "size"), 15 * scale);
+    // Many contacts would hide one another, and all else.
+    gl.uniform1f(gl.getUniformLocation(points, "size"), Math.max(4, 15 - 2.2 * Math.log10(toi.length) ** 1.4) * scale);
+    gl.uniform1f(gl.getUniformLocation(points, "core"), toi.length > 300 ? 2 : 0.68);
     gl.bindVertexArray(dots);
     gl.depthMask(false);
     // Contacts behind a surface shine through it faintly.
