@@ -441,7 +441,21 @@ def test_page_without_collisions(tmp_path):
     stage = new_stage(tmp_path / "scene.usda")
     add_mesh(stage, "/World/Falling", falling(1, 0.5))
     replay(stage)
-    assert Page((tmp_path / "page.html").read_text()).data["view"] is None
+    view = Page((tmp_path / "page.html").read_text()).data["view"]
+    assert (view["from"], view["contacts"], view["lit"]) == (0, "", "")
+    assert view["faces"]  # the scene is there to be seen
+
+
+@pytest.mark.parametrize("visible", ["inherited", "invisible"])
+def test_page_where_little_is_there(tmp_path, visible):
+    stage = new_stage(tmp_path / "scene.usda")
+    mesh = add_mesh(stage, "/World/Falling", falling(1, 0.5))
+    mesh.CreateVisibilityAttr().Set(visible, 0)
+    mesh.GetVisibilityAttr().Set("inherited", 1)
+    mesh.GetPointsAttr().Set(FALLING, 2)
+    replay(stage)
+    view = Page((tmp_path / "page.html").read_text()).data["view"]
+    assert (view is None) == (visible == "invisible")
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

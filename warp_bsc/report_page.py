@@ -39,8 +39,8 @@ class ReportPage:
         self._worst = None
 
     def add(self, interval, contacts):
-        """Keep the contacts of an interval if there are more than in any before."""
-        if len(contacts) and (self._worst is None or len(contacts) > len(self._worst[1])):
+        """Keep the contacts of an interval if there are more than in any before, or none before."""
+        if self._worst is None or len(contacts) > len(self._worst[1]):
             self._worst = interval, contacts
 
     def finish(self, outcome: Outcome):
@@ -127,7 +127,7 @@ def _data(outcome: Outcome, worst) -> dict:
         ],
         "notes": [outcome.motion, *scene.warnings],
         "validation": None,
-        "view": _view(*worst, scene) if worst else None,
+        "view": _view(*worst, scene) if worst and worst[1].segment.meshes else None,
     }
     if not outcome.is_complete:
         data["partial"] = (
@@ -156,12 +156,12 @@ def _view(interval, contacts, scene) -> dict:
     rows = np.arange(len(contacts))
     if len(faces) > _MOST_FACES:
         # Those around one contact in the middle of all.
-        from_middle = np.abs(contacts.position - np.median(contacts.position, axis=0)).max(axis=1)
-        middle = contacts.position[np.argmin(from_middle)]
+        places = contacts.position if len(contacts) else start[faces[:, 0]]
+        middle = places[np.argmin(np.abs(places - np.median(places, axis=0)).max(axis=1))]
         distance = np.abs(start[faces].mean(axis=1) - middle).max(axis=1)
         shown = np.sort(np.argpartition(distance, _MOST_FACES)[:_MOST_FACES])
         rows = np.flatnonzero(np.abs(contacts.position - middle).max(axis=1) <= distance[shown].max())
-        title += f"; the {_MOST_FACES:,} of {len(faces):,} triangles around one of them are shown"
+        title += f"; the {_MOST_FACES:,} of {len(faces):,} triangles around one place are shown"
     lit = np.intersect1d(lit, shown)
     vertices, corners = np.unique(faces[shown], return_inverse=True)
     number = np.full(len(faces), -1)
@@ -176,7 +176,7 @@ def _view(interval, contacts, scene) -> dict:
         "title": title,
         "from": interval.start,
         "to": interval.end,
-        "at": round(float(np.median(contacts.toi)), 3),
+        "at": round(float(np.median(contacts.toi)), 3) if len(contacts) else 0.0,
         "up_axis": scene.up_axis,
         "meshes": [{"name": mesh.name, "moves": mesh.moves} for mesh in segment.meshes],
         "start": _packed(start[vertices] - center, np.float32),

@@ -109,7 +109,7 @@ function showWorst(shown) {
   const fail = (text) => { message.textContent = text; message.hidden = false; };
   if (!shown) {
     byId("viewer").querySelector(".controls").hidden = true;
-    return fail("No interval has collisions.");
+    return fail("There is nothing to show.");
   }
   const canvas = byId("canvas");
   const gl = canvas.getContext("webgl2", { antialias: true });
@@ -130,7 +130,11 @@ function showWorst(shown) {
   const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`;
   shown.meshes.slice(0, 8).forEach(({ name }, index) => addKey(byId("viewer-legend"), { fill: css(colorOf[index]) }, name));
   if (shown.meshes.length > 8) add(byId("viewer-legend"), "span", {}, `and ${count(shown.meshes.length - 8)} more`);
-  addKey(byId("viewer-legend"), { fill: css(LIT_COLOR) }, "faces that collide");
+  if (lit.length) addKey(byId("viewer-legend"), { fill: css(LIT_COLOR) }, "faces that collide");
+  if (!toi.length) {
+    byId("viewer-heading").textContent = "First interval";
+    byId("frame-contacts").hidden = true;
+  }
   ["vertex-face contact", "edge-edge contact"].forEach((text, kind) => {
     if (kinds.includes(kind)) addKey(byId("viewer-legend"), { fill: css(CONTACT_COLORS[kind]), rx: 5 }, text);
   });
@@ -146,7 +150,7 @@ function showWorst(shown) {
   const moving = [];
   for (const values of [start, end])
     moving.push(values.filter((_, i) => shown.meshes[meshes[Math.floor(i / 3)]].moves));
-  const whole = boxOf(moving), near = boxOf([contacts]);
+  const whole = boxOf(moving.some((values) => values.length) ? moving : [start]), near = toi.length ? boxOf([contacts]) : { ...whole };
   near.radius = Math.max(near.radius * 1.6, whole.radius * 0.12);
   const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
   const state = { time: 0, playing: false, last: 0, asked: false };
@@ -203,7 +207,7 @@ function showWorst(shown) {
     }
     set(points);
     // Many contacts would hide one another, and all else.
-    gl.uniform1f(gl.getUniformLocation(points, "size"), Math.max(4, 15 - 2.2 * Math.log10(toi.length) ** 1.4) * scale);
+    gl.uniform1f(gl.getUniformLocation(points, "size"), Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, toi.length)) ** 1.4) * scale);
     gl.uniform1f(gl.getUniformLocation(points, "core"), toi.length > 300 ? 2 : 0.68);
     gl.bindVertexArray(dots);
     gl.depthMask(false);
@@ -277,5 +281,5 @@ function showWorst(shown) {
   new ResizeObserver(ask).observe(canvas);
   state.time = shown.at;
   showTime();
-  frame({ center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) });
+  frame(toi.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : whole);
 }
