@@ -151,6 +151,7 @@ function showWorst(shown) {
   for (const values of [start, end])
     moving.push(values.filter((_, i) => shown.meshes[meshes[Math.floor(i / 3)]].moves));
   const whole = boxOf(moving.some((values) => values.length) ? moving : [start]), near = toi.length ? boxOf([contacts]) : { ...whole };
+  const all = { center: whole.center, radius: 1.15 * whole.radius };
   near.radius = Math.max(near.radius * 1.6, whole.radius * 0.12);
   const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
   const state = { time: 0, playing: false, last: 0, asked: false };
@@ -276,10 +277,10 @@ function showWorst(shown) {
     byId("play").textContent = state.playing ? "Pause" : "Play";
     ask();
   });
-  byId("frame-all").addEventListener("click", () => frame(whole));
+  byId("frame-all").addEventListener("click", () => frame(all));
   byId("frame-contacts").addEventListener("click", () => frame(near));
   new ResizeObserver(ask).observe(canvas);
   state.time = shown.at;
   showTime();
-  frame(toi.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : whole);
+  frame(toi.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : all);
 }
