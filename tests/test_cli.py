@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pxr import Usd, UsdGeom
 
-from warp_bsc import cli
+from warp_bsc import replay_command
 from warp_bsc.cli import main
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
@@ -316,10 +316,10 @@ def test_help_has_examples(capsys, command):
 
 
 def test_interrupt(capsys, monkeypatch, falling_scene):
-    def interrupt(path):
+    def interrupt(path, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "Scene", interrupt)
+    monkeypatch.setattr(replay_command, "Scene", interrupt)
     assert main(["replay", falling_scene]) == 130
     assert capsys.readouterr().err == "warp-bsc: interrupted\n"
 

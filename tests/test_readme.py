@@ -1,7 +1,6 @@
 """The README: its Python code runs as printed, its commands are those that the project runs."""
 
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +43,13 @@ def test_the_scene_of_the_readme_replays_with_its_figures(capsys):
 
 def test_the_collisions_of_the_scene_are_real():
     scene = Scene(ROOT / "assets" / "cloth_twist.usd")
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(scene.faces, scene.vertex_count))
+    segment, _, _ = scene.interval(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(segment.faces, segment.vertex_count))
     confirmed = 0
-    for start, end in pairwise(scene.times):
-        x0, x1 = scene.positions(start), scene.positions(end)
+    for index in range(len(scene.times) - 1):
+        _, x0, x1 = scene.interval(index)
         c = detector.detect(x0, x1)
-        corners = np.concatenate([c.vertex_face[:, :1], scene.faces[c.vertex_face[:, 1]]], axis=1)
+        corners = np.concatenate([c.vertex_face[:, :1], segment.faces[c.vertex_face[:, 1]]], axis=1)
         confirmed += checker.vertex_face(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
         corners = detector.mesh.edges[c.edge_edge].reshape(-1, 4)
         confirmed += checker.edge_edge(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()

@@ -67,8 +67,8 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
     scene = Scene(name)
     if not 0 <= interval < len(scene.times) - 1:
         raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene.times) - 2}")
-    x0, x1 = (scene.positions(time) for time in scene.times[interval : interval + 2])
-    return BenchmarkScene(name, scene.faces, x0, x1)
+    segment, x0, x1 = scene.interval(interval)
+    return BenchmarkScene(name, segment.faces, x0, x1)
 
 
 def _find_generator(name, generator, triangles):

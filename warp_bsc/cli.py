@@ -23,19 +23,16 @@ from .mesh import CollisionMesh
 from .narrow_phase import METHODS
 from .query import query_edge_edge, query_vertex_face
 from .query_file import KINDS, find_query_files, read_query_file
-from .replay import replay
+from .replay_command import add_replay_options, open_scene, run_replay
 from .report import (
     QueryAnswers,
     detector_benchmarks_to_dict,
     print_detector_benchmarks,
     print_queries,
     print_query_benchmarks,
-    print_replay,
     queries_to_dict,
     query_benchmarks_to_dict,
-    replay_to_dict,
 )
-from .scene import Scene
 
 __all__ = ["main"]
 
@@ -44,6 +41,11 @@ exit status:
   0  done, whether or not anything collides
   1  collisions found, with --fail-on-collision
   2  wrong use or bad input; a line on standard error says what and where"""
+
+_REPLAY_EXIT_STATUS = f"""\
+{_EXIT_STATUS}
+  3  --validate found an answer that is wrong
+  130  interrupted"""
 
 _EXAMPLES = f"""\
 examples:
@@ -58,11 +60,15 @@ _REPLAY = """\
 Find the collisions between each two consecutive time samples of a USD scene:
 of its meshes with themselves and with each other, every vertex moving straight
 from sample to sample. Meshes that never move are obstacles; where these touch
-one another is not counted."""
+one another is not counted. Files appear complete or not at all; interrupted,
+they hold the intervals that are finished and say that they are partial."""
 
 _REPLAY_EXAMPLES = f"""\
 examples:
   warp-bsc replay cloth.usd
+  warp-bsc replay shot.usd --overlay hits.usda --report hits.html
+  warp-bsc replay shot.usd --between '/World/Coat' '/World/Body*' --no-self
+  warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
   warp-bsc replay cloth.usd --device cpu --method conservative
   warp-bsc replay cloth.usd --json > collisions.json
   warp-bsc replay cloth.usd --fail-on-collision || echo "it collides"
@@ -72,7 +78,7 @@ examples:
       --output-path twist.usd
   warp-bsc replay twist.usd
 
-{_EXIT_STATUS}"""
+{_REPLAY_EXIT_STATUS}"""
 
 _QUERY = """\
 Answer elementary queries and compare the answers with the truth, if it is
@@ -174,7 +180,7 @@ def _build_parser() -> argparse.ArgumentParser:
     command = _add_command(
         commands, "replay", _run_replay, "find the collisions in a USD scene", _REPLAY, _REPLAY_EXAMPLES
     )
-    command.add_argument("scene", metavar="SCENE", help="a .usd, .usda, .usdc or .usdz file")
+    add_replay_options(command)
     _add_detection_options(command, method="exact")
     _add_fail_on_collision(command)
 
@@ -186,6 +192,7 @@ def _build_parser() -> argparse.ArgumentParser:
         help="what the queries are (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
     )
     _add_detection_options(command, method="exact")
+    _add_json(command)
     _add_fail_on_collision(command)
 
     command = _add_command(commands, "bench", None, "measure how long things take", _BENCH, _BENCH_EXAMPLES)
@@ -207,6 +214,7 @@ def _build_parser() -> argparse.ArgumentParser:
         help="measure the IPC Toolkit's candidates and collision-free step size too, on the CPU; needs ipctk",
     )
     _add_detection_options(command, method="conservative")
+    _add_json(command)
 
     command = _add_command(
         benchmarks, "queries", _run_bench_queries, "measure elementary queries", _BENCH_QUERIES, _BENCH_QUERIES_EXAMPLES
@@ -215,7 +223,8 @@ def _build_parser() -> argparse.ArgumentParser:
         "--count", type=int, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
     )
     _add_benchmark_options(command, repeat=20)
-    _add_device_options(command)
+    _add_device(command)
+    _add_json(command)
     return parser
 
 
@@ -239,11 +248,14 @@ def _add_detection_options(command, *, method):
         help="float: the signs as floating point computes them; conservative: what it cannot certify counts as a "
         "collision; exact: the true answer (default: %(default)s)",
     )
-    _add_device_options(command)
+    _add_device(command)
 
 
-def _add_device_options(command):
+def _add_device(command):
     command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+
+
+def _add_json(command):
     command.add_argument("--json", action="store_true", help="print JSON only, with everything found")
 
 
@@ -272,26 +284,11 @@ def _positive(text: str) -> int:
 
 
 def _run_replay(arguments) -> int:
-    scene = Scene(arguments.scene)
+    scene = open_scene(arguments)
     device = _find_device(arguments.device)
-    console, progress = Console(), Console(stderr=True)
-    with _loading_kernels(progress, device):
+    with _loading_kernels(Console(stderr=True), device):
         _load_detector(arguments.method, scene.dtype, device)
-    intervals = list(
-        track(
-            replay(scene, method=arguments.method, device=device),
-            description="Replaying",
-            total=len(scene.times) - 1,
-            console=progress,
-            transient=True,
-            disable=not progress.is_terminal,
-        )
-    )
-    if arguments.json:
-        print(json.dumps(replay_to_dict(scene, intervals, method=arguments.method, device=str(device))))
-    else:
-        print_replay(console, scene, intervals, method=arguments.method, device=str(device))
-    return 1 if arguments.fail_on_collision and any(interval.hits for interval in intervals) else 0
+    return run_replay(scene, arguments, device)
 
 
 def _run_query(arguments) -> int:

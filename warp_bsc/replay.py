@@ -1,16 +1,20 @@
-"""Replays a USD scene: finds the collisions between each two consecutive times."""
+"""Replays a USD scene: finds the collisions between each two consecutive times, holding one interval at a time."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
+from .contacts import Contacts, find_contacts
 from .detector import CollisionDetector, DetectionStats
 from .mesh import CollisionMesh
 from .scene import Scene
+from .validation import Validation, validate
 
 __all__ = ["Contact", "Interval", "replay"]
+
+TOI_BINS = 20
+"""Parts of an interval that times of impact are counted in."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +22,7 @@ class Contact:
     """Where and when two meshes, or a mesh and itself, meet.
 
     Attributes:
-        meshes: Paths of the two prims.
+        meshes: Names of the two.
         elements: What meets, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
         toi: Time of impact, 0 at the start of the interval and 1 at its end.
         time: The same as a time code.
@@ -32,7 +36,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Interval:
-    """What was found between two consecutive times of a scene.
+    """What was found between two consecutive times of a scene, in numbers.
 
     Attributes:
         index: Number of the interval, from 0.
@@ -40,11 +44,13 @@ class Interval:
         end: Time code at which it ends.
         vertex_face_hits: Number of vertex-face pairs that collide.
         edge_edge_hits: Number of edge-edge pairs that collide.
-        mesh_pairs: Number of pairs that collide for each two meshes, by the paths of their prims, in order; a mesh that
-            collides with itself is there twice.
+        toi_counts: Number of pairs by their time of impact, in equal parts of the interval.
+        mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
+            with itself is there twice.
         earliest: The earliest contact, None if there is none.
         certified: Whether no collision can be missing.
-        stats: Counts and times of the detector's stages.
+        stats: Counts and times of the detector's stages, pairs that do not count included.
+        validation: What the exact checker says of the answers, None if it was not asked.
     """
 
     index: int
@@ -52,10 +58,12 @@ class Interval:
     end: float
     vertex_face_hits: int
     edge_edge_hits: int
+    toi_counts: tuple[int, ...]
     mesh_pairs: dict[tuple[str, str], int]
     earliest: Contact | None
     certified: bool
     stats: DetectionStats
+    validation: Validation | None
 
     @property
     def hits(self) -> int:
@@ -73,74 +81,64 @@ class Interval:
         return sum(self.stats.milliseconds.values())
 
 
-def replay(scene: Scene, *, method: str = "exact", device=None) -> Iterator[Interval]:
+def replay(
+    scene: Scene, *, method: str = "exact", device=None, validate_most: int | None = 0
+) -> Iterator[tuple[Interval, Contacts]]:
     """Find the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
     Meshes that never move are obstacles: where these touch one another is not counted.
 
     Args:
-        scene: The scene.
+        scene: The scene, whose selection says which pairs count.
         method: ``"float"``, ``"conservative"`` or ``"exact"``.
         device: Warp device.
+        validate_most: How many hits, and how many other answers, of each interval are asked again of the exact
+            checker; None for all.
 
     Raises:
         ValueError: If the positions at some time are broken.
     """
-    mesh = CollisionMesh(scene.faces, scene.vertex_count, device=device)
-    detector = CollisionDetector(mesh, method=method)
+    detector = segment = None
+    for index, (start, end) in enumerate(zip(scene.times[:-1], scene.times[1:], strict=True)):
+        last_segment = segment
+        segment, x0, x1 = scene.interval(index)
+        if segment is not last_segment:
+            detector = None  # before the next is made, for the sake of memory
+            detector = CollisionDetector(
+                CollisionMesh(segment.faces, segment.vertex_count, device=device), method=method
+            )
+        collisions = detector.detect(x0, x1)
+        contacts = find_contacts(segment, detector.mesh, collisions, x0, x1, start, end, scene.selection)
+        validation = None
+        if validate_most != 0:
+            validation = validate(detector, collisions, x0, x1, most=validate_most, seed=index)
+        yield _summarize(index, start, end, collisions, contacts, validation), contacts
 
-    moves = np.array([scene_mesh.moves for scene_mesh in scene.meshes])
-    vertex_mesh = scene.meshes_of_vertices(np.arange(scene.vertex_count))
-    face_mesh = scene.meshes_of_faces(np.arange(len(scene.faces)))
-    edge_mesh = vertex_mesh[mesh.edges].max(axis=1)  # a welded end may be of an earlier mesh
-    edge_moves = moves[vertex_mesh[mesh.edges]].any(axis=1)
 
-    positions = scene.positions(scene.times[0])
-    for index, (start, end) in enumerate(pairwise(scene.times)):
-        positions, start_positions = scene.positions(end), positions
-        collisions = detector.detect(start_positions, positions)
-        vertices, faces = collisions.vertex_face.T
-        edges = collisions.edge_edge
-        vertex_face_meshes = np.stack([vertex_mesh[vertices], face_mesh[faces]], axis=1)
-        meshes = np.concatenate([vertex_face_meshes, edge_mesh[edges]])
-        counted = np.concatenate([moves[vertex_face_meshes].any(axis=1), edge_moves[edges].any(axis=1)])
-        toi = np.where(counted, np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi]), np.inf)
-
-        earliest = None
-        if counted.any():
-            first = int(np.argmin(toi))
-            if first < len(vertices):
-                contact = _name_vertex(scene, vertices[first]), _name_face(scene, faces[first])
-            else:
-                contact = [_name_edge(scene, mesh.edges[edge]) for edge in edges[first - len(vertices)]]
-            names, elements = zip(*contact, strict=True)
-            earliest = Contact(names, elements, float(toi[first]), start + float(toi[first]) * (end - start))
-
-        pairs, counts = np.unique(np.sort(meshes[counted], axis=1), axis=0, return_counts=True)
-        paths = [(scene.meshes[a].path, scene.meshes[b].path) for a, b in pairs]
-        yield Interval(
-            index=index,
-            start=start,
-            end=end,
-            vertex_face_hits=int(counted[: len(vertices)].sum()),
-            edge_edge_hits=int(counted[len(vertices) :].sum()),
-            mesh_pairs=dict(zip(paths, counts.tolist(), strict=True)),
-            earliest=earliest,
-            certified=collisions.certified,
-            stats=collisions.stats,
+def _summarize(index, start, end, collisions, contacts, validation) -> Interval:
+    earliest = None
+    if len(contacts):
+        first = int(np.argmin(contacts.toi))
+        row = slice(first, first + 1)
+        earliest = Contact(
+            contacts.mesh_names(row)[0],
+            contacts.element_names(row)[0],
+            float(contacts.toi[first]),
+            float(contacts.time[first]),
         )
-
-
-def _name_vertex(scene, vertex) -> tuple[str, str]:
-    path, point = scene.locate_vertex(vertex)
-    return path, f"vertex {point}"
-
-
-def _name_face(scene, face) -> tuple[str, str]:
-    path, polygon = scene.locate_face(face)
-    return path, f"face {polygon}"
-
-
-def _name_edge(scene, ends) -> tuple[str, str]:
-    (_, first), (path, second) = sorted(scene.locate_vertex(end) for end in ends)
-    return path, f"edge {first}-{second}"
+    pairs, counts = np.unique(np.sort(contacts.meshes, axis=1), axis=0, return_counts=True)
+    names = [mesh.name for mesh in contacts.segment.meshes]
+    edge_edge = int(contacts.kind.sum())
+    return Interval(
+        index=index,
+        start=start,
+        end=end,
+        vertex_face_hits=len(contacts) - edge_edge,
+        edge_edge_hits=edge_edge,
+        toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
+        mesh_pairs={(names[a], names[b]): count for (a, b), count in zip(pairs, counts.tolist(), strict=True)},
+        earliest=earliest,
+        certified=collisions.certified,
+        stats=collisions.stats,
+        validation=validation,
+    )

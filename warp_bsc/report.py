@@ -1,10 +1,8 @@
-"""Shows what a replay, the queries of a file or a benchmark found: tables for people, plain data for programs."""
+"""Shows what the queries of a file or a benchmark found: tables for people, plain data for programs."""
 
 import os
-from collections import Counter
 from dataclasses import asdict, dataclass
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -12,8 +10,7 @@ from .bench import DetectorBenchmark
 from .bench_queries import MODES, SEED, QueryBenchmark
 from .query import QueryResult
 from .query_file import QueryFile
-from .replay import Interval
-from .scene import Scene
+from .tables import count, make_table, say
 
 __all__ = [
     "QueryAnswers",
@@ -21,13 +18,10 @@ __all__ = [
     "print_detector_benchmarks",
     "print_queries",
     "print_query_benchmarks",
-    "print_replay",
     "queries_to_dict",
     "query_benchmarks_to_dict",
-    "replay_to_dict",
 ]
 
-_LONGEST = 30  # rows in a table, or lines in a list
 _STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
 
 
@@ -67,114 +61,6 @@ class QueryAnswers:
         }
 
 
-def print_replay(console: Console, scene: Scene, intervals: list[Interval], *, method: str, device: str) -> None:
-    """Print a table of the intervals and a summary.
-
-    Args:
-        console: Where to.
-        scene: The scene.
-        intervals: All of its intervals.
-        method: The method that was used.
-        device: The device that was used.
-    """
-    _say(
-        console,
-        f"{scene.path}: {_count(len(scene.meshes), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
-        f"{len(scene.faces):,} faces, {_count(len(intervals), 'interval')}; method {method} on {device}",
-    )
-    for warning in scene.warnings:
-        _say(console, f"note: {warning}")
-
-    # Of a long replay the collisions matter.
-    colliding = [interval for interval in intervals if interval.hits]
-    listed = (intervals if len(intervals) <= _LONGEST else colliding)[:_LONGEST]
-    if listed:
-        stages = listed[0].stats.milliseconds
-        headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
-        table = _table("Interval", *headers, caption="Times of the stages in milliseconds.")
-        for interval in listed:
-            table.add_row(
-                f"{interval.start:g} → {interval.end:g}",
-                f"{interval.pairs_tested:,}",
-                f"{interval.hits:,}",
-                f"{round(interval.earliest.time, 6):.6g}" if interval.earliest else "",
-                *(f"{milliseconds:,.1f}" for milliseconds in interval.stats.milliseconds.values()),
-            )
-        console.print(table)
-    if len(listed) < len(intervals):
-        _say(
-            console,
-            f"{_count(len(intervals) - len(listed), 'interval')} not listed, "
-            f"{len(colliding) - sum(interval.hits > 0 for interval in listed)} with collisions; --json has all.",
-        )
-
-    if colliding:
-        vertex_face = sum(interval.vertex_face_hits for interval in colliding)
-        edge_edge = sum(interval.edge_edge_hits for interval in colliding)
-        _say(
-            console,
-            f"Collisions in {len(colliding)} of {_count(len(intervals), 'interval')}: "
-            f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
-        )
-        mesh_pairs = _sum_mesh_pairs(intervals)
-        for (first, second), count in mesh_pairs[:_LONGEST]:
-            _say(console, f"  {count:,} of {first} with {'itself' if first == second else second}")
-        if len(mesh_pairs) > _LONGEST:
-            _say(console, f"  and {len(mesh_pairs) - _LONGEST} more pairs of meshes; --json has all.")
-        contact = colliding[0].earliest
-        (first, second), (first_element, second_element) = contact.meshes, contact.elements
-        other = "its" if first == second else f"{second},"
-        _say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
-        worst = max(colliding, key=lambda interval: interval.hits)
-        _say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
-    else:
-        _say(console, f"No collision in {_count(len(intervals), 'interval')}.")
-
-    uncertain = sum(not interval.certified for interval in intervals)
-    if uncertain:
-        _say(console, f"Not certified, collisions may be missing: {uncertain} of {_count(len(intervals), 'interval')}.")
-    elif method == "conservative":
-        unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
-        _say(console, f"No collision can be missing; hits that could not be certified: {unsure:,}.")
-    else:
-        _say(console, "Every answer is certified.")
-    total = sum(interval.milliseconds for interval in intervals)
-    _say(console, f"Detection took {total:,.0f} ms, {total / len(intervals):,.1f} ms an interval.")
-
-
-def replay_to_dict(scene: Scene, intervals: list[Interval], *, method: str, device: str) -> dict:
-    """Everything that a replay found, to be written as JSON. Arguments as of :func:`print_replay`."""
-    return {
-        "scene": scene.path,
-        "method": method,
-        "device": device,
-        "time_codes_per_second": scene.time_codes_per_second,
-        "vertices": scene.vertex_count,
-        "faces": len(scene.faces),
-        "meshes": [mesh.path for mesh in scene.meshes],
-        "warnings": scene.warnings,
-        "hits": sum(interval.hits for interval in intervals),
-        "certified": all(interval.certified for interval in intervals),
-        "mesh_pairs": _mesh_pairs_to_list(_sum_mesh_pairs(intervals)),
-        "intervals": [
-            {
-                "index": interval.index,
-                "start": interval.start,
-                "end": interval.end,
-                "pairs_tested": interval.pairs_tested,
-                "hits": interval.hits,
-                "vertex_face_hits": interval.vertex_face_hits,
-                "edge_edge_hits": interval.edge_edge_hits,
-                "earliest": asdict(interval.earliest) if interval.earliest else None,
-                "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
-                "certified": interval.certified,
-                "stages": asdict(interval.stats),
-            }
-            for interval in intervals
-        ],
-    }
-
-
 def print_queries(console: Console, answers: list[QueryAnswers], *, method: str, device: str) -> None:
     """Print the answers to query files, and how they compare with the truth where it is known.
 
@@ -185,9 +71,9 @@ def print_queries(console: Console, answers: list[QueryAnswers], *, method: str,
         device: The device that was used.
     """
     folder = os.path.commonpath([answer.file.path.absolute().parent for answer in answers])
-    _say(console, f"{_count(len(answers), 'file')} in {folder}; method {method} on {device}")
-    _say(console, "Free, hit and unsure: what floating point could certify, whatever the method.")
-    table = _table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
+    say(console, f"{count(len(answers), 'file')} in {folder}; method {method} on {device}")
+    say(console, "Free, hit and unsure: what floating point could certify, whatever the method.")
+    table = make_table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
     _add_files(
         table,
         folder,
@@ -197,13 +83,13 @@ def print_queries(console: Console, answers: list[QueryAnswers], *, method: str,
 
     known = [answer for answer in answers if answer.file.truth is not None]
     if known:
-        table = _table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
+        table = make_table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
         _add_files(table, folder, [(answer.file, list(answer.confusion.values())) for answer in known])
         console.print()
         console.print(table)
     for answer in known:
         if answer.file.truth_path != answer.file.path:
-            _say(console, f"Truth of {answer.file.path.name} from {answer.file.truth_path.name}.")
+            say(console, f"Truth of {answer.file.path.name} from {answer.file.truth_path.name}.")
 
 
 def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) -> dict:
@@ -243,12 +129,12 @@ def print_detector_benchmarks(
         threads: How many CPU cores were used.
         repeat: How many repetitions the medians are of.
     """
-    cores = _count(threads, "core") if device.is_cpu else device.name
-    _say(console, f"Method {method} on {device}, {cores}; medians of {_count(repeat, 'repetition')}")
+    cores = count(threads, "core") if device.is_cpu else device.name
+    say(console, f"Method {method} on {device}, {cores}; medians of {count(repeat, 'repetition')}")
     names = _shorten([benchmark.scene.name for benchmark in benchmarks])
     rows = list(zip(names, benchmarks, strict=True))
 
-    table = _table(
+    table = make_table(
         "Scene",
         "Triangles",
         "Candidates",
@@ -263,7 +149,7 @@ def print_detector_benchmarks(
     console.print(table)
     console.print()
 
-    table = _table(
+    table = make_table(
         "Milliseconds",
         "Detect",
         "Detect\nand read",
@@ -285,7 +171,7 @@ def print_detector_benchmarks(
     console.print()
 
     stages = benchmarks[0].stage_milliseconds
-    table = _table("Milliseconds by stage", *("\n".join(stage.rsplit(" ", 1)) for stage in stages))
+    table = make_table("Milliseconds by stage", *("\n".join(stage.rsplit(" ", 1)) for stage in stages))
     for name, took in rows:
         table.add_row(name, *(f"{milliseconds:,.2f}" for milliseconds in took.stage_milliseconds.values()))
     console.print(table)
@@ -294,7 +180,7 @@ def print_detector_benchmarks(
     if compared:
         console.print()
         *_, other = compared[0]
-        table = _table(
+        table = make_table(
             f"IPC Toolkit {other.version}",
             "Candidates",
             "Build",
@@ -302,7 +188,7 @@ def print_detector_benchmarks(
             "Sum",
             "Detect",
             "Ratio",
-            caption=f"Milliseconds on {_count(other.threads, 'core')}, for the earliest time of impact only.",
+            caption=f"Milliseconds on {count(other.threads, 'core')}, for the earliest time of impact only.",
         )
         for name, took, other in compared:
             table.add_row(
@@ -321,7 +207,7 @@ def print_detector_benchmarks(
             )
         console.print(table)
     if not all(benchmark.certified for benchmark in benchmarks):
-        _say(console, "Not certified, collisions may be missing.")
+        say(console, "Not certified, collisions may be missing.")
 
 
 def detector_benchmarks_to_dict(
@@ -377,10 +263,10 @@ def print_query_benchmarks(
         threads: How many CPU cores were used.
         repeat: How many repetitions the medians are of.
     """
-    cores = _count(threads, "core") if device.is_cpu else device.name
-    _say(console, f"Random queries on {device}, {cores}; medians of {_count(repeat, 'repetition')}")
+    cores = count(threads, "core") if device.is_cpu else device.name
+    say(console, f"Random queries on {device}, {cores}; medians of {count(repeat, 'repetition')}")
     caption = "Survivors: queries that the culls leave."
-    table = _table("Kind", "Queries", "Survivors", "Share", "Free", "Hit", "Unsure", caption=caption)
+    table = make_table("Kind", "Queries", "Survivors", "Share", "Free", "Hit", "Unsure", caption=caption)
     for found in benchmarks:
         numbers = [len(found.status), found.survivors, found.free, found.hits, found.unsure]
         number, survivors, *answers = (f"{number:,}" for number in numbers)
@@ -388,7 +274,7 @@ def print_query_benchmarks(
     console.print(table)
     console.print()
 
-    table = _table(
+    table = make_table(
         "Mode",
         "ms",
         "Million\nqueries/s",
@@ -409,10 +295,10 @@ def print_query_benchmarks(
             )
     console.print(table)
     console.print()
-    _say(console, "status: the status of a query, one thread each.")
-    _say(console, "impact: its time of impact, coordinates and normal too.")
-    _say(console, "queued: its status, by one kernel that culls and one for the survivors.")
-    _say(console, f"Copying reads and writes {copy_rate / 1e9:,.1f} GB/s here.")
+    say(console, "status: the status of a query, one thread each.")
+    say(console, "impact: its time of impact, coordinates and normal too.")
+    say(console, "queued: its status, by one kernel that culls and one for the survivors.")
+    say(console, f"Copying reads and writes {copy_rate / 1e9:,.1f} GB/s here.")
 
 
 def query_benchmarks_to_dict(
@@ -450,19 +336,6 @@ def query_benchmarks_to_dict(
     }
 
 
-def _say(console: Console, line: str):
-    console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
-
-
-def _table(first: str, *others: str, caption: str | None = None) -> Table:
-    """A table whose first column is text and may wrap, the others numbers that may not."""
-    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
-    table.add_column(first, overflow="fold")
-    for header in others:
-        table.add_column(header, justify="right", no_wrap=True)
-    return table
-
-
 def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int | float]]]):
     """Add a row for each file, and the total of many."""
 
@@ -479,19 +352,3 @@ def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int |
 def _shorten(scenes: list[str]) -> list[str]:
     """Names of scenes without their folders."""
     return [",".join(os.path.basename(path) for path in scene.split(",")) for scene in scenes]
-
-
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
-
-
-def _sum_mesh_pairs(intervals) -> list[tuple[tuple[str, str], int]]:
-    """Pairs of meshes and the number of pairs that collide, the most first."""
-    total = Counter()
-    for interval in intervals:
-        total.update(interval.mesh_pairs)
-    return total.most_common()
-
-
-def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:
-    return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]

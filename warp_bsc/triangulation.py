@@ -46,19 +46,24 @@ def _clip_ears(corners, normal) -> list[tuple[int, int, int]]:
     if normal[axis] < 0:
         plane = plane[:, ::-1]
 
-    def area(a, b, c):
-        (ux, uy), (vx, vy) = plane[b] - plane[a], plane[c] - plane[a]
-        return ux * vy - uy * vx
+    def is_left(a, b, points):
+        (ux, uy), (vx, vy) = plane[b] - plane[a], (points - plane[a]).T
+        return ux * vy - uy * vx > 0
 
     def is_ear(i):
         a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
-        return area(a, b, c) > 0 and not any(
-            area(a, b, p) > 0 and area(b, c, p) > 0 and area(c, a, p) > 0 for p in left
-        )
+        if not is_left(a, b, plane[[c]])[0]:
+            return False
+        others = plane[left]
+        return not (is_left(a, b, others) & is_left(b, c, others) & is_left(c, a, others)).any()
 
     triangles, left = [], list(range(len(corners)))
+    at = 0
     while len(left) > 2:
-        ear = next(filter(is_ear, range(len(left))), 1)  # a polygon that crosses itself may have no ear
+        # Going on from the last ear keeps the triangles of a large polygon from all meeting in one corner.
+        turns = (number % len(left) for number in range(at, at + len(left)))
+        ear = next(filter(is_ear, turns), 1)  # a polygon that crosses itself may have no ear
         triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))
         del left[ear]
+        at = ear
     return triangles

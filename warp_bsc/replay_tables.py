@@ -1,0 +1,116 @@
+"""Shows what a replay found, on the terminal."""
+
+from rich.console import Console
+from rich.text import Text
+
+from .outcome import Outcome
+from .tables import LONGEST, count, make_table, say
+
+__all__ = ["print_replay"]
+
+
+def print_replay(console: Console, outcome: Outcome) -> None:
+    """Print a table of the worst intervals and a summary.
+
+    Args:
+        console: Where to.
+        outcome: What was found.
+    """
+    scene, intervals = outcome.scene, outcome.intervals
+    say(
+        console,
+        f"{scene.path}: {count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
+        f"{scene.face_count:,} faces, {count(outcome.interval_count, 'interval')}; method {outcome.method} on "
+        f"{outcome.device}",
+    )
+    for warning in scene.warnings:
+        say(console, f"note: {warning}")
+    say(console, f"note: {outcome.motion}")
+    if not outcome.is_complete:
+        say(
+            console,
+            f"Partial: {len(intervals)} of {count(outcome.interval_count, 'interval')} were checked; "
+            f"{outcome.stopped}.",
+        )
+
+    listed = outcome.worst[:LONGEST]
+    if listed:
+        _print_worst(console, listed)
+    if listed and len(listed) < len(intervals):
+        say(
+            console,
+            f"{count(len(intervals) - len(listed), 'interval')} not listed, "
+            f"{len(outcome.colliding) - len(listed)} with collisions; --json has all.",
+        )
+
+    if outcome.colliding:
+        _print_collisions(console, outcome)
+    else:
+        say(console, f"No collision in {count(len(intervals), 'interval')}.")
+
+    if uncertain := sum(not interval.certified for interval in intervals):
+        say(console, f"Not certified, collisions may be missing: {uncertain} of {count(len(intervals), 'interval')}.")
+    elif outcome.method == "conservative":
+        unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
+        say(console, f"No collision can be missing; hits that could not be certified: {unsure:,}.")
+    else:
+        say(console, "Every answer is certified.")
+    if outcome.validation:
+        _print_validation(console, outcome.validation)
+    total = sum(outcome.milliseconds.values())
+    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
+
+
+def _print_worst(console, listed):
+    """The intervals with the most collisions first."""
+    stages = listed[0].stats.milliseconds
+    headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
+    table = make_table("Interval", *headers, caption="The worst first; times of the stages in milliseconds.")
+    for interval in listed:
+        table.add_row(
+            Text(f"{interval.start:g} → {interval.end:g}"),
+            f"{interval.pairs_tested:,}",
+            f"{interval.hits:,}",
+            f"{round(interval.earliest.time, 6):.6g}",
+            *(f"{milliseconds:,.1f}" for milliseconds in interval.stats.milliseconds.values()),
+        )
+    console.print(table)
+
+
+def _print_collisions(console, outcome):
+    """How many pairs collide, of which meshes, and where it begins."""
+    colliding = outcome.colliding
+    vertex_face = sum(interval.vertex_face_hits for interval in colliding)
+    edge_edge = sum(interval.edge_edge_hits for interval in colliding)
+    say(
+        console,
+        f"Collisions in {len(colliding)} of {count(len(outcome.intervals), 'interval')}: "
+        f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
+    )
+    for (first, second), hits in outcome.mesh_pairs[:LONGEST]:
+        say(console, f"  {hits:,} of {first} with {'itself' if first == second else second}")
+    if len(outcome.mesh_pairs) > LONGEST:
+        say(console, f"  and {len(outcome.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
+    contact = colliding[0].earliest
+    (first, second), (first_element, second_element) = contact.meshes, contact.elements
+    other = "its" if first == second else f"{second},"
+    say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
+    worst = outcome.worst[0]
+    say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
+
+
+def _print_validation(console, found):
+    """What the exact checker says."""
+    wrong = found["disagreements"]
+    say(
+        console,
+        f"Validated by the exact checker: {count(found['hits'], 'collision')} and "
+        f"{count(found['others'], 'other pair')}, {count(len(wrong), 'disagreement')}.",
+    )
+    for line in wrong[:LONGEST]:
+        say(console, f"  {line}")
+    if len(wrong) > LONGEST:
+        say(console, f"  and {len(wrong) - LONGEST} more; --json has all.")
+    if found["false_hits"]:
+        say(console, f"Of the collisions {found['false_hits']:,} are none, as method conservative may have it.")
+    say(console, f"Certified by floating point: {found['certified']:,} of {found['answers']:,} answers.")

@@ -1,0 +1,218 @@
+"""A stretch of a scene's time over which the same meshes are there and keep their topology."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+__all__ = ["SceneMesh", "Segment"]
+
+
+@dataclass(frozen=True)
+class SceneMesh:
+    """A mesh's part of a segment.
+
+    Attributes:
+        path: The prim's path.
+        name: The same, with the number of the instance if a point instancer places it.
+        display_name: What the file says to show instead, empty if nothing.
+        moves: Whether its points or its transform change with time.
+        vertices: Its vertices, among those of all meshes before they were welded.
+        faces: Its faces, among those of all meshes.
+        points: The prim's point that each vertex is, shape [len(vertices)].
+        point_count: Number of the prim's points.
+        polygons: The prim's polygon that each face is a part of, ascending, shape [len(faces)].
+        polygon_count: Number of the prim's polygons, holes included.
+    """
+
+    path: str
+    name: str
+    display_name: str
+    moves: bool
+    vertices: slice
+    faces: slice
+    points: np.ndarray = field(repr=False)
+    point_count: int
+    polygons: np.ndarray = field(repr=False)
+    polygon_count: int
+
+
+class Segment:
+    """Meshes merged to one list of vertices and one of faces, and their positions at the times of the segment.
+
+    Attributes:
+        meshes: The meshes, in the order of their vertices.
+        faces: Vertices of each face, shape [face_count, 3], int32.
+        vertex_count: Number of vertices of all meshes, welded.
+        welded: How many vertices were welded to another.
+        dtype: Of the positions, float32 or float64.
+    """
+
+    def __init__(self, usd_meshes, times: list[float], dtype: np.dtype):
+        """Reads the topology, and finds what to weld.
+
+        Args:
+            usd_meshes: The meshes.
+            times: The segment's times, its first and its last included.
+            dtype: Of the positions.
+
+        Raises:
+            ValueError: If a mesh is broken.
+        """
+        self._usd_meshes = usd_meshes
+        self.dtype = dtype
+        self.meshes, faces = [], []
+        vertex_count = face_count = 0
+        for mesh in usd_meshes:
+            points = mesh.read_points(times[0])
+            triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
+            used, corners = np.unique(triangles, return_inverse=True)
+            faces.append(corners.reshape(-1, 3) + vertex_count)
+            self.meshes.append(
+                SceneMesh(
+                    path=mesh.path,
+                    name=mesh.name,
+                    display_name=mesh.display_name,
+                    moves=bool(mesh.times),
+                    vertices=slice(vertex_count, vertex_count + len(used)),
+                    faces=slice(face_count, face_count + len(triangles)),
+                    points=used,
+                    point_count=len(points),
+                    polygons=polygons,
+                    polygon_count=polygon_count,
+                )
+            )
+            vertex_count += len(used)
+            face_count += len(triangles)
+        self._vertex_ends = np.array([mesh.vertices.stop for mesh in self.meshes])
+        self._face_ends = np.array([mesh.faces.stop for mesh in self.meshes])
+        self._corners = np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64)
+
+        self._start = np.zeros((vertex_count, 3), dtype)
+        for number, mesh in enumerate(self.meshes):
+            self._start[mesh.vertices] = self._read_positions(number, times[0], False)
+        welded_to = self._find_welds(times)
+        self._kept, corners = np.unique(welded_to[self._corners], return_inverse=True)
+        self.faces = corners.reshape(-1, 3).astype(np.int32)
+        self.vertex_count = len(self._kept)
+        self.welded = vertex_count - self.vertex_count
+
+    def positions(self, time: float, *, before: bool = False) -> np.ndarray:
+        """Positions of all vertices in world space.
+
+        Args:
+            time: Time code.
+            before: Whether the moment before it is meant, where something jumps at that time.
+
+        Returns:
+            Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`.
+
+        Raises:
+            ValueError: If a mesh has another number of points than at first, or a coordinate is not finite.
+        """
+        positions = self._start.copy()
+        for number, mesh in enumerate(self.meshes):
+            if mesh.moves:
+                positions[mesh.vertices] = self._read_positions(number, time, before)
+        return positions[self._kept]
+
+    def locate_vertices(self, vertices) -> tuple[np.ndarray, np.ndarray]:
+        """Of each vertex its mesh, or the first of those welded there, and its number among the prim's points."""
+        return self._locate(self._kept[vertices])
+
+    def locate_faces(self, faces) -> tuple[np.ndarray, np.ndarray]:
+        """Of each face its mesh, and the number of the prim's polygon that it is a part of."""
+        faces = np.asarray(faces)
+        meshes = np.searchsorted(self._face_ends, faces, side="right")
+        polygons = np.zeros(faces.shape, dtype=np.int64)
+        for number in np.unique(meshes):
+            members = meshes == number
+            polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
+        return meshes, polygons
+
+    def locate_edges(self, ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each edge its mesh, the numbers of its ends among the prim's points, and whether it is a diagonal.
+
+        Args:
+            ends: Vertices, the smaller first, shape [n, 2].
+
+        Returns:
+            Indices of meshes, shape [n]; numbers of points, the smaller first, shape [n, 2]; and whether the edge is a
+            diagonal, shape [n]: one inside a polygon, where triangles of it meet.
+        """
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        place = np.searchsorted(keys, wanted)
+        face, corner = np.divmod(sides[place], 3)
+        # As the face has them: welded ends may be of an earlier mesh.
+        unwelded = self._corners[face[:, None], np.stack([corner, (corner + 1) % 3], axis=1)]
+        meshes, points = self._locate(unwelded)
+
+        # Triangles of one polygon follow one another.
+        following = np.minimum(place + 1, max(0, len(keys) - 1))
+        other = sides[following] // 3
+        same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
+        diagonal = (keys[following] == wanted) & (following > place) & same.all(axis=0)
+        return meshes[:, 0], np.sort(points, axis=1), diagonal
+
+    def faces_around(self, vertices) -> np.ndarray:
+        """The faces that have one of some vertices as a corner."""
+        marked = np.zeros(self.vertex_count, dtype=bool)
+        marked[vertices] = True
+        return np.flatnonzero(marked[self.faces].any(axis=1))
+
+    def faces_at_edges(self, ends) -> np.ndarray:
+        """The faces that have one of some edges, shape [n, 2], smaller vertex first, as a side."""
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
+        marked = np.zeros(len(keys) + 1, dtype=np.int64)
+        np.add.at(marked, first, 1)
+        np.add.at(marked, last, -1)
+        return np.unique(sides[np.cumsum(marked[:-1]) > 0] // 3)
+
+    @cached_property
+    def _sides(self):
+        """Keys of the sides of all faces, ascending, and the number of each: three times its face and its corner."""
+        sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        keys = self._side_keys(sides)
+        order = np.argsort(keys, kind="stable")
+        return keys[order], order
+
+    def _side_keys(self, ends):
+        return np.asarray(ends, dtype=np.int64) @ np.array([self.vertex_count, 1])
+
+    def _locate(self, unwelded):
+        meshes = np.searchsorted(self._vertex_ends, unwelded, side="right")
+        points = np.zeros(unwelded.shape, dtype=np.int64)
+        for number in np.unique(meshes):
+            members = meshes == number
+            points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
+        return meshes, points
+
+    def _read_positions(self, number, time, before) -> np.ndarray:
+        mesh = self.meshes[number]
+        return self._usd_meshes[number].read_positions(
+            time, before=before, used=mesh.points, point_count=mesh.point_count, dtype=self.dtype
+        )
+
+    def _find_welds(self, times) -> np.ndarray:
+        """The first of the vertices that are in the same place as each one at every time, shape [vertex_count]."""
+        _, places, counts = np.unique(self._start, axis=0, return_inverse=True, return_counts=True)
+        places = places.reshape(-1)  # NumPy 2.0 shapes it otherwise
+        (crowded,) = np.nonzero(counts[places] > 1)
+        welded_to = np.arange(len(places))
+        if len(crowded):
+            groups = places[crowded]
+            owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right"))
+            moving = [number for number in owners if self.meshes[number].moves]
+            positions = self._start.copy()
+            for time in times[1:] if moving else ():
+                for number in moving:
+                    vertices = self.meshes[number].vertices
+                    positions[vertices] = self._read_positions(number, time, time == times[-1])
+                motion = np.column_stack([groups, positions[crowded]])
+                groups = np.unique(motion, axis=0, return_inverse=True)[1].reshape(-1)
+            _, firsts, groups = np.unique(groups, return_index=True, return_inverse=True)
+            welded_to[crowded] = crowded[firsts[groups]]
+        return welded_to
