@@ -74,11 +74,11 @@ class Rollout:
         self.detector = bsc.CollisionDetector(mesh, method="exact")
         self.collisions = 0
 
-    def step(self, dt=DT):
+    def step(self, dt=DT, contacts=None):
         start, end = self.states
         before = start.particle_q.numpy().copy()  # the inner solver may overwrite it
         start.clear_forces()
-        self.solver.step(start, end, self.control, None, dt)
+        self.solver.step(start, end, self.control, contacts, dt)
         c = self.detector.detect(before, end.particle_q.numpy())
         self.collisions += len(c.vertex_face) + len(c.edge_edge)
         self.states = end, start
@@ -114,6 +114,39 @@ def test_nothing_passes_through(inner, speed, device):
     assert len(stopped.detector.find_intersections(stopped.positions)) == 0
     report = stopped.solver.report
     assert (report.steps, report.uncertified_steps) == (steps, 0)
+
+
+def test_style3d_is_an_inner_solver_too(device):
+    """It wants cloth of its own kind, and contacts."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    newton.solvers.SolverStyle3D.register_custom_attributes(builder)
+    stiff = {"tri_aniso_ke": wp.vec3(1e2, 1e2, 1e1), "edge_aniso_ke": wp.vec3(2e-5, 1e-5, 5e-6)}
+    for n, cell, height, speed in ((12, 0.05, 0.0, 0.0), (6, 0.03, 0.05, -10.0)):
+        newton.solvers.style3d.add_cloth_grid(
+            builder,
+            pos=wp.vec3(-0.5 * n * cell, -0.5 * n * cell, height),
+            rot=wp.quat_identity(),
+            vel=wp.vec3(0.0, 0.0, speed),
+            dim_x=n,
+            dim_y=n,
+            cell_x=cell,
+            cell_y=cell,
+            mass=0.3 * cell**2,
+            particle_radius=0.002,
+            **dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], speed == 0.0),
+            **stiff,
+        )
+    model = builder.finalize(device=device)
+    contacts = newton.CollisionPipeline(model).contacts()
+    collisions = []
+    for ccd in (False, True):
+        solver = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
+        rollout = Rollout(model, bsc.SolverCCD(solver) if ccd else solver)
+        for _ in range(8):
+            rollout.step(contacts=contacts)
+        collisions.append(rollout.collisions)
+    assert collisions[0] > 0 and collisions[1] == 0
+    assert rollout.solver.report.uncertified_steps == rollout.solver.report.truncated_steps == 0
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
