@@ -6,8 +6,6 @@ import warp as wp
 from .angular_momentum import SUMS, sum_bodies, sum_torques, turn_vertices
 from .constraints import (
     ACTIVE,
-    ANOTHER,
-    BATCH,
     CERTIFIED,
     FIRST_HITS,
     FROZEN_NOW,
@@ -22,14 +20,7 @@ from .constraints import (
     Contacts,
     Progress,
     Vertices,
-    accelerate,
-    change_velocities,
     collect_contacts,
-    displace,
-    enlist_accelerating,
-    enlist_displacing,
-    move_vertices,
-    start_impulses,
     to_double,
     to_single,
 )
@@ -37,6 +28,17 @@ from .detector import CollisionDetector
 from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces
 from .narrow_phase import Count, roomy
 from .near_pairs import NearPairs, collect_near_pairs, forget_near_pairs
+from .projection import (
+    ANOTHER,
+    BATCH,
+    accelerate,
+    change_velocities,
+    displace,
+    enlist_accelerating,
+    enlist_displacing,
+    move_vertices,
+    start_impulses,
+)
 
 __all__ = ["FROZEN", "TRUNCATED", "Response"]
 
