@@ -298,6 +298,7 @@ def print_query_benchmarks(
     say(console, "status: the status of a query, one thread each.")
     say(console, "impact: its time of impact, coordinates and normal too.")
     say(console, "queued: its status, by one kernel that culls and one for the survivors.")
+    say(console, "exact: its status in integers, where floating point leaves it open.")
     say(console, f"Copying reads and writes {copy_rate / 1e9:,.1f} GB/s here.")
 
 
