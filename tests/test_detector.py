@@ -10,6 +10,8 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.blocks import BlockBroadPhase
 from warp_bsc.bvh import BvhBroadPhase
+from warp_bsc.kernels.signs import FREE
+from warp_bsc.narrow_phase import Count
 
 METHODS = ("float", "conservative", "exact")
 
@@ -267,6 +269,58 @@ def test_queues_with_room_for_one_entry_grow(broad_phase):
     c = detector.detect(x0, x1)
     assert_same(c, expected)
     assert c.certified and not c.overflowed
+
+
+def found_pairs(narrow_phases):
+    """What a detection that was not sorted found, as a set for each kind."""
+    found = []
+    for narrow_phase in narrow_phases:
+        count = int(narrow_phase.counts.numpy()[Count.CONTACTS])
+        real = narrow_phase.unsorted.status.numpy()[:count] != FREE
+        found.append({tuple(pair) for pair in narrow_phase.unsorted.pairs.numpy()[:count][real].tolist()})
+    return found
+
+
+def test_of_what_has_changed_all_contacts_are_found_again(broad_phase, device):
+    """Pairs of which no vertex has changed may be left out, and all that is found is right."""
+    x0, x1, faces = crumpled(1)
+    mesh = bsc.CollisionMesh(faces, len(x0), device=device)
+    detector = bsc.CollisionDetector(mesh)
+    detector.detect(x0, x1)  # makes room
+    random = np.random.default_rng(0)
+    for share in (0.0, 0.02, 0.3, 1.0):
+        moved = random.random(len(x0)) < share
+        after = x1 + (0.002 * moved[:, None] * random.standard_normal(x1.shape)).astype(np.float32)
+        start, first, second = (wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1, after))
+        everything = found_pairs(detector.find_contacts(start, second))
+        detector.find_contacts(start, first)
+        changed = wp.array(moved, dtype=int, device=device)
+        again = found_pairs(detector.find_contacts(start, second, refit=True, changed=changed))
+        candidates = sum(int(n.counts.numpy()[Count.CANDIDATES]) for n in detector.narrow_phases)
+        assert (share == 0.0) == (candidates == 0)
+        for full, part, (one, other) in zip(
+            everything, again, ((mesh.vertices[:, None], mesh.faces), (mesh.edges, mesh.edges)), strict=True
+        ):
+            concerned = {(a, b) for a, b in full if moved[one[a]].any() or moved[other[b]].any()}
+            assert concerned <= part <= full
+            assert share < 0.3 or len(part) > 10
+
+
+def test_all_overlapping_pairs_can_be_had(broad_phase, device):
+    """Those as well that an axis separates, and as many as were counted."""
+    x0, x1, faces = crumpled(2)
+    mesh = bsc.CollisionMesh(faces, len(x0), device=device)
+    detector = bsc.CollisionDetector(mesh)
+    positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
+    detector.find_contacts(*positions)
+    while detector.grow():
+        detector.find_contacts(*positions)
+    while True:
+        counts = [narrow_phase.counts.numpy().copy() for narrow_phase in detector.find_candidates()]
+        if not detector.grow():
+            break
+    for kind_counts in counts:
+        assert kind_counts[Count.NEAR] == kind_counts[Count.CANDIDATES] > 0
 
 
 def test_every_pair_a_candidate(broad_phase):

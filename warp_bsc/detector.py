@@ -395,6 +395,8 @@ class CollisionDetector:
     def find_candidates(self):
         """Finds all pairs again whose swept boxes overlapped in the last detection, and does nothing more with them.
 
+        That detection must have found room for all, see :meth:`grow`.
+
         Returns:
             The narrow phases of vertex-face and edge-edge pairs, whose ``near`` are the pairs.
         """
