@@ -169,6 +169,28 @@ def test_without_collisions_nothing_changes(inner, device):
         assert staged.velocities.tobytes() == wanted[1].tobytes()
 
 
+def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
+    """Six patches in a pile fall on a box, all at one speed: only the lowest has a contact at first."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
+    for layer in range(6):
+        at = (0.004 * layer, 0.003 * layer, 0.0005 * (layer + 1))
+        add_patch(builder, 4, 0.028, at, velocity=(0.0, 0.0, -0.8))
+    model = builder.finalize(device=device)
+
+    def rounds():
+        rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
+        rollout.step()
+        assert rollout.collisions == 0 and rollout.solver.report.certified and rollout.solver.report.truncated == 0
+        heights = rollout.positions[:, 2].reshape(6, -1)
+        assert (np.diff(heights.mean(axis=1), prepend=0.0) > 0.0).all()
+        return rollout.solver.report.rounds
+
+    with_near_pairs = rounds()
+    monkeypatch.setattr("warp_bsc.response.Response._collect_near_pairs", lambda self: None)
+    assert 0 < with_near_pairs <= 3 < rounds()
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 @pytest.mark.parametrize("sideways", [0.0, 1.0])
 def test_momenta_of_free_bodies_are_conserved(friction, sideways, device):

@@ -307,8 +307,8 @@ class Response:
     def _detect(self, refit):
         """Detects the motion as it is now, and decides what that means."""
         detector, vertices, progress = self.detector, self.vertices, self._progress
+        changed = vertices.changed if refit else None
         while True:
-            changed = vertices.changed if refit else None
             narrow_phases = detector.find_contacts(vertices.x0, vertices.x1, refit=refit, changed=changed)
             if self._device.is_capturing or not detector.grow():
                 break
@@ -381,7 +381,10 @@ class Response:
         return True
 
     def _launch_over(self, kernel, queue, counts, count, inputs):
-        """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU."""
+        """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU.
+
+        Unlike :func:`.launching.launch_over_queue` on one thread of the CPU, where Warp's atomic additions are none.
+        """
         entries = len(queue)
         if self._device.is_cpu:
             entries = min(entries, int(counts.numpy()[count]))
