@@ -1,4 +1,4 @@
-"""Continuous collision detection of one query, to be called in any Warp kernel."""
+"""Continuous collision detection of one query, to be called in any Warp kernel, differentiable or not."""
 
 from typing import Any
 
@@ -6,107 +6,13 @@ import warp as wp
 
 from .classification import classify
 from .culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from .gradients import with_gradients
+from .motion import all_finite, double, relative_motion
 from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion, coplanarity
 from .signs import FREE, ROUNDOFF, UNSURE
 from .time_of_impact import Impact, impact
 
-_SMALLEST = wp.constant(wp.float64(1.0e-280))
-_LARGEST = wp.constant(wp.float64(1.0e300))
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
-
-
-@wp.func
-def _double(x: Any) -> wp.vec3d:
-    """The same point in double precision, exactly."""
-    return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
-
-
-@wp.func
-def _finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
-    """Whether all coordinates are finite: no sum of doubles is then anything else, but for some beyond 1e307."""
-    start = _double(a0) + _double(b0) + _double(c0) + _double(d0)
-    end = _double(a1) + _double(b1) + _double(c1) + _double(d1)
-    return wp.isfinite(start + end)
-
-
-@wp.func
-def _size(x0: wp.vec3d, x1: wp.vec3d) -> wp.vec3d:
-    return wp.max(wp.abs(x0), wp.abs(x1))
-
-
-@wp.func
-def _motion(
-    kind: int,
-    roundoff: wp.float64,
-    u0: wp.vec3d,
-    u1: wp.vec3d,
-    v0: wp.vec3d,
-    v1: wp.vec3d,
-    w0: wp.vec3d,
-    w1: wp.vec3d,
-) -> Motion:
-    """Relative motion, scaled by a power of two, which is exact, to coordinates below 2.
-
-    It is zero, which nothing can certify, where scaling is impossible: all points equal, or less than 1e-280 or more
-    than 1e300 apart.
-    """
-    motion = Motion()
-    motion.kind = kind
-    motion.roundoff = roundoff
-    u_size = _size(u0, u1)
-    v_size = _size(v0, v1)
-    w_size = _size(w0, w1)
-    size = wp.max(wp.max(u_size, wp.max(v_size, w_size)))
-    if not (size > _SMALLEST and size < _LARGEST):
-        return motion
-    exponent = (wp.cast(size, wp.uint64) >> wp.uint64(52)) & wp.uint64(2047)
-    scale = wp.cast((wp.uint64(2046) - exponent) << wp.uint64(52), wp.float64)
-    motion.u0 = scale * u0
-    motion.u1 = scale * u1
-    motion.v0 = scale * v0
-    motion.v1 = scale * v1
-    motion.w0 = scale * w0
-    motion.w1 = scale * w1
-    motion.u_size = scale * u_size
-    motion.v_size = scale * v_size
-    motion.w_size = scale * w_size
-    return motion
-
-
-@wp.func
-def vertex_face_motion(
-    p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, roundoff: wp.float64
-) -> Motion:
-    """Relative motion of a vertex and a triangle; of finite coordinates only."""
-    origin0 = _double(a0)
-    origin1 = _double(a1)
-    return _motion(
-        VERTEX_FACE,
-        roundoff,
-        _double(b0) - origin0,
-        _double(b1) - origin1,
-        _double(c0) - origin0,
-        _double(c1) - origin1,
-        _double(p0) - origin0,
-        _double(p1) - origin1,
-    )
-
-
-@wp.func
-def edge_edge_motion(
-    a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
-) -> Motion:
-    """Relative motion of two edges; of finite coordinates only."""
-    return _motion(
-        EDGE_EDGE,
-        roundoff,
-        _double(b0) - _double(a0),
-        _double(b1) - _double(a1),
-        _double(d0) - _double(c0),
-        _double(d1) - _double(c1),
-        _double(c0) - _double(a0),
-        _double(c1) - _double(a1),
-    )
 
 
 @wp.func
@@ -122,6 +28,71 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
     if status == UNSURE or (timed and status != FREE):
         return impact(motion, y, status, tolerance)
     return result
+
+
+@wp.func
+def _answer(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    timed: bool,
+    tolerance: wp.float64,
+) -> Impact:
+    """Status of a query and, if ``timed``, its first contact, both constants to differentiation."""
+    result = Impact()
+    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        result.status = UNSURE
+        return result
+    apart = bool(False)
+    if kind == VERTEX_FACE:
+        apart = vertex_face_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+    else:
+        apart = edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+    if apart:
+        result.toi = wp.float64(2.0)
+        return result
+    return solve(relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), timed, tolerance)
+
+
+@wp.func_grad(_answer)
+def _adjoint_of_answer(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    timed: bool,
+    tolerance: wp.float64,
+    adj_ret: Impact,
+):
+    """Nothing, which also keeps Warp from differentiating all that is behind an answer."""
+
+
+@wp.func
+def _impact(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    tolerance: wp.float64,
+) -> Impact:
+    found = _answer(kind, a0, b0, c0, d0, a1, b1, c1, d1, True, tolerance)
+    return with_gradients(kind, a0, b0, c0, d0, a1, b1, c1, d1, found, tolerance)
 
 
 @wp.func
@@ -144,14 +115,18 @@ def impact_vertex_face(
     Returns:
         Status, time of impact, barycentric coordinates and normal, in double precision.
     """
-    result = Impact()
-    if not _finite(p0, a0, b0, c0, p1, a1, b1, c1):
-        result.status = UNSURE
-        return result
-    if vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
-        result.toi = wp.float64(2.0)
-        return result
-    return solve(vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF), True, tolerance)
+    return _impact(
+        VERTEX_FACE,
+        double(p0),
+        double(a0),
+        double(b0),
+        double(c0),
+        double(p1),
+        double(a1),
+        double(b1),
+        double(c1),
+        tolerance,
+    )
 
 
 @wp.func
@@ -174,14 +149,18 @@ def impact_edge_edge(
     Returns:
         Status, time of impact, parameters along the edges and normal, in double precision.
     """
-    result = Impact()
-    if not _finite(a0, b0, c0, d0, a1, b1, c1, d1):
-        result.status = UNSURE
-        return result
-    if edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-        result.toi = wp.float64(2.0)
-        return result
-    return solve(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), True, tolerance)
+    return _impact(
+        EDGE_EDGE,
+        double(a0),
+        double(b0),
+        double(c0),
+        double(d0),
+        double(a1),
+        double(b1),
+        double(c1),
+        double(d1),
+        tolerance,
+    )
 
 
 @wp.func
@@ -192,11 +171,19 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
     Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points
     that are not finite are UNSURE.
     """
-    if not _finite(p0, a0, b0, c0, p1, a1, b1, c1):
-        return UNSURE
-    if vertex_face_boxes_apart(p0, a0, b0, c0, p1, a1, b1, c1):
-        return FREE
-    return solve(vertex_face_motion(p0, a0, b0, c0, p1, a1, b1, c1, ROUNDOFF), False, _TOLERANCE).status
+    return _answer(
+        VERTEX_FACE,
+        double(p0),
+        double(a0),
+        double(b0),
+        double(c0),
+        double(p1),
+        double(a1),
+        double(b1),
+        double(c1),
+        False,
+        _TOLERANCE,
+    ).status
 
 
 @wp.func
@@ -207,8 +194,16 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that
     are not finite are UNSURE.
     """
-    if not _finite(a0, b0, c0, d0, a1, b1, c1, d1):
-        return UNSURE
-    if edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-        return FREE
-    return solve(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), False, _TOLERANCE).status
+    return _answer(
+        EDGE_EDGE,
+        double(a0),
+        double(b0),
+        double(c0),
+        double(d0),
+        double(a1),
+        double(b1),
+        double(c1),
+        double(d1),
+        False,
+        _TOLERANCE,
+    ).status

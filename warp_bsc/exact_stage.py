@@ -11,9 +11,9 @@ import math
 
 import warp as wp
 
-from .kernels.ccd import edge_edge_motion, vertex_face_motion
 from .kernels.closest import contact_at
 from .kernels.exact import NONE, TOO_WIDE, decide_in
+from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polygon import BITS
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.queues import take_slot

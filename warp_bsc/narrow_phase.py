@@ -12,7 +12,6 @@ import warp as wp
 
 from . import checker
 from .exact_stage import launch_exact_stage
-from .kernels.ccd import edge_edge_motion, vertex_face_motion
 from .kernels.classification import classify
 from .kernels.closest import contact_at
 from .kernels.culling import (
@@ -21,6 +20,7 @@ from .kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
+from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polynomials import coplanarity
 from .kernels.queues import append, is_filled, take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic

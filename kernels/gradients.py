@@ -1,0 +1,225 @@
+"""Gradients of first contacts, by the implicit function theorem.
+
+A contact is a time t and two numbers x, y at which the gap between the features closes,
+
+    g(t, x, y) = w(t) - x u(t) - y v(t) = 0,
+
+with u, v, w as in :mod:`.polynomials`: x, y are (beta, gamma) of a vertex in a face, (s, -r) of two edges. Moving the
+points changes the contact by
+
+    e dt - u dx - v dy + (dw - x du - y dv) = 0,  e = dg/dt,
+
+the velocity of one feature relative to the other. So for cotangents of t, x and y there is one vector q with
+
+    q . e = dt, -q . u = dx, -q . v = dy  (cotangents),
+
+and -q, x q, y q are the cotangents of w, u, v at the time of contact; a point there has the share 1 - t of that at the
+start and t of that at the end. With n = u x v, N = n / |n| and the dual vectors u* = v x n / n^2, v* = n x u / n^2,
+
+    q = (dt + (dx u* + dy v*) . e) / (N . e) N - dx u* - dy v*.
+
+That is dt*/dx = -(dY/dx) / (dY/dt) for Y = w . n, as q for the time alone is n / (dY/dt), and the normal N follows
+u, v and the time.
+
+**At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root after it, found
+to double precision by Newton's method on N . g, for which x and y are solved at each time.
+
+**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, rest, or
+have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away from
+zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
+
+    1 / (N . e)  becomes  N . e / max((N . e)^2, (sigma max(|e|, f))^2),
+    1 / n^2      becomes  1 / max(n^2, (sigma max(|u|, f) max(|v|, f))^2).
+
+Gradients of the time are then at most 2^32 over that coordinate, and fade to zero where there is no derivative. Where
+one of the two has an effect, ``grazing`` says so. So it does where the time is not known to within the tolerance, and
+gradients are those of a contact at the time of impact with its coordinates and normal.
+"""
+
+import warp as wp
+
+from .motion import all_finite, relative_motion
+from .polynomials import VERTEX_FACE, Motion
+from .signs import FREE
+from .time_of_impact import Impact, mix_vector
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_SQUARE_SINE = wp.constant(wp.float64(2.0**-20))  # sigma^2
+_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
+_NEWTON_STEPS = wp.constant(8)
+_NEWTON_END = wp.constant(wp.float64(2.0**-50))
+_CONVERGED = wp.constant(wp.float64(2.0**-40))
+
+
+@wp.struct
+class Touch:
+    """A contact and what its gradients are made of, as the module says, in the scale of the motion."""
+
+    t: wp.float64
+    x: wp.float64
+    y: wp.float64
+    u: wp.vec3d
+    v: wp.vec3d
+    n: wp.vec3d
+    velocity: wp.vec3d  # e
+    normal: wp.vec3d  # unit normal, N or its opposite
+    area: wp.float64  # |n|^2, kept away from zero
+    approach: wp.float64  # 1 / (normal . e), kept away from infinity
+    grazing: int  # 1 where something had to be kept away
+
+
+@wp.func
+def _square_length(x: wp.vec3d) -> wp.float64:
+    return wp.max(wp.length_sq(x), _SQUARE_LENGTH)
+
+
+@wp.func
+def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, normal: wp.vec3d, planar: bool) -> Touch:
+    """The touch at a time, at the coordinates and with the normal given or, if ``planar``, those in the plane there."""
+    at = Touch()
+    at.t = t
+    at.u = mix_vector(motion.u0, motion.u1, t)
+    at.v = mix_vector(motion.v0, motion.v1, t)
+    at.n = wp.cross(at.u, at.v)
+    square = wp.length_sq(at.n)
+    smallest = _SQUARE_SINE * _square_length(at.u) * _square_length(at.v)
+    at.area = wp.max(square, smallest)
+    at.x = x
+    at.y = y
+    at.normal = normal
+    at.grazing = 1
+    if planar and square >= smallest:
+        w = mix_vector(motion.w0, motion.w1, t)
+        at.x = wp.dot(wp.cross(at.v, at.n), w) / square
+        at.y = wp.dot(wp.cross(at.n, at.u), w) / square
+        at.normal = at.n / wp.sqrt(square)
+        if wp.dot(at.normal, normal) < _ZERO:
+            at.normal = -at.normal
+        at.grazing = 0
+    at.velocity = motion.w1 - motion.w0 - at.x * (motion.u1 - motion.u0) - at.y * (motion.v1 - motion.v0)
+    speed = wp.dot(at.normal, at.velocity)
+    slowest = _SQUARE_SINE * _square_length(at.velocity)
+    at.approach = speed / wp.max(speed * speed, slowest)
+    if speed * speed < slowest:
+        at.grazing = 1
+    return at
+
+
+@wp.func
+def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
+    """The contact that was found, at the root in the tolerance after its time of impact."""
+    x = found.coordinates[0]
+    y = -found.coordinates[1]
+    if motion.kind == VERTEX_FACE:
+        x = found.coordinates[1]
+        y = found.coordinates[2]
+    at = _touch_at(motion, found.toi, x, y, found.normal, found.localized == 1)
+    if at.grazing == 1:
+        return at
+    last = wp.min(found.toi + tolerance, _ONE)
+    step = _ONE
+    for _ in range(_NEWTON_STEPS):
+        gap = mix_vector(motion.w0, motion.w1, at.t) - at.x * at.u - at.y * at.v
+        step = wp.dot(at.normal, gap) * at.approach
+        at = _touch_at(motion, wp.clamp(at.t - step, found.toi, last), x, y, found.normal, True)
+        if wp.abs(step) <= _NEWTON_END:
+            break
+    if wp.abs(step) > _CONVERGED:
+        at.grazing = 1
+    return at
+
+
+@wp.func
+def with_gradients(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    found: Impact,
+    tolerance: wp.float64,
+) -> Impact:
+    """The first contact of a query, given as a constant, as a function of the query's points.
+
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE.
+        a0: Points at the start, here and next: p a b c of a vertex and a face, a b c d of two edges.
+        b0: Second point.
+        c0: Third point.
+        d0: Fourth point.
+        a1: Points at the end, here and next.
+        b1: Second point.
+        c1: Third point.
+        d1: Fourth point.
+        found: What was found for these points.
+        tolerance: Of the time of impact, with which it was found.
+
+    Returns:
+        The same, with ``grazing``; its time, coordinates and normal have gradients.
+    """
+    result = found
+    result.grazing = 0
+    if found.status != FREE:
+        result.grazing = 1
+        if all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+            result.grazing = _touch(motion, found, tolerance).grazing
+    return result
+
+
+@wp.func_grad(with_gradients)
+def _adjoint_of_with_gradients(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    found: Impact,
+    tolerance: wp.float64,
+    adj_ret: Impact,
+):
+    if found.status != FREE and all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+        at = _touch(motion, found, tolerance)
+        # the normal, along u and v, which move with the time
+        turn = adj_ret.normal - wp.dot(at.normal, adj_ret.normal) * at.normal
+        turn = wp.dot(at.n, at.normal) / at.area * turn
+        adj_u = wp.cross(at.v, turn)
+        adj_v = wp.cross(turn, at.u)
+        adj_t = adj_ret.toi + wp.dot(adj_u, motion.u1 - motion.u0) + wp.dot(adj_v, motion.v1 - motion.v0)
+        adj_x = adj_ret.coordinates[0]
+        adj_y = -adj_ret.coordinates[1]
+        if kind == VERTEX_FACE:
+            adj_x = adj_ret.coordinates[1] - adj_ret.coordinates[0]
+            adj_y = adj_ret.coordinates[2] - adj_ret.coordinates[0]
+        # q of the module docstring
+        along = (adj_x * wp.cross(at.v, at.n) + adj_y * wp.cross(at.n, at.u)) / at.area
+        q = (adj_t + wp.dot(along, at.velocity)) * at.approach * at.normal - along
+        adj_u = motion.scale * (adj_u + at.x * q)
+        adj_v = motion.scale * (adj_v + at.y * q)
+        adj_w = -motion.scale * q
+        adj_a = adj_w
+        adj_b = -(adj_u + adj_v + adj_w)
+        adj_c = adj_u
+        adj_d = adj_v
+        if kind != VERTEX_FACE:
+            adj_a = -(adj_u + adj_w)
+            adj_b = adj_u
+            adj_c = adj_w - adj_v
+        wp.adjoint[a0] += (_ONE - at.t) * adj_a
+        wp.adjoint[b0] += (_ONE - at.t) * adj_b
+        wp.adjoint[c0] += (_ONE - at.t) * adj_c
+        wp.adjoint[d0] += (_ONE - at.t) * adj_d
+        wp.adjoint[a1] += at.t * adj_a
+        wp.adjoint[b1] += at.t * adj_b
+        wp.adjoint[c1] += at.t * adj_c
+        wp.adjoint[d1] += at.t * adj_d
