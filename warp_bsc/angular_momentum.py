@@ -7,13 +7,29 @@ import warp as wp
 
 from .constraints import PROJECTED, Constraints, Vertices, relative, to_double, to_single
 
-__all__ = ["SUMS", "sum_bodies", "sum_torques", "turn_vertices"]
+__all__ = [
+    "HELD",
+    "MASS",
+    "MOMENTS",
+    "SUMS",
+    "Moments",
+    "acts",
+    "change_by_turn",
+    "is_held",
+    "moments",
+    "sum_bodies",
+    "sum_torques",
+    "torque_of",
+    "turn_vertices",
+    "turns",
+]
 
-SUMS = 15
-"""Sums of a world: of the torque, of mass, mass times position, its six second moments, mass times the square of the
-change of velocity, and of contacts with what is not free."""
+SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
+"""How many sums of a world there are: of the torque and, from ``MASS`` on, so many moments, which are of mass, mass by
+position, its six second moments, and mass by the square of the change of velocity; and at ``HELD`` of contacts with
+what is not free."""
+Moments = wp.types.vector(length=11, dtype=wp.float64)
 
-_MASS, _FIRST, _SECOND, _SQUARE, _HELD = (wp.constant(i) for i in (3, 4, 7, 13, 14))
 _UNITS = wp.constant(wp.float64(2.0**32))
 """Sums are of integers in these units of kg, m and s, so that they are the same in any order."""
 _LIMIT = wp.constant(wp.float64(0.1))
@@ -30,13 +46,37 @@ def _add(sums: wp.array2d[wp.int64], world: int, place: int, x: wp.float64):
 
 
 @wp.func
-def _turns(vertices: Vertices, vertex: int) -> bool:
+def turns(vertices: Vertices, vertex: int) -> bool:
+    """Whether a vertex has collided, and is free to turn."""
     return vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] == PROJECTED
 
 
 @wp.func
-def _is_acting(constraints: Constraints, i: int) -> bool:
+def torque_of(vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+    """What a contact between free bodies has done to the angular momentum.
+
+    Displacements across the motion do something, and so do impulses at points that have slid apart since the contact.
+    """
+    weights = constraints.weights[i]
+    corners = constraints.vertices[i]
+    of_displacement = wp.cross(constraints.displacing[i], relative(weights, corners, vertices.wanted_velocity))
+    return of_displacement + wp.cross(relative(weights, corners, vertices.x1), constraints.impulse[i])
+
+
+@wp.func
+def acts(constraints: Constraints, i: int) -> bool:
+    """Whether a constraint has done anything."""
     return wp.length_sq(constraints.displacing[i]) + wp.length_sq(constraints.impulse[i]) > _ZERO
+
+
+@wp.func
+def is_held(vertices: Vertices, constraints: Constraints, i: int) -> bool:
+    """Whether a contact is with something that is not free."""
+    corners = constraints.vertices[i]
+    held = corners[0] == corners[1]  # on a plane
+    for j in range(4):
+        held = held or (constraints.weights[i][j] != _ZERO and not turns(vertices, corners[j]))
+    return held
 
 
 @wp.kernel(**_KERNEL)
@@ -49,65 +89,66 @@ def sum_torques(vertices: Vertices, constraints: Constraints, sums: wp.array2d[w
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    corners = constraints.vertices[i]
-    weights = constraints.weights[i]
-    world = vertices.world[corners[0]]
-    if sums[world, _HELD] != wp.int64(0) or not _is_acting(constraints, i):
+    world = vertices.world[constraints.vertices[i][0]]
+    if sums[world, HELD] != wp.int64(0) or not acts(constraints, i):
         return
-    on_plane = corners[0] == corners[1]
-    for j in range(4):
-        if on_plane or (weights[j] != _ZERO and not _turns(vertices, corners[j])):
-            sums[world, _HELD] = wp.int64(1)
-            return
-    torque = wp.cross(constraints.displacing[i], relative(weights, corners, vertices.wanted_velocity))
-    torque += wp.cross(relative(weights, corners, vertices.x1), constraints.impulse[i])
+    if is_held(vertices, constraints, i):
+        sums[world, HELD] = wp.int64(1)
+        return
+    added = torque_of(vertices, constraints, i)
     for axis in range(3):
-        _add(sums, world, axis, torque[axis])
+        _add(sums, world, axis, added[axis])
+
+
+@wp.func
+def moments(vertices: Vertices, vertex: int) -> Moments:
+    """What a vertex adds to the sums of a world, from :data:`MASS` on."""
+    mass = _ONE / wp.float64(vertices.inverse_mass[vertex])
+    x = to_double(vertices.x1[vertex])
+    change = to_double(vertices.velocity[vertex]) - to_double(vertices.wanted_velocity[vertex])
+    return Moments(
+        mass,
+        mass * x[0],
+        mass * x[1],
+        mass * x[2],
+        mass * x[0] * x[0],
+        mass * x[1] * x[1],
+        mass * x[2] * x[2],
+        mass * x[1] * x[2],
+        mass * x[2] * x[0],
+        mass * x[0] * x[1],
+        mass * wp.dot(change, change),
+    )
 
 
 @wp.kernel(**_KERNEL)
 def sum_bodies(vertices: Vertices, sums: wp.array2d[wp.int64]):
     """Sums up the moments of what has collided."""
     vertex = wp.tid()
-    if not _turns(vertices, vertex):
+    if not turns(vertices, vertex):
         return
     world = vertices.world[vertex]
-    if sums[world, _HELD] != wp.int64(0):
+    if sums[world, HELD] != wp.int64(0):
         return
-    mass = _ONE / wp.float64(vertices.inverse_mass[vertex])
-    x = to_double(vertices.x1[vertex])
-    change = to_double(vertices.velocity[vertex]) - to_double(vertices.wanted_velocity[vertex])
-    _add(sums, world, _MASS, mass)
-    _add(sums, world, _SQUARE, mass * wp.dot(change, change))
-    for axis in range(3):
-        _add(sums, world, _FIRST + axis, mass * x[axis])
-        _add(sums, world, _SECOND + axis, mass * x[axis] * x[axis])
-        _add(sums, world, _SECOND + 3 + axis, mass * x[(axis + 1) % 3] * x[(axis + 2) % 3])
+    added = moments(vertices, vertex)
+    for i in range(MOMENTS):
+        _add(sums, world, MASS + i, added[i])
 
 
 @wp.func
-def _sum(sums: wp.array2d[wp.int64], world: int, place: int) -> wp.vec3d:
-    return wp.vec3d(
-        wp.float64(sums[world, place]) / _UNITS,
-        wp.float64(sums[world, place + 1]) / _UNITS,
-        wp.float64(sums[world, place + 2]) / _UNITS,
+def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
+    """How a turn of a world, as a rigid body would turn, that takes a torque back changes the velocity at a place."""
+    square = total[10]
+    if wp.dot(torque, torque) == _ZERO or square <= _ZERO:
+        return wp.vec3d()
+    mass = total[0]
+    centre = wp.vec3d(total[1], total[2], total[3]) / mass
+    squares = wp.vec3d(total[4], total[5], total[6]) - mass * wp.cw_mul(centre, centre)
+    products = wp.vec3d(
+        total[7] - mass * centre[1] * centre[2],
+        total[8] - mass * centre[2] * centre[0],
+        total[9] - mass * centre[0] * centre[1],
     )
-
-
-@wp.kernel(**_KERNEL)
-def turn_vertices(vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Turns what has collided in each world, as a rigid body would, by the torque that contacts have added."""
-    vertex = wp.tid()
-    world = vertices.world[vertex]
-    torque = _sum(sums, world, 0)
-    if not _turns(vertices, vertex) or sums[world, _HELD] != wp.int64(0) or wp.dot(torque, torque) == _ZERO:
-        return
-    mass = wp.float64(sums[world, _MASS]) / _UNITS
-    centre = _sum(sums, world, _FIRST) / mass
-    squares = _sum(sums, world, _SECOND) - mass * wp.cw_mul(centre, centre)
-    products = _sum(sums, world, _SECOND + 3)
-    for axis in range(3):
-        products[axis] -= mass * centre[(axis + 1) % 3] * centre[(axis + 2) % 3]
     inertia = wp.mat33d(
         squares[1] + squares[2],
         -products[2],
@@ -120,10 +161,24 @@ def turn_vertices(vertices: Vertices, sums: wp.array2d[wp.int64]):
         squares[0] + squares[1],
     )
     if wp.determinant(inertia) <= _ZERO:
-        return
+        return wp.vec3d()
     turn = -wp.inverse(inertia) * torque
-    square = wp.float64(sums[world, _SQUARE]) / _UNITS
     most = _LIMIT * wp.sqrt(square / wp.max(wp.dot(turn, inertia * turn), wp.float64(1e-300)))
-    turn = wp.min(most, _ONE) * turn
-    change = wp.cross(turn, to_double(vertices.x1[vertex]) - centre)
+    return wp.cross(wp.min(most, _ONE) * turn, x - centre)
+
+
+@wp.kernel(**_KERNEL)
+def turn_vertices(vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Turns what has collided in each world by the torque that contacts have added."""
+    vertex = wp.tid()
+    world = vertices.world[vertex]
+    if not turns(vertices, vertex) or sums[world, HELD] != wp.int64(0):
+        return
+    torque = wp.vec3d()
+    for axis in range(3):
+        torque[axis] = wp.float64(sums[world, axis]) / _UNITS
+    total = Moments()
+    for i in range(MOMENTS):
+        total[i] = wp.float64(sums[world, MASS + i]) / _UNITS
+    change = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
     vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .history import History
 from .kernels.queues import is_filled
 from .kernels.signs import FREE
 from .narrow_phase import Count
@@ -9,9 +10,14 @@ from .narrow_phase import Count
 __all__ = [
     "ACTIVE",
     "CERTIFIED",
+    "EDGE_EDGE_CONTACT",
     "FIRST_HITS",
     "FROZEN_NOW",
     "HITS",
+    "NEAR_EDGES",
+    "NEAR_VERTEX_FACE",
+    "NEVER",
+    "ON_PLANE",
     "PROJECTED",
     "PROJECTIONS",
     "REMAINING",
@@ -19,6 +25,7 @@ __all__ = [
     "STEER",
     "TIMES",
     "UNDETECTED",
+    "VERTEX_FACE_CONTACT",
     "Constraints",
     "Contacts",
     "Progress",
@@ -26,7 +33,10 @@ __all__ = [
     "add_constraint",
     "add_contact",
     "collect_contacts",
+    "contact_vertices",
+    "contact_weights",
     "feasible",
+    "feasible_in_contact",
     "gap",
     "is_projecting",
     "is_slow",
@@ -34,10 +44,12 @@ __all__ = [
     "relative",
     "to_double",
     "to_single",
+    "touch_in",
+    "urgency_of",
     "widened",
 ]
 
-PROJECTIONS = wp.constant(40)
+PROJECTIONS = 40
 """Rounds of projection, after which what still collides is truncated."""
 PROJECTED = wp.constant(1)
 """Bit of what has been done to a vertex."""
@@ -49,8 +61,13 @@ ACTIVE, ROUND, CERTIFIED, HITS, FIRST_HITS, REMAINING, FROZEN_NOW, UNDETECTED, S
 certified, contacts counted so far in a detection, those of the first, those of the last, how many vertices this round
 has frozen, and whether a detection was incomplete; and how many places there are."""
 
+VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, ON_PLANE, NEAR_VERTEX_FACE, NEAR_EDGES = (wp.constant(i) for i in range(5))
+"""What a constraint is of: contacts of the two kinds, a vertex and a half-space, near pairs of the two kinds."""
+
 TIMES = wp.constant(wp.float64(2.0**30))
 """Units of time in a step, in which times are integers."""
+NEVER = wp.constant(wp.int64(2**62))
+"""No time."""
 
 _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new contacts grows from round to round: what is in a jam moves further."""
@@ -83,7 +100,7 @@ class Vertices:
     active: wp.array[int]  # how many active constraints it has
     displacement: wp.array2d[wp.int64]  # from where it wanted to be, summed over its constraints
     velocity_change: wp.array2d[wp.int64]
-    time: wp.array[int]  # of its first contact
+    time: wp.array[wp.int64]  # of its first contact, and which that is, see touch_in
     changed: wp.array[int]  # whether it may have other contacts than those that the last detection found
     done: wp.array[int]  # what has been done to it, in bits
     movable: int  # no contact counts that has vertices from here on only
@@ -94,6 +111,8 @@ class Progress:
     """How far the response is."""
 
     steer: wp.array[int]
+    projections: int  # rounds of projection at most
+    history: History
     contact_round: wp.array[int]  # of each world, the round after which it last had a contact
     iteration: wp.array[int]  # whether there is another batch of iterations, and the number of the iteration
 
@@ -125,6 +144,8 @@ class Constraints:
     normal: wp.array[wp.vec3d]
     separation: wp.array[wp.float64]  # along the normal [m]
     friction: wp.array[float]  # coefficient
+    origin: wp.array[int]  # what it is of
+    toi: wp.array[wp.float64]  # of the contact that it is of
     urgency: wp.array[wp.float64]  # share of its violation that a whole step's approach is
     displacing: wp.array[wp.vec3d]  # what it does to displacements, times mass [kg m]
     slow: wp.array[int]  # 1 where it is of what moves little, see is_slow
@@ -150,7 +171,7 @@ def to_single(x: wp.vec3d) -> wp.vec3:
 @wp.func
 def is_projecting(progress: Progress, world: int) -> bool:
     """Whether this round projects vertices of a world: one without contacts is left as it is, like one alone."""
-    return progress.steer[ROUND] <= PROJECTIONS and progress.contact_round[world] == progress.steer[ROUND] - 1
+    return progress.steer[ROUND] <= progress.projections and progress.contact_round[world] == progress.steer[ROUND] - 1
 
 
 @wp.func
@@ -161,7 +182,18 @@ def add_contact(progress: Progress, world: int):
 
 
 @wp.func
-def _vertices(contacts: Contacts, i: int) -> wp.vec4i:
+def touch_in(vertices: Vertices, vertex: int, time: wp.float64, kind: int, i: int):
+    """Takes down that a vertex is in the contact ``i`` of a kind, if it is its first in this step.
+
+    A key orders them: the time, above which of them it is.
+    """
+    key = (wp.int64(wp.floor(TIMES * time)) << wp.int64(32)) | wp.int64(4 * i + kind)
+    wp.atomic_min(vertices.time, vertex, key)
+
+
+@wp.func
+def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
+    """The four vertices of a contact, those of its first element first."""
     first = contacts.pairs[i][0]
     second = contacts.pairs[i][1]
     if contacts.edges == 1:
@@ -175,10 +207,14 @@ def _vertices(contacts: Contacts, i: int) -> wp.vec4i:
 
 
 @wp.func
-def _weights(contacts: Contacts, i: int) -> wp.vec4d:
-    """Weights of the four vertices in the vector from the contact point of the second feature to that of the first."""
-    c = contacts.coordinates[i]
-    if contacts.edges == 1:
+def contact_weights(edges: int, c: wp.vec3d) -> wp.vec4d:
+    """Weights of the four vertices in the vector from the contact point of the second feature to that of the first.
+
+    Args:
+        edges: 1 where the contact is of edges.
+        c: Its coordinates.
+    """
+    if edges == 1:
         return wp.vec4d(_ONE - c[0], c[0], c[1] - _ONE, -c[1])
     return wp.vec4d(_ONE, -c[0], -c[1], -c[2])
 
@@ -216,6 +252,20 @@ def feasible(asked: wp.float64, start: wp.float64, separation: wp.float64, path:
 
 
 @wp.func
+def feasible_in_contact(
+    vertices: Vertices,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    asked: wp.float64,
+    separation: wp.float64,
+) -> wp.float64:
+    """The separation to ask of a contact of what is slow, where ``asked`` is asked of others."""
+    start = wp.dot(normal, relative(weights, corners, vertices.x0))
+    return feasible(asked, start, separation, longest_path(vertices, corners))
+
+
+@wp.func
 def widened(separation: wp.float64, progress: Progress) -> wp.float64:
     """The separation that is asked for in a round."""
     return separation * wp.min(wp.pow(_WIDENING, wp.float64(progress.steer[ROUND])), _WIDEST)
@@ -238,6 +288,18 @@ def gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
 
 
 @wp.func
+def urgency_of(
+    vertices: Vertices, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, separation: wp.float64
+) -> wp.float64:
+    """Which share of its violation the approach of a whole step is."""
+    end = wp.dot(normal, relative(weights, corners, vertices.x1))
+    start = wp.dot(normal, relative(weights, corners, vertices.x0))
+    if end < separation:
+        return wp.clamp((start - end) / (separation - end), _ZERO, _ONE)
+    return _ONE
+
+
+@wp.func
 def add_constraint(
     vertices: Vertices,
     constraints: Constraints,
@@ -247,6 +309,8 @@ def add_constraint(
     separation: wp.float64,
     friction: float,
     slow: int,
+    origin: int,
+    toi: wp.float64,
 ):
     """Adds a constraint that does nothing yet, if there is room."""
     i = wp.atomic_add(constraints.count, 0, 1)
@@ -257,11 +321,9 @@ def add_constraint(
         constraints.separation[i] = separation
         constraints.friction[i] = friction
         constraints.slow[i] = slow
-        path = relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
-        lack = -gap(vertices, constraints, i)
-        constraints.urgency[i] = _ONE
-        if lack > _ZERO:
-            constraints.urgency[i] = wp.clamp(-wp.dot(normal, path) / lack, _ZERO, _ONE)
+        constraints.origin[i] = origin
+        constraints.toi[i] = toi
+        constraints.urgency[i] = urgency_of(vertices, corners, weights, normal, separation)
         constraints.displacing[i] = wp.vec3d()
         constraints.impulse[i] = wp.vec3d()
         constraints.reached[i] = wp.vec3d()
@@ -276,23 +338,23 @@ def collect_contacts(
     i = wp.tid()
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
-    corners = _vertices(contacts, i)
+    corners = contact_vertices(contacts, i)
     if wp.min(corners) >= vertices.movable:
         return
     add_contact(progress, vertices.world[corners[0]])
     for j in range(4):
         vertices.changed[corners[j]] = 1
-    if progress.steer[ROUND] < PROJECTIONS:
+    if progress.steer[ROUND] < progress.projections:
         friction = wp.sqrt(vertices.friction[corners[0]] * vertices.friction[corners[3]])
-        weights = _weights(contacts, i)
+        weights = contact_weights(contacts.edges, contacts.coordinates[i])
         normal = contacts.normal[i]
         asked = widened(separation, progress)
         slow = is_slow(vertices, corners, contacts.edges)
         if slow == 1:
-            start = wp.dot(normal, relative(weights, corners, vertices.x0))
-            asked = feasible(asked, start, separation, longest_path(vertices, corners))
-        add_constraint(vertices, constraints, corners, weights, normal, asked, friction, slow)
+            asked = feasible_in_contact(vertices, corners, weights, normal, asked, separation)
+        origin = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
+        toi = contacts.toi[i]
+        add_constraint(vertices, constraints, corners, weights, normal, asked, friction, slow, origin, toi)
     else:
-        time = int(wp.floor(TIMES * contacts.toi[i]))
         for j in range(4):
-            wp.atomic_min(vertices.time, corners[j], time)
+            touch_in(vertices, corners[j], contacts.toi[i], contacts.edges, i)

@@ -4,19 +4,19 @@ import warp as wp
 
 from .constraints import (
     FIRST_HITS,
-    PROJECTIONS,
+    ON_PLANE,
     ROUND,
-    TIMES,
     Constraints,
     Progress,
     Vertices,
     add_constraint,
     add_contact,
     to_double,
+    touch_in,
     widened,
 )
 
-__all__ = ["HalfSpaces", "collect_penetrations", "place_half_spaces"]
+__all__ = ["HalfSpaces", "clearance", "collect_penetrations", "place_half_spaces", "time_of_entry"]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
@@ -58,7 +58,7 @@ def place_half_spaces(
 
 
 @wp.func
-def _clearance(plane: wp.vec4d, x: wp.vec3):
+def clearance(plane: wp.vec4d, x: wp.vec3):
     """Distance of a point from a half-space [m], negative within, and a bound on the error of what is computed.
 
     Each of three products, and each of three sums, is off by 2^-53 of itself at most, and by 2^-1075 where it
@@ -71,6 +71,12 @@ def _clearance(plane: wp.vec4d, x: wp.vec3):
         value += term
         magnitude += wp.abs(term)
     return value, _ROUNDOFF * magnitude + _TINY
+
+
+@wp.func
+def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
+    """When a vertex enters a half-space, from its clearances at the start and at the end of a step."""
+    return wp.min(wp.max(before, _ZERO) / wp.max(before - after, _TINY), wp.float64(1.0))
 
 
 @wp.kernel(**_KERNEL)
@@ -94,16 +100,16 @@ def collect_penetrations(
     for i in range(half_spaces.end.shape[0]):
         if half_spaces.world[i] >= 0 and half_spaces.world[i] != world:
             continue
-        after, error_after = _clearance(half_spaces.end[i], vertices.x1[vertex])
+        after, error_after = clearance(half_spaces.end[i], vertices.x1[vertex])
         if after > error_after:
             continue
-        before, error_before = _clearance(half_spaces.start[i], vertices.x0[vertex])
+        before, error_before = clearance(half_spaces.start[i], vertices.x0[vertex])
         if ahead:
             wp.atomic_add(progress.steer, FIRST_HITS, 1)
         elif before >= -error_before:
             add_contact(progress, world)
             vertices.changed[vertex] = 1
-        if progress.steer[ROUND] < PROJECTIONS:
+        if progress.steer[ROUND] < progress.projections:
             plane = half_spaces.end[i]
             add_constraint(
                 vertices,
@@ -114,7 +120,8 @@ def collect_penetrations(
                 plane[3] + widened(separation, progress),
                 wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
                 1,
+                ON_PLANE,
+                _ZERO,
             )
         else:
-            part = wp.max(before, _ZERO) / wp.max(before - after, _TINY)
-            wp.atomic_min(vertices.time, vertex, int(wp.floor(TIMES * wp.min(part, wp.float64(1.0)))))
+            touch_in(vertices, vertex, time_of_entry(before, after), ON_PLANE, i)

@@ -3,6 +3,8 @@
 import warp as wp
 
 from .constraints import (
+    NEAR_EDGES,
+    NEAR_VERTEX_FACE,
     Constraints,
     Progress,
     Vertices,
@@ -19,7 +21,7 @@ from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.queues import is_filled
 from .narrow_phase import Count
 
-__all__ = ["NearPairs", "collect_near_pairs", "forget_near_pairs"]
+__all__ = ["NearPairs", "closest_weights", "collect_near_pairs", "forget_near_pairs"]
 
 _NEAR = wp.constant(int(Count.NEAR))
 _REACH = wp.constant(wp.float64(1.5))
@@ -43,6 +45,28 @@ class NearPairs:
 @wp.func
 def _are_positive(a: wp.float64, b: wp.float64) -> bool:
     return a > _ZERO and b > _ZERO
+
+
+@wp.func
+def closest_weights(vertices: Vertices, corners: wp.vec4i, edges: int) -> wp.vec4d:
+    """Weights of the four vertices in the vector between the closest points of two elements at the start."""
+    a = to_double(vertices.x0[corners[0]])
+    b = to_double(vertices.x0[corners[1]])
+    c = to_double(vertices.x0[corners[2]])
+    d = to_double(vertices.x0[corners[3]])
+    if edges == 1:
+        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
+    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+
+
+@wp.func
+def _is_within(weights: wp.vec4d, edges: int) -> bool:
+    """Whether closest points are within both elements, not on their borders."""
+    if edges == 1 and not _are_positive(weights[0], weights[1]):
+        return False
+    return _are_positive(-weights[2], -weights[3]) and (edges == 1 or weights[1] < _ZERO)
 
 
 @wp.kernel(**_KERNEL)
@@ -69,21 +93,9 @@ def collect_near_pairs(
         return
     if is_slow(vertices, corners, near.edges) == 0:
         return
-    a = to_double(vertices.x0[corners[0]])
-    b = to_double(vertices.x0[corners[1]])
-    c = to_double(vertices.x0[corners[2]])
-    d = to_double(vertices.x0[corners[3]])
-    weights = wp.vec4d()
-    if near.edges == 1:
-        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
-        if not (_are_positive(at[0], _ONE - at[0]) and _are_positive(at[1], _ONE - at[1])):
-            return
-        weights = wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
-    else:
-        at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
-        if not (_are_positive(at[0], at[1]) and at[0] + at[1] < _ONE):
-            return
-        weights = wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+    weights = closest_weights(vertices, corners, near.edges)
+    if not _is_within(weights, near.edges):
+        return
     between = relative(weights, corners, vertices.x0)
     distance = wp.length(between)
     path = longest_path(vertices, corners)
@@ -91,7 +103,8 @@ def collect_near_pairs(
         return
     friction = wp.sqrt(vertices.friction[corners[0]] * vertices.friction[corners[3]])
     asked = feasible(separation, distance, separation, path)
-    add_constraint(vertices, constraints, corners, weights, between / distance, asked, friction, 1)
+    origin = wp.where(near.edges == 1, NEAR_EDGES, NEAR_VERTEX_FACE)
+    add_constraint(vertices, constraints, corners, weights, between / distance, asked, friction, 1, origin, _ZERO)
 
 
 @wp.kernel(**_KERNEL)

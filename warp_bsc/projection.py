@@ -14,6 +14,7 @@ from .constraints import (
     to_double,
     to_single,
 )
+from .history import end_iteration, is_recording, record_entry
 from .kernels.queues import take_slot
 
 __all__ = [
@@ -22,12 +23,18 @@ __all__ = [
     "ITERATIONS",
     "NUMBER",
     "accelerate",
+    "accelerated",
     "change_velocities",
     "displace",
+    "displaced",
     "enlist_accelerating",
     "enlist_displacing",
     "move_vertices",
+    "moved",
+    "spread",
     "start_impulses",
+    "starts",
+    "takes_back",
 ]
 
 ITERATIONS, BATCH = wp.constant(40), wp.constant(8)
@@ -108,7 +115,7 @@ def _add(sums: wp.array2d[wp.int64], vertex: int, x: wp.vec3d):
 
 
 @wp.func
-def _spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, sums: wp.array2d[wp.int64]):
+def spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, sums: wp.array2d[wp.int64]):
     """Adds what a constraint does to its vertices."""
     for j in range(4):
         vertex = constraints.vertices[i][j]
@@ -118,7 +125,7 @@ def _spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, s
 
 
 @wp.func
-def _takes_back(constraints: Constraints, progress: Progress, i: int) -> bool:
+def takes_back(constraints: Constraints, progress: Progress, i: int) -> bool:
     """Whether a constraint takes back what it has done too much, which leaves things nearest to what was wanted.
 
     What is fast only pushes after the first round, which makes room where contacts come back.
@@ -163,6 +170,8 @@ def _finish_iteration(constraints: Constraints, progress: Progress):
     acting = constraints.acting_count[0] > wp.int64(0)
     progress.iteration[NUMBER] = iteration
     progress.iteration[ANOTHER] = wp.where(acting and iteration < ITERATIONS, 1, 0)
+    if is_recording(progress.history):
+        end_iteration(progress.history, int(constraints.acting_count[0]))
     constraints.acting_count[0] = wp.int64(0)
 
 
@@ -184,7 +193,7 @@ def enlist_displacing(vertices: Vertices, constraints: Constraints, progress: Pr
         return
     distance = gap(vertices, constraints, i)
     acts = distance < -tolerance
-    if not acts and _takes_back(constraints, progress, i):
+    if not acts and takes_back(constraints, progress, i):
         done = constraints.displacing[i]
         if wp.length_sq(done) > _ZERO:
             friction = wp.float64(constraints.friction[i])
@@ -192,6 +201,30 @@ def enlist_displacing(vertices: Vertices, constraints: Constraints, progress: Pr
             acts = distance > tolerance or not _is_held(done, constraints.normal[i], path, friction, tolerance)
     if acts:
         _enlist(vertices, constraints, i)
+
+
+@wp.func
+def displaced(vertices: Vertices, constraints: Constraints, i: int, pushes_only: bool) -> wp.vec3d:
+    """What the multiplier of a constraint becomes by an iteration on positions, without momentum."""
+    old = constraints.displacing[i]
+    mobility = _mobility(vertices, constraints, i, wp.where(pushes_only, _RELAXATION, _ONE))
+    if mobility <= _ZERO:
+        return old
+    excess = gap(vertices, constraints, i)
+    path = _path(vertices, constraints, i)
+    return updated(old, constraints.normal[i], excess, path, mobility, wp.float64(constraints.friction[i]))
+
+
+@wp.func
+def accelerated(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> wp.vec3d:
+    """What the multiplier of a constraint becomes by an iteration on velocities, without momentum."""
+    old = constraints.impulse[i]
+    mobility = _mobility(vertices, constraints, i, _ONE)
+    if mobility <= _ZERO:
+        return old
+    excess = _parting(vertices, constraints, i, restitution)
+    velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
+    return updated(old, constraints.normal[i], excess, velocity, mobility, wp.float64(constraints.friction[i]))
 
 
 @wp.kernel(**_KERNEL)
@@ -206,31 +239,23 @@ def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
     if wp.int64(place) >= constraints.acting_count[0]:
         return
     i = constraints.acting[place]
-    relaxation = _ONE
+    pushes_only = not takes_back(constraints, progress, i)
     momentum = _momentum(constraints, progress, i)
-    if not _takes_back(constraints, progress, i):
-        relaxation = _RELAXATION
+    if pushes_only:
         momentum = wp.min(momentum, _PUSHING_MOMENTUM)
-    mobility = _mobility(vertices, constraints, i, relaxation)
-    if mobility <= _ZERO:
-        return
     old = constraints.displacing[i]
-    reached = updated(
-        old,
-        constraints.normal[i],
-        gap(vertices, constraints, i),
-        _path(vertices, constraints, i),
-        mobility,
-        wp.float64(constraints.friction[i]),
-    )
+    if is_recording(progress.history):
+        record_entry(progress.history, place, i, old, constraints.reached[i], momentum)
+    reached = displaced(vertices, constraints, i, pushes_only)
     new = reached + momentum * (reached - constraints.reached[i])
     constraints.reached[i] = reached
     constraints.displacing[i] = new
-    _spread(vertices, constraints, i, new - old, vertices.displacement)
+    spread(vertices, constraints, i, new - old, vertices.displacement)
 
 
 @wp.func
-def _moved(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
+def moved(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
+    """A position or velocity with what constraints have added to it."""
     y = to_double(x)
     for axis in range(3):
         y[axis] += wp.float64(sums[vertex, axis]) / _UNITS
@@ -247,9 +272,15 @@ def move_vertices(vertices: Vertices, constraints: Constraints, progress: Progre
         return
     vertices.active[vertex] = 0
     if vertices.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = _moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+        vertices.x1[vertex] = moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
         vertices.changed[vertex] = 1
         vertices.done[vertex] = vertices.done[vertex] | PROJECTED
+
+
+@wp.func
+def starts(constraints: Constraints, i: int) -> bool:
+    """Whether a constraint has pushed something, which gives it an impulse."""
+    return _is_pushing(constraints.displacing[i], constraints.normal[i])
 
 
 @wp.kernel(**_KERNEL)
@@ -261,11 +292,11 @@ def start_impulses(vertices: Vertices, constraints: Constraints, dt: wp.float64)
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    if _is_pushing(constraints.displacing[i], constraints.normal[i]):
+    if starts(constraints, i):
         constraints.impulse[i] = constraints.displacing[i] * (constraints.urgency[i] / dt)
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
-        _spread(vertices, constraints, i, constraints.impulse[i], vertices.velocity_change)
+        spread(vertices, constraints, i, constraints.impulse[i], vertices.velocity_change)
     constraints.reached[i] = constraints.impulse[i]
     constraints.iteration[i] = -2
 
@@ -284,7 +315,7 @@ def enlist_accelerating(
         return
     impulse = constraints.impulse[i]
     if wp.length_sq(impulse) == _ZERO:
-        if not _is_pushing(constraints.displacing[i], constraints.normal[i]):
+        if not starts(constraints, i):
             return
         if gap(vertices, constraints, i) > constraints.separation[i]:
             return
@@ -308,22 +339,14 @@ def accelerate(vertices: Vertices, constraints: Constraints, progress: Progress,
         return
     i = constraints.acting[place]
     momentum = _momentum(constraints, progress, i)
-    mobility = _mobility(vertices, constraints, i, _ONE)
-    if mobility <= _ZERO:
-        return
     old = constraints.impulse[i]
-    reached = updated(
-        old,
-        constraints.normal[i],
-        _parting(vertices, constraints, i, restitution),
-        relative(constraints.weights[i], constraints.vertices[i], vertices.velocity),
-        mobility,
-        wp.float64(constraints.friction[i]),
-    )
+    if is_recording(progress.history):
+        record_entry(progress.history, place, i, old, constraints.reached[i], momentum)
+    reached = accelerated(vertices, constraints, i, restitution)
     new = reached + momentum * (reached - constraints.reached[i])
     constraints.reached[i] = reached
     constraints.impulse[i] = new
-    _spread(vertices, constraints, i, new - old, vertices.velocity_change)
+    spread(vertices, constraints, i, new - old, vertices.velocity_change)
 
 
 @wp.kernel(**_KERNEL)
@@ -336,4 +359,4 @@ def change_velocities(vertices: Vertices, constraints: Constraints, progress: Pr
         return
     vertices.active[vertex] = 0
     if vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] <= PROJECTED:
-        vertices.velocity[vertex] = _moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)

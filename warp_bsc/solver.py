@@ -1,5 +1,6 @@
 """The collision stage for Newton: a solver that lets another one step, and makes what it did free of collisions."""
 
+import contextlib
 import time
 
 import numpy as np
@@ -9,11 +10,16 @@ from newton.solvers import SolverBase
 from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
+from .response_gradient import Recording, Undoing
 
 __all__ = ["SolverCCD", "SolverReport"]
 
 _SEPARATION = 5e-3
 """Default distance that contacts are moved apart, as a share of the median length of an edge."""
+
+_TOLERANCE = 0.1
+"""How precisely constraints are solved, as a share of the separation. With gradients all iterations are made: whether a
+constraint still acts would else depend on ever so little, and results would jump."""
 
 _STEPS, _UNCERTIFIED_STEPS, _TRUNCATED_STEPS, _FROZEN_STEPS, _TOTALS = (wp.constant(i) for i in range(5))
 """Places in the array of totals, and how many there are."""
@@ -60,6 +66,20 @@ def _count_step(steer: wp.array[int], fallbacks: wp.array[int], totals: wp.array
     totals[_UNCERTIFIED_STEPS] = totals[_UNCERTIFIED_STEPS] + 1 - steer[CERTIFIED]
     totals[_TRUNCATED_STEPS] = totals[_TRUNCATED_STEPS] + fallbacks[0]
     totals[_FROZEN_STEPS] = totals[_FROZEN_STEPS] + fallbacks[1]
+
+
+@contextlib.contextmanager
+def _paused_tape():
+    """Keeps launches from being recorded on the tape that is active, if any, and gives it."""
+    tape = wp._src.context.runtime.tape  # there is no public way to ask
+    if tape is None:
+        yield None
+        return
+    tape.__exit__(None, None, None)
+    try:
+        yield tape
+    finally:
+        tape.__enter__()
 
 
 class SolverReport:
@@ -220,6 +240,7 @@ class SolverCCD(SolverBase):
             wp.array(shape_friction[mesh.planes.shape], dtype=float, device=mesh.device),
             separation=float(separation),
             restitution=float(restitution),
+            tolerance=0.0 if model.requires_grad else _TOLERANCE,
         )
         self._response.prepare()
         self._fallbacks = wp.zeros(2, dtype=int, device=mesh.device)
@@ -244,15 +265,25 @@ class SolverCCD(SolverBase):
             dt: Length of the step [s].
             options: As for the inner solver.
         """
+        response = self._response
+        with _paused_tape():
+            response.start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
+        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        with _paused_tape() as tape:
+            self._respond(state_in, state_out, dt, tape)
+
+    def _respond(self, state_in, state_out, dt, tape):
+        """Changes what the inner solver has made of a state; a tape takes down how gradients go back."""
         response, device = self._response, self.mesh.device
         vertices = response.vertices
-        response.start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
-        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        records = tape is not None and state_out.particle_q is not None and state_out.particle_q.requires_grad
+        if records and state_in is state_out:
+            raise ValueError("gradients need the state at the start: step into another state")
         self._lap(start=True)
         response.end(state_out.particle_q, state_out.body_q)
         inputs = [state_out.particle_qd, vertices.x0, vertices.x1, dt]
         wp.launch(_start_velocities, len(vertices.x0), inputs=inputs, outputs=[vertices.velocity], device=device)
-        response.resolve(dt)
+        response.resolve(dt, records=records)
         self._fallbacks.zero_()
         inputs = [vertices.done, vertices.x1, vertices.velocity]
         outputs = [state_out.particle_q, state_out.particle_qd, self._fallbacks]
@@ -260,6 +291,17 @@ class SolverCCD(SolverBase):
         inputs, outputs = [response.steer, self._fallbacks], [self._totals]
         wp.launch(_count_step, 1, inputs=inputs, outputs=outputs, device=device)
         self._lap(start=False)
+        if records:
+            self._record(tape, state_in, state_out, Recording(response, dt))
+
+    def _record(self, tape, state_in, state_out, recording):
+        """Lets the tape carry gradients back through a step of the response."""
+        arrays = [state_in.particle_q, state_out.particle_q, state_out.particle_qd]
+
+        def backward():
+            Undoing(recording, self._response).backward(*(array.grad for array in arrays))
+
+        tape.record_func(backward, arrays)
 
     def _lap(self, *, start):
         device = self.mesh.device

@@ -1,0 +1,786 @@
+"""The gradient of a response: undoes what a step did, last things first, and carries gradients along.
+
+What a response did is a long chain of small steps: contacts become constraints, each iteration changes multipliers and
+by them positions, paths are cut, and in the end velocities change. Which contacts there were, which constraints acted
+and when it was enough is taken as given; all the rest is differentiated as it was computed. The adjoint of each small
+step is Warp's; this module only sees to it that each finds what was there when the step was made. For that iterations
+are undone: multipliers are in the history, and positions follow by taking back what multipliers had changed, exactly,
+as the sums are integers.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from .angular_momentum import (
+    HELD,
+    MASS,
+    MOMENTS,
+    SUMS,
+    Moments,
+    acts,
+    change_by_turn,
+    is_held,
+    moments,
+    torque_of,
+    turns,
+)
+from .constraints import (
+    EDGE_EDGE_CONTACT,
+    NEAR_EDGES,
+    ON_PLANE,
+    PROJECTED,
+    ROUND,
+    STEER,
+    UNDETECTED,
+    Constraints,
+    Progress,
+    Vertices,
+    contact_weights,
+    feasible,
+    feasible_in_contact,
+    longest_path,
+    relative,
+    to_double,
+    to_single,
+    urgency_of,
+    widened,
+)
+from .half_spaces import HalfSpaces, clearance, time_of_entry
+from .history import (
+    ENTRIES,
+    FORGOTTEN,
+    ITERATIONS_DONE,
+    MARKED,
+    OF_ENTRIES,
+    OF_TRUNCATIONS,
+    STANDS,
+    TRUNCATED_PATHS,
+    History,
+)
+from .kernels.gradients import with_gradients
+from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from .kernels.signs import HIT
+from .kernels.time_of_impact import Impact
+from .narrow_phase import TOLERANCE
+from .near_pairs import closest_weights
+from .projection import BATCH, accelerated, displaced, moved, spread, starts, takes_back
+from .response import SHARE, TRUNCATIONS
+
+__all__ = ["Recording", "Undoing"]
+
+_NEXT, _CURRENT, _FIRST, _MARK, _CURSOR = (wp.constant(i) for i in range(5))
+"""Places in the array that says how far undoing is: the iteration to undo next, the one being undone or -1, the first
+of the round, and the mark of the round; and how many places there are."""
+
+_TOLERANCE = wp.constant(wp.float64(TOLERANCE))
+_OF_CONSTRAINTS = (
+    "vertices",
+    "weights",
+    "normal",
+    "separation",
+    "friction",
+    "urgency",
+    "origin",
+    "toi",
+    "slow",
+    "displacing",
+    "impulse",
+    "reached",
+)
+_UNDONE_OF_CONSTRAINTS = "displacing", "impulse", "reached"
+_DIFFERENTIABLE = "weights", "normal", "separation", "urgency", "displacing", "impulse", "reached"
+_OF_VERTICES = "x0", "x1", "velocity", "wanted_x1", "wanted_velocity", "displacement", "velocity_change", "done"
+_UNDONE_OF_VERTICES = "x1", "velocity", "displacement", "velocity_change"
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+
+_KERNEL = {"enable_backward": False}
+
+
+@wp.struct
+class _Gradients:
+    """Gradients with respect to positions and velocities as they are where undoing is."""
+
+    x1: wp.array[wp.vec3]
+    velocity: wp.array[wp.vec3]
+    more_x1: wp.array[wp.vec3]  # to be added, once everything has read the former
+    more_velocity: wp.array[wp.vec3]
+    push: wp.array[wp.vec3]  # with respect to what constraints add to velocities
+
+
+@wp.func
+def _push(vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, push: wp.array[wp.vec3]):
+    """Adds what the change of a multiplier does to its vertices, see :func:`.projection.spread`."""
+    for j in range(4):
+        vertex = constraints.vertices[i][j]
+        share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
+        wp.atomic_add(push, vertex, to_single(share * change))
+
+
+@wp.func
+def _first_entry(history: History, iteration: int) -> int:
+    if iteration == 0:
+        return 0
+    return history.ends[iteration - 1]
+
+
+@wp.func
+def _entry(history: History, iteration: int, place: int) -> int:
+    """The entry of a constraint that acted in an iteration, by its place; -1 if not so many did."""
+    if iteration < 0:
+        return -1
+    entry = _first_entry(history, iteration) + place
+    return wp.where(entry < history.ends[iteration], entry, -1)
+
+
+@wp.kernel
+def _displacing(
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    cursor: wp.array[int],
+    multiplier_change: wp.array[wp.vec3d],
+    reached_change: wp.array[wp.vec3d],
+    push: wp.array[wp.vec3],
+):
+    """What an iteration on positions changes, by :func:`.projection.displace`."""
+    entry = _entry(progress.history, cursor[_CURRENT], wp.tid())
+    if entry < 0:
+        return
+    i = progress.history.constraint[entry]
+    reached = displaced(vertices, constraints, i, not takes_back(constraints, progress, i))
+    before = constraints.reached[i]
+    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.displacing[i]
+    multiplier_change[i] = change
+    reached_change[i] = reached - before
+    _push(vertices, constraints, i, change, push)
+
+
+@wp.kernel
+def _accelerating(
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    cursor: wp.array[int],
+    restitution: wp.float64,
+    multiplier_change: wp.array[wp.vec3d],
+    reached_change: wp.array[wp.vec3d],
+    push: wp.array[wp.vec3],
+):
+    """What an iteration on velocities changes, by :func:`.projection.accelerate`."""
+    entry = _entry(progress.history, cursor[_CURRENT], wp.tid())
+    if entry < 0:
+        return
+    i = progress.history.constraint[entry]
+    reached = accelerated(vertices, constraints, i, restitution)
+    before = constraints.reached[i]
+    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.impulse[i]
+    multiplier_change[i] = change
+    reached_change[i] = reached - before
+    _push(vertices, constraints, i, change, push)
+
+
+@wp.kernel
+def _starting(
+    vertices: Vertices,
+    constraints: Constraints,
+    dt: wp.float64,
+    impulse: wp.array[wp.vec3d],
+    reached: wp.array[wp.vec3d],
+    push: wp.array[wp.vec3],
+):
+    """The impulses to begin with, by :func:`.projection.start_impulses`."""
+    i = wp.tid()
+    if i < constraints.count[0] and starts(constraints, i):
+        first = constraints.displacing[i] * (constraints.urgency[i] / dt)
+        impulse[i] = first
+        reached[i] = first
+        _push(vertices, constraints, i, first, push)
+
+
+@wp.kernel
+def _twisting(vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
+    """The torques that contacts have added in each world, by :func:`.angular_momentum.sum_torques`."""
+    i = wp.tid()
+    if i >= constraints.count[0] or not acts(constraints, i):
+        return
+    world = vertices.world[constraints.vertices[i][0]]
+    if is_held(vertices, constraints, i):
+        totals[world, HELD] = _ONE
+    else:
+        torque = torque_of(vertices, constraints, i)
+        for axis in range(3):
+            wp.atomic_add(totals, world, axis, torque[axis])
+
+
+@wp.kernel
+def _massing(vertices: Vertices, totals: wp.array2d[wp.float64]):
+    """The moments of what has collided in each world, by :func:`.angular_momentum.sum_bodies`."""
+    vertex = wp.tid()
+    if turns(vertices, vertex):
+        added = moments(vertices, vertex)
+        for i in range(MOMENTS):
+            wp.atomic_add(totals, vertices.world[vertex], MASS + i, added[i])
+
+
+@wp.kernel
+def _turning(vertices: Vertices, totals: wp.array2d[wp.float64], change: wp.array[wp.vec3]):
+    """How the turn of each world changes velocities, by :func:`.angular_momentum.turn_vertices`."""
+    vertex = wp.tid()
+    world = vertices.world[vertex]
+    if not turns(vertices, vertex) or totals[world, HELD] != _ZERO:
+        return
+    torque = wp.vec3d(totals[world, 0], totals[world, 1], totals[world, 2])
+    total = Moments(
+        totals[world, MASS],
+        totals[world, MASS + 1],
+        totals[world, MASS + 2],
+        totals[world, MASS + 3],
+        totals[world, MASS + 4],
+        totals[world, MASS + 5],
+        totals[world, MASS + 6],
+        totals[world, MASS + 7],
+        totals[world, MASS + 8],
+        totals[world, MASS + 9],
+        totals[world, MASS + 10],
+    )
+    change[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
+
+
+@wp.func
+def _touching(
+    vertices: Vertices,
+    corners: wp.vec4i,
+    kind: int,
+    toi: wp.float64,
+    coordinates: wp.vec3d,
+    normal: wp.vec3d,
+) -> Impact:
+    """A contact as a function of where its vertices are."""
+    found = Impact()
+    found.status = HIT
+    found.localized = 1
+    found.toi = toi
+    found.coordinates = coordinates
+    found.normal = normal
+    return with_gradients(
+        wp.where(kind == EDGE_EDGE_CONTACT, EDGE_EDGE, VERTEX_FACE),
+        to_double(vertices.x0[corners[0]]),
+        to_double(vertices.x0[corners[1]]),
+        to_double(vertices.x0[corners[2]]),
+        to_double(vertices.x0[corners[3]]),
+        to_double(vertices.x1[corners[0]]),
+        to_double(vertices.x1[corners[1]]),
+        to_double(vertices.x1[corners[2]]),
+        to_double(vertices.x1[corners[3]]),
+        found,
+        _TOLERANCE,
+    )
+
+
+@wp.kernel
+def _constraining(
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    cursor: wp.array[int],
+    least: wp.float64,
+    weights: wp.array[wp.vec4d],
+    normals: wp.array[wp.vec3d],
+    separations: wp.array[wp.float64],
+    urgencies: wp.array[wp.float64],
+):
+    """What a round's constraints were made of contacts and near pairs, by :func:`.constraints.collect_contacts`."""
+    mark = cursor[_MARK]
+    i = wp.tid()
+    if mark > 0:
+        i += progress.history.constraints[mark - 1]
+    if i >= progress.history.constraints[mark]:
+        return
+    corners = constraints.vertices[i]
+    origin = constraints.origin[i]
+    weight = constraints.weights[i]
+    normal = constraints.normal[i]
+    separation = constraints.separation[i]
+    if origin < ON_PLANE:
+        edges = wp.where(origin == EDGE_EDGE_CONTACT, 1, 0)
+        coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
+        if edges == 1:
+            coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
+        touch = _touching(vertices, corners, origin, constraints.toi[i], coordinates, normal)
+        weight = contact_weights(edges, touch.coordinates)
+        normal = touch.normal
+        if constraints.slow[i] == 1:
+            asked = widened(least, progress)
+            separation = feasible_in_contact(vertices, corners, weight, normal, asked, least)
+    elif origin > ON_PLANE:
+        weight = closest_weights(vertices, corners, wp.where(origin == NEAR_EDGES, 1, 0))
+        between = relative(weight, corners, vertices.x0)
+        distance = wp.length(between)
+        normal = between / distance
+        separation = feasible(least, distance, least, longest_path(vertices, corners))
+    weights[i] = weight
+    normals[i] = normal
+    separations[i] = separation
+    urgencies[i] = urgency_of(vertices, corners, weight, normal, separation)
+
+
+@wp.kernel
+def _truncating(
+    vertices: Vertices,
+    half_spaces: HalfSpaces,
+    progress: Progress,
+    cursor: wp.array[int],
+    dt: wp.float64,
+    end: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+):
+    """Where paths are cut, and how fast vertices are then."""
+    history = progress.history
+    mark = cursor[_MARK]
+    entry = history.truncations[mark] + wp.tid()
+    if entry >= history.truncations[mark + 1]:
+        return
+    vertex = history.vertex[entry]
+    kind = history.kind[entry]
+    toi = _ZERO
+    if kind == ON_PLANE:
+        plane = history.contact[entry][1]
+        before, _error = clearance(half_spaces.start[plane], vertices.x0[vertex])
+        after, _error_after = clearance(half_spaces.end[plane], vertices.x1[vertex])
+        toi = time_of_entry(before, after)
+    elif kind != STANDS:
+        corners = history.contact[entry]
+        toi = _touching(
+            vertices, corners, kind, history.toi[entry], history.coordinates[entry], history.normal[entry]
+        ).toi
+    x0 = to_double(vertices.x0[vertex])
+    path = SHARE * toi * (to_double(vertices.x1[vertex]) - x0)
+    end[entry] = to_single(x0 + path)
+    velocity[entry] = to_single(path / dt)
+
+
+@wp.kernel(**_KERNEL)
+def _begin(
+    vertices: Vertices,
+    gradients: _Gradients,
+    steer: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    x0: wp.array[wp.vec3],
+):
+    """Takes over the gradients of a step's results; where all stood still, that of the start is all there is."""
+    vertex = wp.tid()
+    x1 = wp.vec3()
+    velocity = wp.vec3()
+    if vertex < particle_q.shape[0]:
+        x1 = particle_q[vertex]
+        velocity = particle_qd[vertex]
+    x0[vertex] = wp.vec3()
+    if steer[UNDETECTED] == 1 and vertices.inverse_mass[vertex] > 0.0:
+        x0[vertex] = x1
+        x1 = wp.vec3()
+        velocity = wp.vec3()
+    gradients.x1[vertex] = x1
+    gradients.velocity[vertex] = velocity
+
+
+@wp.kernel(**_KERNEL)
+def _begin_undoing(
+    history: History,
+    steer: wp.array[int],
+    projections: int,
+    cursor: wp.array[int],
+    more: wp.array[int],
+    back: wp.array[int],
+):
+    """Puts the cursor behind the last iteration on velocities; ``more`` says of iterations and rounds if there are."""
+    mark = wp.min(steer[ROUND], projections + TRUNCATIONS + 1)
+    cursor[_MARK] = mark
+    cursor[_FIRST] = history.iterations[mark + 1]
+    cursor[_NEXT] = history.sizes[ITERATIONS_DONE] - 1
+    more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+    more[1] = 1
+    back[ROUND] = mark
+
+
+@wp.kernel(**_KERNEL)
+def _begin_round(history: History, cursor: wp.array[int], more: wp.array[int]):
+    """Puts the cursor behind the last iteration on positions of a round."""
+    mark = cursor[_MARK]
+    cursor[_FIRST] = history.iterations[mark]
+    cursor[_NEXT] = history.iterations[mark + 1] - 1
+    more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def _to_detection(cursor: wp.array[int], back: wp.array[int]):
+    """Goes back to the detection before a round."""
+    back[ROUND] = wp.max(cursor[_MARK] - 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def _end_round(cursor: wp.array[int], more: wp.array[int]):
+    """Goes back to the round before."""
+    cursor[_MARK] = cursor[_MARK] - 1
+    more[1] = wp.where(cursor[_MARK] >= 0, 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def _undo(
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    cursor: wp.array[int],
+    multiplier: wp.array[wp.vec3d],
+    sums: wp.array2d[wp.int64],
+):
+    """Takes back what an iteration did to multipliers, and to the sums of what they change."""
+    entry = _entry(progress.history, cursor[_NEXT], wp.tid())
+    if cursor[_NEXT] < cursor[_FIRST] or entry < 0:
+        return
+    i = progress.history.constraint[entry]
+    old = progress.history.multiplier[entry]
+    spread(vertices, constraints, i, old - multiplier[i], sums)
+    multiplier[i] = old
+    constraints.reached[i] = progress.history.reached[entry]
+    for j in range(4):
+        wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+
+
+@wp.func
+def _step_back(vertex: int, cursor: wp.array[int], more: wp.array[int]):
+    """Lets the cursor be at the iteration that is being undone, and the next be the one before."""
+    if vertex == 0:
+        iteration = cursor[_NEXT]
+        undone = iteration >= cursor[_FIRST]
+        cursor[_CURRENT] = wp.where(undone, iteration, -1)
+        cursor[_NEXT] = wp.where(undone, iteration - 1, iteration)
+        more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def _undo_displacements(vertices: Vertices, gradients: _Gradients, cursor: wp.array[int], more: wp.array[int]):
+    """Moves vertices back to where they were before an iteration, and adds up their gradients."""
+    vertex = wp.tid()
+    _step_back(vertex, cursor, more)
+    gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
+    gradients.more_x1[vertex] = wp.vec3()
+    if vertices.active[vertex] != 0 and vertices.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def _undo_turn(vertices: Vertices):
+    """Gives vertices the velocities that they had before they were turned."""
+    vertex = wp.tid()
+    if turns(vertices, vertex):
+        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def _undo_velocities(vertices: Vertices, gradients: _Gradients, cursor: wp.array[int], more: wp.array[int]):
+    """Gives vertices the velocities that they had before an iteration, and adds up their gradients."""
+    vertex = wp.tid()
+    _step_back(vertex, cursor, more)
+    gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
+    gradients.more_velocity[vertex] = wp.vec3()
+    gradients.push[vertex] = wp.vec3()
+    if vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] <= PROJECTED:
+        gradients.push[vertex] = gradients.velocity[vertex]
+        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def _undo_truncations(
+    vertices: Vertices,
+    gradients: _Gradients,
+    history: History,
+    cursor: wp.array[int],
+    end: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+):
+    """Lets paths that were cut end where they did before; the gradients of what was cut go to ``end`` and velocity."""
+    mark = cursor[_MARK]
+    entry = history.truncations[mark] + wp.tid()
+    if entry >= history.truncations[mark + 1]:
+        return
+    vertex = history.vertex[entry]
+    end[entry] = gradients.x1[vertex]
+    velocity[entry] = gradients.velocity[vertex]
+    gradients.x1[vertex] = wp.vec3()
+    gradients.velocity[vertex] = wp.vec3()
+    vertices.x1[vertex] = history.end[entry]
+
+
+@wp.kernel(**_KERNEL)
+def _finish(
+    gradients: _Gradients,
+    x0: wp.array[wp.vec3],
+    wanted_x1: wp.array[wp.vec3],
+    wanted_velocity: wp.array[wp.vec3],
+    complete: wp.array[int],
+    start_q: wp.array[wp.vec3],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+):
+    """Hands over the gradients of what the step started from; NaN if it was not all taken down."""
+    particle = wp.tid()
+    missing = float(0.0)
+    if complete[0] == 0:
+        missing = wp.nan
+    x1 = gradients.x1[particle] + gradients.more_x1[particle] + wanted_x1[particle]
+    velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + wanted_velocity[particle]
+    particle_q[particle] = x1 + wp.vec3(missing)
+    particle_qd[particle] = velocity + wp.vec3(missing)
+    start_q[particle] = start_q[particle] + x0[particle] + wp.vec3(missing)
+
+
+@wp.kernel(**_KERNEL)
+def _judge(constraints: wp.array[int], history: History, room: int, complete: wp.array[int]):
+    """Whether all that a step did has found room in its recording."""
+    sizes = history.sizes
+    fits = constraints[0] <= room and sizes[FORGOTTEN] == 0
+    fits = fits and sizes[ITERATIONS_DONE] <= history.ends.shape[0]
+    fits = fits and sizes[ENTRIES] <= history.constraint.shape[0]
+    fits = fits and sizes[TRUNCATED_PATHS] <= history.vertex.shape[0]
+    complete[0] = wp.where(fits, 1, 0)
+
+
+class Recording:
+    """A step as it was taken down: as much of it as there is or, in a CUDA graph, as there is room for.
+
+    Attributes:
+        dt: Length of the step [s].
+        vertices: The vertices at its end.
+        constraints: The constraints at its end.
+        history: What was done.
+        half_spaces: The half-spaces.
+        steer: What the response was steered by.
+        complete: Array of one int, 1 where nothing is missing.
+    """
+
+    def __init__(self, response, dt):
+        """Copies what a response has just done."""
+        self.dt = dt
+        constraints, history = response.constraints, response.history.arrays
+        if response.device.is_capturing:
+            count, iterations = len(constraints.vertices), len(history.ends)
+            entries, truncations = len(history.constraint), len(history.vertex)
+        else:
+            count = int(constraints.count.numpy()[0])
+            iterations, entries, truncations = (
+                int(history.sizes.numpy()[int(place)]) for place in (ITERATIONS_DONE, ENTRIES, TRUNCATED_PATHS)
+            )
+        self.steer = wp.clone(response.steer)
+        self.half_spaces = HalfSpaces()
+        for name in ("start", "end"):
+            setattr(self.half_spaces, name, wp.clone(getattr(response.half_spaces, name)))
+        self.vertices = _copied(response.vertices, Vertices(), dict.fromkeys(_OF_VERTICES))
+        for name in ("inverse_mass", "friction", "world"):
+            setattr(self.vertices, name, getattr(response.vertices, name))
+        self.constraints = _copied(constraints, Constraints(), {**dict.fromkeys(_OF_CONSTRAINTS, count), "count": 1})
+        lengths = {"sizes": None, "ends": iterations, **dict.fromkeys(MARKED)}
+        lengths |= {**dict.fromkeys(OF_ENTRIES, entries), **dict.fromkeys(OF_TRUNCATIONS, truncations)}
+        self.history = _copied(history, History(), lengths)
+        self.complete = wp.empty(1, dtype=int, device=response.device)
+        inputs = [constraints.count, history, count]
+        wp.launch(_judge, 1, inputs=inputs, outputs=[self.complete], device=response.device)
+
+
+def _copied(struct, into, lengths):
+    """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
+    for name, length in lengths.items():
+        array = getattr(struct, name)
+        setattr(into, name, wp.clone(array if length is None else array[:length]))
+    return into
+
+
+def _give_gradients(struct, names, gradients=None):
+    """Replaces arrays of a struct by ones of the same data with gradients, given or new ones, which it returns."""
+    into = SimpleNamespace(**(gradients or {}))
+    for name in names:
+        array = getattr(struct, name)
+        if not hasattr(into, name):
+            setattr(into, name, wp.zeros_like(array))
+        if len(array):
+            alias = array[:]
+            alias.grad = getattr(into, name)
+            setattr(struct, name, alias)
+    return into
+
+
+class Undoing:
+    """Undoes a recorded step, and carries gradients along."""
+
+    def __init__(self, recording, response):
+        """Prepares to undo a recording of a response."""
+        self._recording, self._response, self._device = recording, response, response.device
+        self._launch_count = len(recording.constraints.vertices)
+        device, n = self._device, len(recording.vertices.x0)
+        self._gradients = gradients = _Gradients()
+        for name in _Gradients.vars:
+            setattr(gradients, name, wp.zeros(n, dtype=wp.vec3, device=device))
+        self._vertices = vertices = _copied(recording.vertices, Vertices(), dict.fromkeys(_UNDONE_OF_VERTICES))
+        for name in set(_OF_VERTICES) - set(_UNDONE_OF_VERTICES) | {"inverse_mass", "friction", "world"}:
+            setattr(vertices, name, getattr(recording.vertices, name))
+        vertices.active = wp.zeros(n, dtype=int, device=device)
+        of_vertices = {"x1": gradients.more_x1, "velocity": gradients.more_velocity}
+        self._of_vertices = _give_gradients(
+            vertices, ("x0", "x1", "velocity", "wanted_x1", "wanted_velocity"), of_vertices
+        )
+        self._constraints = constraints = _copied(
+            recording.constraints, Constraints(), dict.fromkeys(_UNDONE_OF_CONSTRAINTS)
+        )
+        for name in set(_OF_CONSTRAINTS) - set(_UNDONE_OF_CONSTRAINTS) | {"count"}:
+            setattr(constraints, name, getattr(recording.constraints, name))
+        self._of_constraints = _give_gradients(constraints, _DIFFERENTIABLE)
+        self._pushed = wp.empty(n, dtype=wp.vec3, device=device)
+        self._progress = Progress()
+        self._progress.steer = wp.zeros(int(STEER), dtype=int, device=device)
+        self._progress.history = recording.history
+        self._cursor = wp.zeros(int(_CURSOR), dtype=int, device=device)
+        self._more = wp.zeros(2, dtype=int, device=device)
+        self._more_iterations, self._more_rounds = self._more[:1], self._more[1:]
+
+    def backward(self, start_q, particle_q, particle_qd):
+        """Turns gradients with respect to what the step led to into those with respect to what it came from.
+
+        Args:
+            start_q: Gradient with respect to positions at the start, to which it is added, array of vec3.
+            particle_q: Gradient with respect to the positions at the end, array of vec3; in its place is put that with
+                respect to the positions that the inner solver wanted.
+            particle_qd: The same for the velocities.
+        """
+        recording, vertices, gradients = self._recording, self._vertices, self._gradients
+        history, of_vertices = recording.history, self._of_vertices
+        inputs = [vertices, gradients, recording.steer, particle_q, particle_qd]
+        self._launch(_begin, len(vertices.x0), inputs, [of_vertices.x0])
+        inputs = [history, recording.steer, self._response.projections]
+        self._launch(_begin_undoing, 1, inputs, [self._cursor, self._more, self._progress.steer])
+        self._undo_turn()
+        wp.capture_while(self._more_iterations, self._batch, undo=self._undo_acceleration)
+        self._undo_start()
+        wp.capture_while(self._more_rounds, self._undo_round)
+        inputs = [gradients, of_vertices.x0, of_vertices.wanted_x1, of_vertices.wanted_velocity, recording.complete]
+        self._launch(_finish, len(particle_q), inputs, [start_q, particle_q, particle_qd])
+
+    def _undo_turn(self):
+        """Undoes the turn that keeps angular momentum."""
+        vertices, constraints = self._vertices, self._constraints
+        n = len(vertices.x0)
+        self._launch(_undo_turn, n, [vertices])
+        totals = wp.zeros((self._response.worlds, int(SUMS)), dtype=wp.float64, device=self._device, requires_grad=True)
+        self._launch(_twisting, self._launch_count, [vertices, constraints], [totals])
+        self._launch(_massing, n, [vertices], [totals])
+        self._adjoin(_turning, n, [vertices, totals], [self._gradients.velocity])
+        self._adjoin(_massing, n, [vertices], [totals.grad])
+        self._adjoin(_twisting, self._launch_count, [vertices, constraints], [totals.grad])
+
+    def _batch(self, undo):
+        for _ in range(BATCH):
+            undo()
+
+    def _undo_acceleration(self):
+        """Undoes an iteration on velocities."""
+        constraints, of_constraints = self._constraints, self._of_constraints
+        self._undo(constraints.impulse, self._vertices.velocity_change)
+        self._undo_velocities()
+        self._adjoin(
+            _accelerating,
+            self._launch_count,
+            [self._vertices, constraints, self._progress, self._cursor, self._response.restitution],
+            [of_constraints.impulse, of_constraints.reached, self._gradients.push],
+        )
+        self._vertices.active.zero_()
+
+    def _undo_velocities(self):
+        inputs = [self._vertices, self._gradients, self._cursor, self._more]
+        self._launch(_undo_velocities, len(self._vertices.x0), inputs)
+
+    def _undo_start(self):
+        """Undoes the impulses to begin with."""
+        constraints, of_constraints = self._constraints, self._of_constraints
+        self._undo_velocities()
+        self._adjoin(
+            _starting,
+            self._launch_count,
+            [self._vertices, constraints, self._recording.dt],
+            [of_constraints.impulse, of_constraints.reached, self._gradients.push],
+        )
+        of_constraints.reached.zero_()
+
+    def _undo_round(self):
+        """Undoes a round: truncation or projection, and what its contacts were made of."""
+        self._undo_displacements()
+        self._undo_truncations()
+        inputs = [self._recording.history, self._cursor]
+        self._launch(_begin_round, 1, inputs, [self._more])
+        wp.capture_while(self._more_iterations, self._batch, undo=self._undo_displacement)
+        self._launch(_to_detection, 1, [self._cursor], [self._progress.steer])
+        of_constraints = self._of_constraints
+        self._adjoin(
+            _constraining,
+            self._launch_count,
+            [self._vertices, self._recording.constraints, self._progress, self._cursor, self._response.separation],
+            [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.urgency],
+        )
+        self._launch(_end_round, 1, [self._cursor], [self._more])
+
+    def _undo_displacement(self):
+        """Undoes an iteration on positions."""
+        constraints, of_constraints = self._constraints, self._of_constraints
+        self._undo(constraints.displacing, self._vertices.displacement)
+        self._undo_displacements()
+        self._adjoin(
+            _displacing,
+            self._launch_count,
+            [self._vertices, constraints, self._progress, self._cursor],
+            [of_constraints.displacing, of_constraints.reached, self._gradients.x1],
+        )
+        self._vertices.active.zero_()
+
+    def _undo_displacements(self):
+        inputs = [self._vertices, self._gradients, self._cursor, self._more]
+        self._launch(_undo_displacements, len(self._vertices.x0), inputs)
+
+    def _undo_truncations(self):
+        vertices, history = self._vertices, self._recording.history
+        truncations = len(history.vertex)
+        if not truncations:
+            return
+        ends, velocities = (wp.zeros(truncations, dtype=wp.vec3, device=self._device) for _ in range(2))
+        inputs = [vertices, self._gradients, history, self._cursor]
+        self._launch(_undo_truncations, truncations, inputs, [ends, velocities])
+        self._adjoin(
+            _truncating,
+            truncations,
+            [vertices, self._recording.half_spaces, self._progress, self._cursor, self._recording.dt],
+            [ends, velocities],
+        )
+
+    def _undo(self, multiplier, sums):
+        inputs = [self._vertices, self._constraints, self._progress, self._cursor, multiplier]
+        self._launch(_undo, self._launch_count, inputs, [sums])
+
+    def _launch(self, kernel, dim, inputs, outputs=()):
+        wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
+
+    def _adjoin(self, kernel, dim, inputs, of_outputs):
+        """Launches the adjoint of a kernel.
+
+        It does not touch outputs, which their gradients stand for, but for those that functions add to.
+        """
+        outputs = [self._pushed if of is self._gradients.x1 or of is self._gradients.push else of for of in of_outputs]
+        of_inputs = [value._cls() if hasattr(value, "_cls") else None for value in inputs]
+        wp.launch(
+            kernel,
+            dim,
+            inputs=inputs,
+            outputs=outputs,
+            adj_inputs=of_inputs,
+            adj_outputs=of_outputs,
+            adjoint=True,
+            device=self._device,
+        )
