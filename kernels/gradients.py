@@ -24,9 +24,9 @@ u, v and the time.
 **At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root after it, found
 to double precision by Newton's method on N . g, for which x and y are solved at each time.
 
-**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, rest, or
-have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away from
-zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
+**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, or
+rest, or have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away
+from zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
 
     1 / (N . e)  becomes  N . e / max((N . e)^2, (sigma max(|e|, f))^2),
     1 / n^2      becomes  1 / max(n^2, (sigma max(|u|, f) max(|v|, f))^2).
