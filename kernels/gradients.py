@@ -31,7 +31,7 @@ from zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the la
     1 / (N . e)  becomes  N . e / max((N . e)^2, (sigma max(|e|, f))^2),
     1 / n^2      becomes  1 / max(n^2, (sigma max(|u|, f) max(|v|, f))^2).
 
-Gradients of the time are then at most 2^32 over that coordinate, and fade to zero where there is no derivative. Where
+Gradients of the time are then at most 2^33 over that coordinate, and fade to zero where there is no derivative. Where
 one of the two has an effect, ``grazing`` says so. So it does where the time is not known to within the tolerance, and
 gradients are those of a contact at the time of impact with its coordinates and normal.
 """
