@@ -228,13 +228,14 @@ def test_gradients_of_the_time_are_exact_at_the_root_of_the_checker(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_do_not_depend_on_the_tolerance(kind):
-    """They are those at the root, however roughly its time is asked for."""
-    points, found, distance, _ = passing(kind, np.float64)
-    away = np.flatnonzero((distance > 0.02) & (found.status == HIT))[:2000]
-    for tolerance in (2.0**-12, 2.0**-38):
-        other = impacts(kind, points[away], tolerance)
-        errors = relative_errors(other.derivatives, found.derivatives[away])
-        assert errors.max() < 1e-9
+    """They are those at the root, however roughly its time is asked for, as far as it is certain which one that is."""
+    points, found, *_ = passing(kind, np.float64)
+    for tolerance, share in ((2.0**-2, 0.5), (2.0**-4, 0.8), (2.0**-8, 0.99), (2.0**-12, 0.998), (2.0**-38, 0.98)):
+        other = impacts(kind, points, tolerance)
+        certain = (found.status == HIT) & (found.grazing == 0) & (other.grazing == 0)
+        certain &= (found.normal * other.normal).sum(axis=1) > 0.0
+        assert certain.mean() > share
+        assert relative_errors(other.derivatives[certain], found.derivatives[certain]).max() < 1e-9
 
 
 @pytest.mark.parametrize("kind", KINDS)
