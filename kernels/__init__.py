@@ -1,8 +1,8 @@
 """Device functions to import into one's own Warp kernels.
 
 ``ccd_vertex_face`` and ``ccd_edge_edge`` answer FREE, HIT or UNSURE; ``impact_vertex_face`` and
-``impact_edge_edge`` find the first contact as well. They take eight points, ``vec3`` or ``vec3d``. The other
-modules hold one idea of the method each.
+``impact_edge_edge`` find the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``.
+The other modules hold one idea of the method each.
 """
 
 from .ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face

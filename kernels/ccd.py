@@ -1,4 +1,4 @@
-"""Continuous collision detection of one query, to be called in any Warp kernel, differentiable or not."""
+"""Continuous collision detection of one query, to be called in any Warp kernel, with or without gradients."""
 
 from typing import Any
 
@@ -113,7 +113,9 @@ def impact_vertex_face(
         tolerance: Of the time of impact, as a share of the step.
 
     Returns:
-        Status, time of impact, barycentric coordinates and normal, in double precision.
+        Status, time of impact, barycentric coordinates and normal, in double precision. The last three are
+        differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
+        are clamped, as :mod:`.gradients` says.
     """
     return _impact(
         VERTEX_FACE,
@@ -147,7 +149,9 @@ def impact_edge_edge(
         tolerance: Of the time of impact, as a share of the step.
 
     Returns:
-        Status, time of impact, parameters along the edges and normal, in double precision.
+        Status, time of impact, parameters along the edges and normal, in double precision. The last three are
+        differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
+        are clamped, as :mod:`.gradients` says.
     """
     return _impact(
         EDGE_EDGE,

@@ -21,27 +21,31 @@ start and t of that at the end. With n = u x v, N = n / |n| and the dual vectors
 That is dt*/dx = -(dY/dx) / (dY/dt) for Y = w . n, as q for the time alone is n / (dY/dt), and the normal N follows
 u, v and the time.
 
-**At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root after it, found
-to double precision by Newton's method on N . g, for which x and y are solved at each time.
+**At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root of Y that comes
+within the tolerance after it, found to double precision by Newton's method on N . g, with x and y solved for each time.
 
-**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, rest, or
-have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away from
-zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
+**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, or
+rest, or have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away
+from zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
 
     1 / (N . e)  becomes  N . e / max((N . e)^2, (sigma max(|e|, f))^2),
     1 / n^2      becomes  1 / max(n^2, (sigma max(|u|, f) max(|v|, f))^2).
 
-Gradients of the time are then at most 2^32 over that coordinate, and fade to zero where there is no derivative. Where
-one of the two has an effect, ``grazing`` says so. So it does where the time is not known to within the tolerance, and
-gradients are those of a contact at the time of impact with its coordinates and normal.
+Gradients of the time are then at most 2^33 over that coordinate, and fade to zero where there is no derivative. Where
+one of the two has an effect, ``grazing`` says so. It also does where the root is not certain: where contact is not
+certain to come within the tolerance, whose gradients are those of a contact at the time of impact with the coordinates
+and the normal there, or where Y both rises and falls within it.
+
+Gradients of points in single precision are rounded to it, and at most 2^100.
 """
 
 import warp as wp
 
+from .bernstein import mix, restrict_cubic
 from .motion import all_finite, relative_motion
-from .polynomials import VERTEX_FACE, Motion
+from .polynomials import VERTEX_FACE, Motion, coplanarity
 from .signs import FREE
-from .time_of_impact import Impact, mix_vector
+from .time_of_impact import Impact, approximate_root, mix_vector
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
@@ -118,6 +122,10 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
     if at.grazing == 1:
         return at
     last = wp.min(found.toi + tolerance, _ONE)
+    k = restrict_cubic(coplanarity(motion).k, found.toi, last)
+    if k[0] * k[3] < _ZERO:
+        t = mix(found.toi, last, approximate_root(k))
+        at = _touch_at(motion, t, x, y, found.normal, True)
     step = _ONE
     for _ in range(_NEWTON_STEPS):
         gap = mix_vector(motion.w0, motion.w1, at.t) - at.x * at.u - at.y * at.v
@@ -125,7 +133,8 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
         at = _touch_at(motion, wp.clamp(at.t - step, found.toi, last), x, y, found.normal, True)
         if wp.abs(step) <= _NEWTON_END:
             break
-    if wp.abs(step) > _CONVERGED:
+    slopes = wp.vec3d(k[1] - k[0], k[2] - k[1], k[3] - k[2])
+    if wp.abs(step) > _CONVERGED or not (wp.min(slopes) > _ZERO or wp.max(slopes) < _ZERO):
         at.grazing = 1
     return at
 

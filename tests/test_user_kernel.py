@@ -44,3 +44,16 @@ def test_double_precision_answers_are_those_of_the_query(device):
     status = wp.zeros(len(points), dtype=int)
     wp.launch(ask_edge_edge, len(points), inputs=[wp.array(points, dtype=wp.vec3d), status])
     np.testing.assert_array_equal(status.numpy(), query_edge_edge(points).status)
+
+
+def test_times_of_impact_in_a_user_kernel_have_gradients(device):
+    """A vertex that falls from 1 m to -1 m onto a triangle: raised by dz at either end, it arrives dz / 4 m later."""
+    triangle = [[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]]
+    points = np.array([[[0.0, 0.0, 1.0], *triangle, [0.0, 0.0, -1.0], *triangle]], dtype=np.float32)
+    p = wp.array(points, dtype=wp.vec3, requires_grad=True)
+    status, toi = wp.zeros(1, dtype=int), wp.zeros(1, dtype=wp.float64, requires_grad=True)
+    with wp.Tape() as tape:
+        wp.launch(ask_vertex_face, 1, inputs=[p], outputs=[status, toi])
+    tape.backward(toi)
+    np.testing.assert_allclose(p.grad.numpy()[0, [0, 4]], [[0.0, 0.0, 0.25]] * 2)
+    np.testing.assert_allclose(p.grad.numpy()[0].sum(axis=0), 0.0, atol=1e-6)

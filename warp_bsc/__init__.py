@@ -10,6 +10,7 @@ if not (Path(__file__).parent / "kernels").is_dir():
 __version__ = "0.1.0"
 
 _MODULES = {
+    "CollisionArrays": "collision_arrays",
     "CollisionDetector": "detector",
     "CollisionMesh": "mesh",
     "Collisions": "detector",
@@ -22,6 +23,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "CollisionArrays",
     "CollisionDetector",
     "CollisionMesh",
     "Collisions",

@@ -398,7 +398,8 @@ class BvhBroadPhase:
         faces = len(self._mesh.faces)
         if faces == 0:
             return
-        wp.launch(_box_elements(x0.dtype), self._most, inputs=[x0, x1, self._mesh], device=self._device)
+        inputs = [x0, x1, self._mesh]
+        wp.launch(_box_elements(x0.dtype), self._most, inputs=inputs, device=self._device, record_tape=False)
         boxes = self._mesh.face_lowers, self._mesh.face_uppers
         if self._bvh is None:
             self._bvh = wp.Bvh(*boxes, groups=self._worlds)
@@ -407,9 +408,9 @@ class BvhBroadPhase:
         else:
             self._bvh.rebuild()
         inputs = [self._bvh.id, *boxes, self._worlds, self._mesh.faces, changed, self._count, *self.queues]
-        wp.launch(_pair_faces, faces, inputs=inputs, device=self._device)
+        wp.launch(_pair_faces, faces, inputs=inputs, device=self._device, record_tape=False)
 
     def _launch_over_pairs(self, kernel, *arguments):
         (face_pairs,) = self.queues
         inputs = [self._mesh, face_pairs, self._count, *arguments]
-        wp.launch(kernel, len(face_pairs), inputs=inputs, device=self._device)
+        wp.launch(kernel, len(face_pairs), inputs=inputs, device=self._device, record_tape=False)

@@ -12,6 +12,7 @@ from . import checker
 from .arrays import checked_coordinates
 from .blocks import BlockBroadPhase
 from .bvh import BvhBroadPhase
+from .collision_arrays import CollisionArrays, put, take
 from .kernels.crossing import edge_crosses_face
 from .kernels.signs import HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly, roomy
@@ -147,9 +148,12 @@ class Collisions:
             for method "float", and if a queue overflowed, a position was not finite, or a pair was left to the host in
             a CUDA graph.
         stats: Counts and times of every stage.
+        arrays: The collisions on the device, with gradients, :class:`CollisionArrays`; None unless ``x0`` or ``x1``
+            requires gradients.
     """
 
     def __init__(self, detector, clock):
+        self.arrays = None
         self._detector = detector
         self._clock = clock  # None in a CUDA graph
         self._run = detector._run
@@ -239,7 +243,8 @@ class CollisionDetector:
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
-                array. They are taken as exact. In a CUDA graph, a Warp array of vec3 or vec3d on the mesh's device.
+                array. They are taken as exact. In a CUDA graph, or if it requires gradients, a Warp array of vec3 or
+                vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
 
         Returns:
@@ -260,7 +265,11 @@ class CollisionDetector:
             self._run += 1
             self._captured = True
             self._launch(x0, x1)
-            return Collisions(self, None)
+            collisions = Collisions(self, None)
+            if x0.requires_grad or x1.requires_grad:
+                found = {n.kind: take(n.contacts, n.counts) for n in self.narrow_phases}
+                collisions.arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, found)
+            return collisions
         last = self._last()
         if last is not None:
             last._keep()
@@ -277,8 +286,15 @@ class CollisionDetector:
             self._grow(counts)
         collisions = Collisions(self, clock)
         self._last = weakref.ref(collisions)
-        if counts[[_VERTEX_FACE + Count.WIDEST, _EDGE_EDGE + Count.WIDEST]].any():
+        left = counts[[_VERTEX_FACE + Count.WIDEST, _EDGE_EDGE + Count.WIDEST]].any()
+        if left:
             collisions._keep(x0, x1)  # what is left to the host, now, while the positions are what they were
+        if x0.requires_grad or x1.requires_grad:
+            if left:
+                found = {n.kind: put(collisions._results(), n.kind, self.mesh.device) for n in self.narrow_phases}
+            else:
+                found = {n.kind: take(n.contacts, n.counts, n.counts.numpy()) for n in self.narrow_phases}
+            collisions.arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, found)
         return collisions
 
     def find_intersections(self, x):
@@ -311,7 +327,8 @@ class CollisionDetector:
             counts.zero_()
         status = wp.empty(found, dtype=int, device=mesh.device)
         inputs = [x, mesh.device_edges, mesh.device_faces, candidates]
-        wp.launch(_kernels(x.dtype)[1], found, inputs=inputs, outputs=[status], device=mesh.device)
+        _, classify_crossings = _kernels(x.dtype)
+        wp.launch(classify_crossings, found, inputs=inputs, outputs=[status], device=mesh.device, record_tape=False)
         status = status.numpy()
         pairs = candidates.numpy()[:found]
         unsure = pairs[status == UNSURE]
@@ -327,8 +344,9 @@ class CollisionDetector:
             if x.shape != (mesh.vertex_count,):
                 raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {x.shape}")
             return x
-        if capturing:
-            raise ValueError(f"in a CUDA graph {name} must be a Warp array of vec3 or vec3d on {mesh.device}")
+        if capturing or (isinstance(x, wp.array) and x.requires_grad):
+            when = "in a CUDA graph" if capturing else "to have gradients"
+            raise ValueError(f"{when} {name} must be a Warp array of vec3 or vec3d on {mesh.device}")
         values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
         if len(values) != mesh.vertex_count:
             raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {len(values)}")
@@ -418,8 +436,8 @@ class CollisionDetector:
 
     def _count_not_finite(self, x0, x1):
         count_not_finite, _ = _kernels(x0.dtype)
-        inputs, outputs = [x0, x1], [self.counts]
-        wp.launch(count_not_finite, self.mesh.vertex_count, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        inputs, device = [x0, x1, self.counts], self.mesh.device
+        wp.launch(count_not_finite, self.mesh.vertex_count, inputs=inputs, device=device, record_tape=False)
 
     def _room(self):
         """How much room there is for what each count counts; none for positions that are not finite."""
@@ -473,6 +491,7 @@ class CollisionDetector:
                 milliseconds["exact"] += 1000.0 * (time.perf_counter() - start)
             hit = contacts["hit"]
             results[kind] = contacts["pairs"][hit]
+            results[f"_{kind}_localized"] = contacts["localized"][hit]
             for name in ("toi", "coordinates", "normal"):
                 results[f"{kind}_{name}"] = contacts[name][hit]
             earliest = min(earliest, float(results[f"{kind}_toi"].min(initial=2.0)))

@@ -1,4 +1,4 @@
-"""Launches over the entries of a queue, of which only the device knows how many there are."""
+"""Launches over the entries of a queue, of which only the device knows how many there are; on no tape."""
 
 import functools
 import os
@@ -30,13 +30,14 @@ def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=
     suit kernels of which few threads work long; a chunk, at least so large, is what a core takes at a time.
     """
     if device.is_cuda:
-        wp.launch(kernel, count, inputs=[0, *inputs], outputs=outputs, device=device, block_dim=block_dim)
+        inputs = [0, *inputs]
+        wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim, record_tape=False)
         return
     chunk = max(chunk, -(-count // (8 * _THREADS)))
 
     def launch(first):
         dim = min(chunk, count - first)
-        wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device)
+        wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device, record_tape=False)
 
     starts = range(0, count, chunk)
     if _THREADS == 1 or len(starts) < 2:

@@ -474,7 +474,7 @@ def decide_exactly(kind, x0, x1, elements, contacts, ask, *, timed=True):
         x0: Positions at the start of the step, Warp array.
         x1: Positions at its end.
         elements: Vertex indices of faces or edges, Warp array.
-        contacts: NumPy arrays by name: pairs, hit, and, if timed, toi, coordinates, normal.
+        contacts: NumPy arrays by name: pairs, hit, and, if timed, localized, toi, coordinates, normal.
         ask: Which contacts, bool, shape [n].
         timed: Whether to find times of impact, coordinates and normals.
     """
@@ -492,6 +492,7 @@ def decide_exactly(kind, x0, x1, elements, contacts, ask, *, timed=True):
     toi[ask] = getattr(checker, f"{kind}_toi")(points)[:, 0]
     hit[ask] = ~np.isnan(toi[ask])
     toi[~hit] = 2.0
+    contacts["localized"][ask] = hit[ask]
     again = np.flatnonzero(ask & hit)
     *_, find_contact_points = _kernels(kind, x0.dtype)
     at = wp.empty(len(again), dtype=wp.vec3d, device=x0.device)
@@ -499,5 +500,6 @@ def decide_exactly(kind, x0, x1, elements, contacts, ask, *, timed=True):
     times = wp.array(toi[again], dtype=wp.float64, device=x0.device)
     asked = wp.array(pairs[again], dtype=wp.vec2i, device=x0.device)
     inputs = [x0, x1, elements, asked, times]
-    wp.launch(find_contact_points, len(again), inputs=inputs, outputs=[at, direction], device=x0.device)
+    outputs = [at, direction]
+    wp.launch(find_contact_points, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
     contacts["coordinates"][again], contacts["normal"][again] = at.numpy(), direction.numpy()
