@@ -22,8 +22,10 @@ __all__ = [
     "PROJECTIONS",
     "REMAINING",
     "ROUND",
+    "SHARE",
     "STEER",
     "TIMES",
+    "TRUNCATIONS",
     "UNDETECTED",
     "VERTEX_FACE_CONTACT",
     "Constraints",
@@ -51,6 +53,10 @@ __all__ = [
 
 PROJECTIONS = 40
 """Rounds of projection, after which what still collides is truncated."""
+TRUNCATIONS = wp.constant(8)
+"""Rounds of truncation, after which what still collides stands still."""
+SHARE = wp.constant(wp.float64(0.9))
+"""Which part of the way to its first contact a truncated vertex goes."""
 PROJECTED = wp.constant(1)
 """Bit of what has been done to a vertex."""
 
@@ -126,6 +132,7 @@ class Contacts:
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
     status: wp.array[wp.int8]
+    localized: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
@@ -145,7 +152,8 @@ class Constraints:
     separation: wp.array[wp.float64]  # along the normal [m]
     friction: wp.array[float]  # coefficient
     origin: wp.array[int]  # what it is of
-    toi: wp.array[wp.float64]  # of the contact that it is of
+    localized: wp.array[wp.bool]  # whether the contact that it is of is certain to come within the tolerance after
+    toi: wp.array[wp.float64]  # its time of impact
     urgency: wp.array[wp.float64]  # share of its violation that a whole step's approach is
     displacing: wp.array[wp.vec3d]  # what it does to displacements, times mass [kg m]
     slow: wp.array[int]  # 1 where it is of what moves little, see is_slow
@@ -310,6 +318,7 @@ def add_constraint(
     friction: float,
     slow: int,
     origin: int,
+    localized: bool,
     toi: wp.float64,
 ):
     """Adds a constraint that does nothing yet, if there is room."""
@@ -322,6 +331,7 @@ def add_constraint(
         constraints.friction[i] = friction
         constraints.slow[i] = slow
         constraints.origin[i] = origin
+        constraints.localized[i] = localized
         constraints.toi[i] = toi
         constraints.urgency[i] = urgency_of(vertices, corners, weights, normal, separation)
         constraints.displacing[i] = wp.vec3d()
@@ -353,8 +363,9 @@ def collect_contacts(
         if slow == 1:
             asked = feasible_in_contact(vertices, corners, weights, normal, asked, separation)
         origin = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
+        localized = contacts.localized[i]
         toi = contacts.toi[i]
-        add_constraint(vertices, constraints, corners, weights, normal, asked, friction, slow, origin, toi)
+        add_constraint(vertices, constraints, corners, weights, normal, asked, friction, slow, origin, localized, toi)
     else:
         for j in range(4):
             touch_in(vertices, corners[j], contacts.toi[i], contacts.edges, i)

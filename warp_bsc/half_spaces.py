@@ -121,6 +121,7 @@ def collect_penetrations(
                 wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
                 1,
                 ON_PLANE,
+                True,
                 _ZERO,
             )
         else:

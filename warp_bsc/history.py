@@ -5,6 +5,7 @@ import warp as wp
 __all__ = [
     "ENTRIES",
     "FORGOTTEN",
+    "GRAZING",
     "ITERATIONS_DONE",
     "MARKED",
     "MARKS",
@@ -21,9 +22,9 @@ __all__ = [
     "record_entry",
 ]
 
-ITERATIONS_DONE, ENTRIES, TRUNCATED_PATHS, FORGOTTEN, SIZES = (wp.constant(i) for i in range(5))
-"""Places in the array of sizes: iterations so far, constraints that acted in them, paths that were cut, and whether
-constraints were forgotten; and how many places there are."""
+ITERATIONS_DONE, ENTRIES, TRUNCATED_PATHS, FORGOTTEN, GRAZING, SIZES = (wp.constant(i) for i in range(6))
+"""Places in the array of sizes: iterations so far, constraints that acted in them, paths that were cut, whether
+constraints were forgotten, and contacts whose gradients are clamped; and how many places there are."""
 
 STANDS = wp.constant(-1)
 """The kind of contact of a vertex that is left where it was."""
@@ -34,7 +35,7 @@ MARKS = wp.constant(64)
 
 MARKED = "iterations", "constraints", "truncations"
 OF_ENTRIES = "constraint", "multiplier", "reached", "momentum"
-OF_TRUNCATIONS = "vertex", "end", "contact", "kind", "toi", "coordinates", "normal"
+OF_TRUNCATIONS = "vertex", "end", "contact", "kind", "localized", "toi", "coordinates", "normal"
 """Arrays of a history that have an element for each mark, each entry, each path that was cut."""
 
 
@@ -55,6 +56,7 @@ class History:
     end: wp.array[wp.vec3]  # of the path before
     kind: wp.array[int]  # of the contact that it was cut before; STANDS where all of the path was cut
     contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a half-space
+    localized: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]

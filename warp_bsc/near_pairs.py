@@ -104,7 +104,7 @@ def collect_near_pairs(
     friction = wp.sqrt(vertices.friction[corners[0]] * vertices.friction[corners[3]])
     asked = feasible(separation, distance, separation, path)
     origin = wp.where(near.edges == 1, NEAR_EDGES, NEAR_VERTEX_FACE)
-    add_constraint(vertices, constraints, corners, weights, between / distance, asked, friction, 1, origin, _ZERO)
+    add_constraint(vertices, constraints, corners, weights, between / distance, asked, friction, 1, origin, True, _ZERO)
 
 
 @wp.kernel(**_KERNEL)

@@ -16,8 +16,10 @@ from .constraints import (
     PROJECTIONS,
     REMAINING,
     ROUND,
+    SHARE,
     STEER,
     TIMES,
+    TRUNCATIONS,
     UNDETECTED,
     Constraints,
     Contacts,
@@ -53,18 +55,14 @@ from .projection import (
     move_vertices,
     start_impulses,
 )
+from .response_steps import count_grazing
 
-__all__ = ["FROZEN", "SHARE", "TRUNCATED", "TRUNCATIONS", "Response"]
-
-TRUNCATIONS = wp.constant(8)
-"""Rounds of truncation, after which what still collides stands still."""
+__all__ = ["FROZEN", "TRUNCATED", "Response"]
 
 _LEAST_ENTRIES = 4096
 """Constraints acting in iterations for which there is room to take them down at least."""
 _ROUNDS_OF_ROOM = 2
 """For the contacts of how many rounds there is room."""
-SHARE = wp.constant(wp.float64(0.9))
-"""Which part of the way to its first contact a truncated vertex goes."""
 
 TRUNCATED, FROZEN = wp.constant(2), wp.constant(4)
 """Bits of what has been done to a vertex."""
@@ -127,6 +125,7 @@ def _record_truncation(
     history.toi[entry] = time
     if kind != ON_PLANE and kind != STANDS:
         history.contact[entry] = contact_vertices(contacts, i)
+        history.localized[entry] = contacts.localized[i]
         history.toi[entry] = contacts.toi[i]
         history.coordinates[entry] = contacts.coordinates[i]
         history.normal[entry] = contacts.normal[i]
@@ -429,6 +428,9 @@ class Response:
         for contacts in self._contacts():
             inputs = [vertices, contacts, self.constraints, progress, self.separation]
             self._launch_over(collect_contacts, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
+            if self._records:
+                inputs = [vertices, contacts, progress.history]
+                self._launch_over(count_grazing, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
         wp.launch(_decide, 1, inputs=[progress, detector.counts, detector.capacities], device=self.device)
@@ -440,8 +442,8 @@ class Response:
             contacts = Contacts()
             contacts.edges = int(narrow_phase.kind == "edge_edge")
             contacts.elements, contacts.counts = elements, narrow_phase.counts
-            contacts.pairs, contacts.status, contacts.toi = found.pairs, found.status, found.toi
-            contacts.coordinates, contacts.normal = found.coordinates, found.normal
+            contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.localized
+            contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
             yield contacts
 
     def _with_elements(self, narrow_phases):
@@ -466,6 +468,7 @@ class Response:
         )
         constraints.friction = wp.empty(room, dtype=float, device=self.device)
         constraints.origin = wp.empty(room, dtype=int, device=self.device)
+        constraints.localized = wp.empty(room, dtype=wp.bool, device=self.device)
         constraints.toi = wp.empty(room, dtype=wp.float64, device=self.device)
         constraints.acting_count = wp.zeros(1, dtype=wp.int64, device=self.device)
         constraints.slow, constraints.iteration, constraints.acting = (

@@ -12,41 +12,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .angular_momentum import (
-    HELD,
-    MASS,
-    MOMENTS,
-    SUMS,
-    Moments,
-    acts,
-    change_by_turn,
-    is_held,
-    moments,
-    torque_of,
-    turns,
-)
-from .constraints import (
-    EDGE_EDGE_CONTACT,
-    NEAR_EDGES,
-    ON_PLANE,
-    PROJECTED,
-    ROUND,
-    STEER,
-    UNDETECTED,
-    Constraints,
-    Progress,
-    Vertices,
-    contact_weights,
-    feasible,
-    feasible_in_contact,
-    longest_path,
-    relative,
-    to_double,
-    to_single,
-    urgency_of,
-    widened,
-)
-from .half_spaces import HalfSpaces, clearance, time_of_entry
+from .angular_momentum import SUMS, turns
+from .constraints import PROJECTED, ROUND, STEER, TRUNCATIONS, UNDETECTED, Constraints, Progress, Vertices
+from .half_spaces import HalfSpaces
 from .history import (
     ENTRIES,
     FORGOTTEN,
@@ -54,26 +22,29 @@ from .history import (
     MARKED,
     OF_ENTRIES,
     OF_TRUNCATIONS,
-    STANDS,
     TRUNCATED_PATHS,
     History,
 )
-from .kernels.gradients import with_gradients
-from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.signs import HIT
-from .kernels.time_of_impact import Impact
-from .narrow_phase import TOLERANCE
-from .near_pairs import closest_weights
-from .projection import BATCH, accelerated, displaced, moved, spread, starts, takes_back
-from .response import SHARE, TRUNCATIONS
+from .projection import BATCH, moved, spread
+from .response_steps import (
+    CURRENT,
+    CURSOR,
+    FIRST,
+    MARK,
+    NEXT,
+    accelerating,
+    constraining,
+    displacing,
+    entry_of,
+    massing,
+    starting,
+    truncating,
+    turning,
+    twisting,
+)
 
 __all__ = ["Recording", "Undoing"]
 
-_NEXT, _CURRENT, _FIRST, _MARK, _CURSOR = (wp.constant(i) for i in range(5))
-"""Places in the array that says how far undoing is: the iteration to undo next, the one being undone or -1, the first
-of the round, and the mark of the round; and how many places there are."""
-
-_TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _OF_CONSTRAINTS = (
     "vertices",
     "weights",
@@ -82,6 +53,7 @@ _OF_CONSTRAINTS = (
     "friction",
     "urgency",
     "origin",
+    "localized",
     "toi",
     "slow",
     "displacing",
@@ -92,9 +64,6 @@ _UNDONE_OF_CONSTRAINTS = "displacing", "impulse", "reached"
 _DIFFERENTIABLE = "weights", "normal", "separation", "urgency", "displacing", "impulse", "reached"
 _OF_VERTICES = "x0", "x1", "velocity", "wanted_x1", "wanted_velocity", "displacement", "velocity_change", "done"
 _UNDONE_OF_VERTICES = "x1", "velocity", "displacement", "velocity_change"
-_ZERO = wp.constant(wp.float64(0.0))
-_ONE = wp.constant(wp.float64(1.0))
-
 _KERNEL = {"enable_backward": False}
 
 
@@ -107,258 +76,6 @@ class _Gradients:
     more_x1: wp.array[wp.vec3]  # to be added, once everything has read the former
     more_velocity: wp.array[wp.vec3]
     push: wp.array[wp.vec3]  # with respect to what constraints add to velocities
-
-
-@wp.func
-def _push(vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, push: wp.array[wp.vec3]):
-    """Adds what the change of a multiplier does to its vertices, see :func:`.projection.spread`."""
-    for j in range(4):
-        vertex = constraints.vertices[i][j]
-        share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
-        wp.atomic_add(push, vertex, to_single(share * change))
-
-
-@wp.func
-def _first_entry(history: History, iteration: int) -> int:
-    if iteration == 0:
-        return 0
-    return history.ends[iteration - 1]
-
-
-@wp.func
-def _entry(history: History, iteration: int, place: int) -> int:
-    """The entry of a constraint that acted in an iteration, by its place; -1 if not so many did."""
-    if iteration < 0:
-        return -1
-    entry = _first_entry(history, iteration) + place
-    return wp.where(entry < history.ends[iteration], entry, -1)
-
-
-@wp.kernel
-def _displacing(
-    vertices: Vertices,
-    constraints: Constraints,
-    progress: Progress,
-    cursor: wp.array[int],
-    multiplier_change: wp.array[wp.vec3d],
-    reached_change: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
-):
-    """What an iteration on positions changes, by :func:`.projection.displace`."""
-    entry = _entry(progress.history, cursor[_CURRENT], wp.tid())
-    if entry < 0:
-        return
-    i = progress.history.constraint[entry]
-    reached = displaced(vertices, constraints, i, not takes_back(constraints, progress, i))
-    before = constraints.reached[i]
-    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.displacing[i]
-    multiplier_change[i] = change
-    reached_change[i] = reached - before
-    _push(vertices, constraints, i, change, push)
-
-
-@wp.kernel
-def _accelerating(
-    vertices: Vertices,
-    constraints: Constraints,
-    progress: Progress,
-    cursor: wp.array[int],
-    restitution: wp.float64,
-    multiplier_change: wp.array[wp.vec3d],
-    reached_change: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
-):
-    """What an iteration on velocities changes, by :func:`.projection.accelerate`."""
-    entry = _entry(progress.history, cursor[_CURRENT], wp.tid())
-    if entry < 0:
-        return
-    i = progress.history.constraint[entry]
-    reached = accelerated(vertices, constraints, i, restitution)
-    before = constraints.reached[i]
-    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.impulse[i]
-    multiplier_change[i] = change
-    reached_change[i] = reached - before
-    _push(vertices, constraints, i, change, push)
-
-
-@wp.kernel
-def _starting(
-    vertices: Vertices,
-    constraints: Constraints,
-    dt: wp.float64,
-    impulse: wp.array[wp.vec3d],
-    reached: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
-):
-    """The impulses to begin with, by :func:`.projection.start_impulses`."""
-    i = wp.tid()
-    if i < constraints.count[0] and starts(constraints, i):
-        first = constraints.displacing[i] * (constraints.urgency[i] / dt)
-        impulse[i] = first
-        reached[i] = first
-        _push(vertices, constraints, i, first, push)
-
-
-@wp.kernel
-def _twisting(vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
-    """The torques that contacts have added in each world, by :func:`.angular_momentum.sum_torques`."""
-    i = wp.tid()
-    if i >= constraints.count[0] or not acts(constraints, i):
-        return
-    world = vertices.world[constraints.vertices[i][0]]
-    if is_held(vertices, constraints, i):
-        totals[world, HELD] = _ONE
-    else:
-        torque = torque_of(vertices, constraints, i)
-        for axis in range(3):
-            wp.atomic_add(totals, world, axis, torque[axis])
-
-
-@wp.kernel
-def _massing(vertices: Vertices, totals: wp.array2d[wp.float64]):
-    """The moments of what has collided in each world, by :func:`.angular_momentum.sum_bodies`."""
-    vertex = wp.tid()
-    if turns(vertices, vertex):
-        added = moments(vertices, vertex)
-        for i in range(MOMENTS):
-            wp.atomic_add(totals, vertices.world[vertex], MASS + i, added[i])
-
-
-@wp.kernel
-def _turning(vertices: Vertices, totals: wp.array2d[wp.float64], change: wp.array[wp.vec3]):
-    """How the turn of each world changes velocities, by :func:`.angular_momentum.turn_vertices`."""
-    vertex = wp.tid()
-    world = vertices.world[vertex]
-    if not turns(vertices, vertex) or totals[world, HELD] != _ZERO:
-        return
-    torque = wp.vec3d(totals[world, 0], totals[world, 1], totals[world, 2])
-    total = Moments(
-        totals[world, MASS],
-        totals[world, MASS + 1],
-        totals[world, MASS + 2],
-        totals[world, MASS + 3],
-        totals[world, MASS + 4],
-        totals[world, MASS + 5],
-        totals[world, MASS + 6],
-        totals[world, MASS + 7],
-        totals[world, MASS + 8],
-        totals[world, MASS + 9],
-        totals[world, MASS + 10],
-    )
-    change[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
-
-
-@wp.func
-def _touching(
-    vertices: Vertices,
-    corners: wp.vec4i,
-    kind: int,
-    toi: wp.float64,
-    coordinates: wp.vec3d,
-    normal: wp.vec3d,
-) -> Impact:
-    """A contact as a function of where its vertices are."""
-    found = Impact()
-    found.status = HIT
-    found.localized = 1
-    found.toi = toi
-    found.coordinates = coordinates
-    found.normal = normal
-    return with_gradients(
-        wp.where(kind == EDGE_EDGE_CONTACT, EDGE_EDGE, VERTEX_FACE),
-        to_double(vertices.x0[corners[0]]),
-        to_double(vertices.x0[corners[1]]),
-        to_double(vertices.x0[corners[2]]),
-        to_double(vertices.x0[corners[3]]),
-        to_double(vertices.x1[corners[0]]),
-        to_double(vertices.x1[corners[1]]),
-        to_double(vertices.x1[corners[2]]),
-        to_double(vertices.x1[corners[3]]),
-        found,
-        _TOLERANCE,
-    )
-
-
-@wp.kernel
-def _constraining(
-    vertices: Vertices,
-    constraints: Constraints,
-    progress: Progress,
-    cursor: wp.array[int],
-    least: wp.float64,
-    weights: wp.array[wp.vec4d],
-    normals: wp.array[wp.vec3d],
-    separations: wp.array[wp.float64],
-    urgencies: wp.array[wp.float64],
-):
-    """What a round's constraints were made of contacts and near pairs, by :func:`.constraints.collect_contacts`."""
-    mark = cursor[_MARK]
-    i = wp.tid()
-    if mark > 0:
-        i += progress.history.constraints[mark - 1]
-    if i >= progress.history.constraints[mark]:
-        return
-    corners = constraints.vertices[i]
-    origin = constraints.origin[i]
-    weight = constraints.weights[i]
-    normal = constraints.normal[i]
-    separation = constraints.separation[i]
-    if origin < ON_PLANE:
-        edges = wp.where(origin == EDGE_EDGE_CONTACT, 1, 0)
-        coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
-        if edges == 1:
-            coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
-        touch = _touching(vertices, corners, origin, constraints.toi[i], coordinates, normal)
-        weight = contact_weights(edges, touch.coordinates)
-        normal = touch.normal
-        if constraints.slow[i] == 1:
-            asked = widened(least, progress)
-            separation = feasible_in_contact(vertices, corners, weight, normal, asked, least)
-    elif origin > ON_PLANE:
-        weight = closest_weights(vertices, corners, wp.where(origin == NEAR_EDGES, 1, 0))
-        between = relative(weight, corners, vertices.x0)
-        distance = wp.length(between)
-        normal = between / distance
-        separation = feasible(least, distance, least, longest_path(vertices, corners))
-    weights[i] = weight
-    normals[i] = normal
-    separations[i] = separation
-    urgencies[i] = urgency_of(vertices, corners, weight, normal, separation)
-
-
-@wp.kernel
-def _truncating(
-    vertices: Vertices,
-    half_spaces: HalfSpaces,
-    progress: Progress,
-    cursor: wp.array[int],
-    dt: wp.float64,
-    end: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-):
-    """Where paths are cut, and how fast vertices are then."""
-    history = progress.history
-    mark = cursor[_MARK]
-    entry = history.truncations[mark] + wp.tid()
-    if entry >= history.truncations[mark + 1]:
-        return
-    vertex = history.vertex[entry]
-    kind = history.kind[entry]
-    toi = _ZERO
-    if kind == ON_PLANE:
-        plane = history.contact[entry][1]
-        before, _error = clearance(half_spaces.start[plane], vertices.x0[vertex])
-        after, _error_after = clearance(half_spaces.end[plane], vertices.x1[vertex])
-        toi = time_of_entry(before, after)
-    elif kind != STANDS:
-        corners = history.contact[entry]
-        toi = _touching(
-            vertices, corners, kind, history.toi[entry], history.coordinates[entry], history.normal[entry]
-        ).toi
-    x0 = to_double(vertices.x0[vertex])
-    path = SHARE * toi * (to_double(vertices.x1[vertex]) - x0)
-    end[entry] = to_single(x0 + path)
-    velocity[entry] = to_single(path / dt)
 
 
 @wp.kernel(**_KERNEL)
@@ -397,10 +114,10 @@ def _begin_undoing(
 ):
     """Puts the cursor behind the last iteration on velocities; ``more`` says of iterations and rounds if there are."""
     mark = wp.min(steer[ROUND], projections + TRUNCATIONS + 1)
-    cursor[_MARK] = mark
-    cursor[_FIRST] = history.iterations[mark + 1]
-    cursor[_NEXT] = history.sizes[ITERATIONS_DONE] - 1
-    more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+    cursor[MARK] = mark
+    cursor[FIRST] = history.iterations[mark + 1]
+    cursor[NEXT] = history.sizes[ITERATIONS_DONE] - 1
+    more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
     more[1] = 1
     back[ROUND] = mark
 
@@ -408,23 +125,23 @@ def _begin_undoing(
 @wp.kernel(**_KERNEL)
 def _begin_round(history: History, cursor: wp.array[int], more: wp.array[int]):
     """Puts the cursor behind the last iteration on positions of a round."""
-    mark = cursor[_MARK]
-    cursor[_FIRST] = history.iterations[mark]
-    cursor[_NEXT] = history.iterations[mark + 1] - 1
-    more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+    mark = cursor[MARK]
+    cursor[FIRST] = history.iterations[mark]
+    cursor[NEXT] = history.iterations[mark + 1] - 1
+    more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
 
 
 @wp.kernel(**_KERNEL)
 def _to_detection(cursor: wp.array[int], back: wp.array[int]):
     """Goes back to the detection before a round."""
-    back[ROUND] = wp.max(cursor[_MARK] - 1, 0)
+    back[ROUND] = wp.max(cursor[MARK] - 1, 0)
 
 
 @wp.kernel(**_KERNEL)
 def _end_round(cursor: wp.array[int], more: wp.array[int]):
     """Goes back to the round before."""
-    cursor[_MARK] = cursor[_MARK] - 1
-    more[1] = wp.where(cursor[_MARK] >= 0, 1, 0)
+    cursor[MARK] = cursor[MARK] - 1
+    more[1] = wp.where(cursor[MARK] >= 0, 1, 0)
 
 
 @wp.kernel(**_KERNEL)
@@ -437,8 +154,8 @@ def _undo(
     sums: wp.array2d[wp.int64],
 ):
     """Takes back what an iteration did to multipliers, and to the sums of what they change."""
-    entry = _entry(progress.history, cursor[_NEXT], wp.tid())
-    if cursor[_NEXT] < cursor[_FIRST] or entry < 0:
+    entry = entry_of(progress.history, cursor[NEXT], wp.tid())
+    if cursor[NEXT] < cursor[FIRST] or entry < 0:
         return
     i = progress.history.constraint[entry]
     old = progress.history.multiplier[entry]
@@ -453,11 +170,11 @@ def _undo(
 def _step_back(vertex: int, cursor: wp.array[int], more: wp.array[int]):
     """Lets the cursor be at the iteration that is being undone, and the next be the one before."""
     if vertex == 0:
-        iteration = cursor[_NEXT]
-        undone = iteration >= cursor[_FIRST]
-        cursor[_CURRENT] = wp.where(undone, iteration, -1)
-        cursor[_NEXT] = wp.where(undone, iteration - 1, iteration)
-        more[0] = wp.where(cursor[_NEXT] >= cursor[_FIRST], 1, 0)
+        iteration = cursor[NEXT]
+        undone = iteration >= cursor[FIRST]
+        cursor[CURRENT] = wp.where(undone, iteration, -1)
+        cursor[NEXT] = wp.where(undone, iteration - 1, iteration)
+        more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
 
 
 @wp.kernel(**_KERNEL)
@@ -502,7 +219,7 @@ def _undo_truncations(
     velocity: wp.array[wp.vec3],
 ):
     """Lets paths that were cut end where they did before; the gradients of what was cut go to ``end`` and velocity."""
-    mark = cursor[_MARK]
+    mark = cursor[MARK]
     entry = history.truncations[mark] + wp.tid()
     if entry >= history.truncations[mark + 1]:
         return
@@ -593,7 +310,10 @@ def _copied(struct, into, lengths):
     """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
     for name, length in lengths.items():
         array = getattr(struct, name)
-        setattr(into, name, wp.clone(array if length is None else array[:length]))
+        if length == 0:  # of which Warp makes no slices
+            setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))
+        else:
+            setattr(into, name, wp.clone(array if length is None else array[:length]))
     return into
 
 
@@ -640,7 +360,7 @@ class Undoing:
         self._progress = Progress()
         self._progress.steer = wp.zeros(int(STEER), dtype=int, device=device)
         self._progress.history = recording.history
-        self._cursor = wp.zeros(int(_CURSOR), dtype=int, device=device)
+        self._cursor = wp.zeros(int(CURSOR), dtype=int, device=device)
         self._more = wp.zeros(2, dtype=int, device=device)
         self._more_iterations, self._more_rounds = self._more[:1], self._more[1:]
 
@@ -672,11 +392,11 @@ class Undoing:
         n = len(vertices.x0)
         self._launch(_undo_turn, n, [vertices])
         totals = wp.zeros((self._response.worlds, int(SUMS)), dtype=wp.float64, device=self._device, requires_grad=True)
-        self._launch(_twisting, self._launch_count, [vertices, constraints], [totals])
-        self._launch(_massing, n, [vertices], [totals])
-        self._adjoin(_turning, n, [vertices, totals], [self._gradients.velocity])
-        self._adjoin(_massing, n, [vertices], [totals.grad])
-        self._adjoin(_twisting, self._launch_count, [vertices, constraints], [totals.grad])
+        self._launch(twisting, self._launch_count, [vertices, constraints], [totals])
+        self._launch(massing, n, [vertices], [totals])
+        self._adjoin(turning, n, [vertices, totals], [self._gradients.velocity])
+        self._adjoin(massing, n, [vertices], [totals.grad])
+        self._adjoin(twisting, self._launch_count, [vertices, constraints], [totals.grad])
 
     def _batch(self, undo):
         for _ in range(BATCH):
@@ -688,7 +408,7 @@ class Undoing:
         self._undo(constraints.impulse, self._vertices.velocity_change)
         self._undo_velocities()
         self._adjoin(
-            _accelerating,
+            accelerating,
             self._launch_count,
             [self._vertices, constraints, self._progress, self._cursor, self._response.restitution],
             [of_constraints.impulse, of_constraints.reached, self._gradients.push],
@@ -704,7 +424,7 @@ class Undoing:
         constraints, of_constraints = self._constraints, self._of_constraints
         self._undo_velocities()
         self._adjoin(
-            _starting,
+            starting,
             self._launch_count,
             [self._vertices, constraints, self._recording.dt],
             [of_constraints.impulse, of_constraints.reached, self._gradients.push],
@@ -721,7 +441,7 @@ class Undoing:
         self._launch(_to_detection, 1, [self._cursor], [self._progress.steer])
         of_constraints = self._of_constraints
         self._adjoin(
-            _constraining,
+            constraining,
             self._launch_count,
             [self._vertices, self._recording.constraints, self._progress, self._cursor, self._response.separation],
             [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.urgency],
@@ -734,7 +454,7 @@ class Undoing:
         self._undo(constraints.displacing, self._vertices.displacement)
         self._undo_displacements()
         self._adjoin(
-            _displacing,
+            displacing,
             self._launch_count,
             [self._vertices, constraints, self._progress, self._cursor],
             [of_constraints.displacing, of_constraints.reached, self._gradients.x1],
@@ -754,7 +474,7 @@ class Undoing:
         inputs = [vertices, self._gradients, history, self._cursor]
         self._launch(_undo_truncations, truncations, inputs, [ends, velocities])
         self._adjoin(
-            _truncating,
+            truncating,
             truncations,
             [vertices, self._recording.half_spaces, self._progress, self._cursor, self._recording.dt],
             [ends, velocities],

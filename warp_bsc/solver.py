@@ -8,6 +8,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
+from .history import GRAZING
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
 from .response_gradient import Recording, Undoing
@@ -21,7 +22,9 @@ _TOLERANCE = 0.1
 """How precisely constraints are solved, as a share of the separation. With gradients all iterations are made: whether a
 constraint still acts would else depend on ever so little, and results would jump."""
 
-_STEPS, _UNCERTIFIED_STEPS, _TRUNCATED_STEPS, _FROZEN_STEPS, _TOTALS = (wp.constant(i) for i in range(5))
+_STEPS, _UNCERTIFIED_STEPS, _TRUNCATED_STEPS, _FROZEN_STEPS, _GRAZING, _LOST_GRADIENTS, _TOTALS = (
+    wp.constant(i) for i in range(7)
+)
 """Places in the array of totals, and how many there are."""
 
 
@@ -80,6 +83,12 @@ def _paused_tape():
         yield tape
     finally:
         tape.__enter__()
+
+
+@wp.kernel(enable_backward=False)
+def _count_recording(sizes: wp.array[int], complete: wp.array[int], totals: wp.array[int]):
+    totals[_GRAZING] = totals[_GRAZING] + sizes[GRAZING]
+    totals[_LOST_GRADIENTS] = totals[_LOST_GRADIENTS] + 1 - complete[0]
 
 
 class SolverReport:
@@ -170,12 +179,33 @@ class SolverReport:
         """Steps so far in which a vertex was left where it was."""
         return self._total(_FROZEN_STEPS)
 
+    @property
+    def grazing(self) -> int:
+        """Contacts so far, in steps on a tape, whose gradients are clamped.
+
+        Features that slide along each other, or have no plane, have no derivative that is of any use; what is taken
+        instead is finite, see :mod:`warp_bsc.kernels.gradients`.
+        """
+        return self._total(_GRAZING)
+
+    @property
+    def lost_gradients(self) -> int:
+        """Steps so far on a tape, in a CUDA graph, that found too little room to be taken down.
+
+        Gradients that go back through such a step are NaN. Step without the graph, on a tape, which makes room, and
+        capture anew.
+        """
+        return self._total(_LOST_GRADIENTS)
+
     def __str__(self):
         """The steps so far, in a line."""
-        return (
+        line = (
             f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
             f"left standing, {self.uncertified_steps} not certified"
         )
+        if self.grazing or self.lost_gradients:
+            line += f"; gradients: {self.grazing} grazing contacts, {self.lost_gradients} steps lost"
+        return line
 
     def _steer(self, place):
         return int(self._response.steer.numpy()[int(place)])
@@ -192,6 +222,12 @@ class SolverCCD(SolverBase):
 
     The cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide
     with particles. Everything else is the inner solver's: what is not defined here is asked of it.
+
+    A step on a :class:`warp.Tape` carries gradients, if the model was finalized with ``requires_grad=True`` and the
+    inner solver is differentiable: from positions and velocities of particles at its end to those at its start, and to
+    those that the inner solver wanted. Which contacts there were is taken as given; the rest is the derivative of what
+    was computed, see :mod:`.response_gradient`. The motion of bodies is a constant. With ``requires_grad`` all
+    iterations are made, so that results do not jump.
 
     Attributes:
         solver: The inner solver.
@@ -264,9 +300,15 @@ class SolverCCD(SolverBase):
             contacts: As for the inner solver.
             dt: Length of the step [s].
             options: As for the inner solver.
+
+        Raises:
+            ValueError: If gradients are to be taken down on a tape, and both states are the same.
+            RuntimeError: If they are, in a CUDA graph, and there was no such step outside one.
         """
         response = self._response
-        with _paused_tape():
+        with _paused_tape() as tape:
+            if tape is not None and state_in is state_out and self.model.requires_grad:
+                raise ValueError("gradients need the state at the start: step into another state")
             response.start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with _paused_tape() as tape:
@@ -277,8 +319,6 @@ class SolverCCD(SolverBase):
         response, device = self._response, self.mesh.device
         vertices = response.vertices
         records = tape is not None and state_out.particle_q is not None and state_out.particle_q.requires_grad
-        if records and state_in is state_out:
-            raise ValueError("gradients need the state at the start: step into another state")
         self._lap(start=True)
         response.end(state_out.particle_q, state_out.body_q)
         inputs = [state_out.particle_qd, vertices.x0, vertices.x1, dt]
@@ -292,16 +332,21 @@ class SolverCCD(SolverBase):
         wp.launch(_count_step, 1, inputs=inputs, outputs=outputs, device=device)
         self._lap(start=False)
         if records:
-            self._record(tape, state_in, state_out, Recording(response, dt))
+            self._record(tape, state_in, state_out, dt)
 
-    def _record(self, tape, state_in, state_out, recording):
-        """Lets the tape carry gradients back through a step of the response."""
+    def _record(self, tape, state_in, state_out, dt):
+        """Lets the tape carry gradients back through the response to this step, if it has changed anything."""
+        if not (self.mesh.device.is_capturing or self._response.vertices.done.numpy().any()):
+            return
+        recording = Recording(self._response, dt)
         arrays = [state_in.particle_q, state_out.particle_q, state_out.particle_qd]
 
         def backward():
             Undoing(recording, self._response).backward(*(array.grad for array in arrays))
 
         tape.record_func(backward, arrays)
+        inputs = [self._response.history.arrays.sizes, recording.complete]
+        wp.launch(_count_recording, 1, inputs=inputs, outputs=[self._totals], device=self.mesh.device)
 
     def _lap(self, *, start):
         device = self.mesh.device
