@@ -356,6 +356,8 @@ class Undoing:
         for name in set(_OF_CONSTRAINTS) - set(_UNDONE_OF_CONSTRAINTS) | {"count"}:
             setattr(constraints, name, getattr(recording.constraints, name))
         self._of_constraints = _give_gradients(constraints, _DIFFERENTIABLE)
+        truncations = len(recording.history.vertex)
+        self._of_truncations = [wp.zeros(truncations, dtype=wp.vec3, device=device) for _ in range(2)]
         self._pushed = wp.empty(n, dtype=wp.vec3, device=device)
         self._progress = Progress()
         self._progress.steer = wp.zeros(int(STEER), dtype=int, device=device)
@@ -468,9 +470,7 @@ class Undoing:
     def _undo_truncations(self):
         vertices, history = self._vertices, self._recording.history
         truncations = len(history.vertex)
-        if not truncations:
-            return
-        ends, velocities = (wp.zeros(truncations, dtype=wp.vec3, device=self._device) for _ in range(2))
+        ends, velocities = self._of_truncations
         inputs = [vertices, self._gradients, history, self._cursor]
         self._launch(_undo_truncations, truncations, inputs, [ends, velocities])
         self._adjoin(
