@@ -7,7 +7,7 @@ import warp as wp
 from .classification import classify
 from .culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from .gradients import with_gradients
-from .motion import all_finite, double, relative_motion
+from .motion import all_finite, doubles, relative_motion
 from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion, coplanarity
 from .signs import FREE, ROUNDOFF, UNSURE
 from .time_of_impact import Impact, impact
@@ -79,23 +79,6 @@ def _adjoint_of_answer(
 
 
 @wp.func
-def _impact(
-    kind: int,
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    tolerance: wp.float64,
-) -> Impact:
-    found = _answer(kind, a0, b0, c0, d0, a1, b1, c1, d1, True, tolerance)
-    return with_gradients(kind, a0, b0, c0, d0, a1, b1, c1, d1, found, tolerance)
-
-
-@wp.func
 def impact_vertex_face(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, tolerance: wp.float64
 ) -> Impact:
@@ -117,18 +100,10 @@ def impact_vertex_face(
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
         are clamped, as :mod:`.gradients` says.
     """
-    return _impact(
-        VERTEX_FACE,
-        double(p0),
-        double(a0),
-        double(b0),
-        double(c0),
-        double(p1),
-        double(a1),
-        double(b1),
-        double(c1),
-        tolerance,
-    )
+    p, a, b, c = doubles(p0, a0, b0, c0)
+    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
+    found = _answer(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, True, tolerance)
+    return with_gradients(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, found, tolerance)
 
 
 @wp.func
@@ -153,18 +128,10 @@ def impact_edge_edge(
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
         are clamped, as :mod:`.gradients` says.
     """
-    return _impact(
-        EDGE_EDGE,
-        double(a0),
-        double(b0),
-        double(c0),
-        double(d0),
-        double(a1),
-        double(b1),
-        double(c1),
-        double(d1),
-        tolerance,
-    )
+    a, b, c, d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    found = _answer(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, True, tolerance)
+    return with_gradients(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, found, tolerance)
 
 
 @wp.func
@@ -175,19 +142,9 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
     Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points
     that are not finite are UNSURE.
     """
-    return _answer(
-        VERTEX_FACE,
-        double(p0),
-        double(a0),
-        double(b0),
-        double(c0),
-        double(p1),
-        double(a1),
-        double(b1),
-        double(c1),
-        False,
-        _TOLERANCE,
-    ).status
+    p, a, b, c = doubles(p0, a0, b0, c0)
+    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
+    return _answer(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, False, _TOLERANCE).status
 
 
 @wp.func
@@ -198,16 +155,6 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that
     are not finite are UNSURE.
     """
-    return _answer(
-        EDGE_EDGE,
-        double(a0),
-        double(b0),
-        double(c0),
-        double(d0),
-        double(a1),
-        double(b1),
-        double(c1),
-        double(d1),
-        False,
-        _TOLERANCE,
-    ).status
+    a, b, c, d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    return _answer(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, False, _TOLERANCE).status

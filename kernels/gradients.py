@@ -9,17 +9,17 @@ points changes the contact by
 
     e dt - u dx - v dy + (dw - x du - y dv) = 0,  e = dg/dt,
 
-the velocity of one feature relative to the other. So for cotangents of t, x and y there is one vector q with
+the velocity of one feature relative to the other. So for adjoints adj_t, adj_x, adj_y there is one vector q with
 
-    q . e = dt, -q . u = dx, -q . v = dy  (cotangents),
+    q . e = adj_t,  -q . u = adj_x,  -q . v = adj_y,
 
-and -q, x q, y q are the cotangents of w, u, v at the time of contact; a point there has the share 1 - t of that at the
-start and t of that at the end. With n = u x v, N = n / |n| and the dual vectors u* = v x n / n^2, v* = n x u / n^2,
+and -q, x q, y q are the adjoints of w, u, v at the time of contact. A point has the share 1 - t of its own there at the
+start, and t at the end. With n = u x v, N = n / |n| and the dual vectors u* = v x n / n^2, v* = n x u / n^2,
 
-    q = (dt + (dx u* + dy v*) . e) / (N . e) N - dx u* - dy v*.
+    q = (adj_t + d . e) / (N . e) N - d,  d = adj_x u* + adj_y v*.
 
-That is dt*/dx = -(dY/dx) / (dY/dt) for Y = w . n, as q for the time alone is n / (dY/dt), and the normal N follows
-u, v and the time.
+For the time alone q is n / (dY/dt), with Y = w . n: the implicit function theorem for Y(t) = 0. The normal N is a
+function of u and v, hence of the time too, which adds to adj_t.
 
 **At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root of Y that comes
 within the tolerance after it, found to double precision by Newton's method on N . g, with x and y solved for each time.
@@ -210,9 +210,9 @@ def _adjoint_of_with_gradients(
         if kind == VERTEX_FACE:
             adj_x = adj_ret.coordinates[1] - adj_ret.coordinates[0]
             adj_y = adj_ret.coordinates[2] - adj_ret.coordinates[0]
-        # q of the module docstring
-        along = (adj_x * wp.cross(at.v, at.n) + adj_y * wp.cross(at.n, at.u)) / at.area
-        q = (adj_t + wp.dot(along, at.velocity)) * at.approach * at.normal - along
+        # d and q as in the module's docstring
+        d = (adj_x * wp.cross(at.v, at.n) + adj_y * wp.cross(at.n, at.u)) / at.area
+        q = (adj_t + wp.dot(d, at.velocity)) * at.approach * at.normal - d
         adj_u = motion.scale * (adj_u + at.x * q)
         adj_v = motion.scale * (adj_v + at.y * q)
         adj_w = -motion.scale * q

@@ -32,6 +32,12 @@ def _adjoint_of_double(x: wp.vec3, adj_ret: wp.vec3d):
 
 
 @wp.func
+def doubles(a: Any, b: Any, c: Any, d: Any):
+    """The same points in double precision, exactly."""
+    return double(a), double(b), double(c), double(d)
+
+
+@wp.func
 def all_finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
     """Whether all coordinates are finite: no sum of doubles is then anything else, but for some beyond 1e307."""
     start = double(a0) + double(b0) + double(c0) + double(d0)

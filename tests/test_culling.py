@@ -14,7 +14,8 @@ from generators import GENERATORS, mostly_hits, uniform
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.kernels import FREE, HIT, UNSURE, ccd, ccd_edge_edge, ccd_vertex_face, crossing, culling
+from warp_bsc.kernels import FREE, HIT, UNSURE, ccd_edge_edge, ccd_vertex_face, crossing, culling
+from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
 from warp_bsc.kernels.polynomials import Motion
 from warp_bsc.kernels.signs import ROUNDOFF
 
@@ -36,13 +37,11 @@ def ask_double(
     i = wp.tid()
     motion = Motion()
     if edges:
-        motion = ccd.edge_edge_motion(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], ROUNDOFF)
+        motion = edge_edge_motion(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], ROUNDOFF)
         boxes[i] = culling.edge_edge_boxes_apart(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7])
         status[i] = ccd_edge_edge(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7])
     else:
-        motion = ccd.vertex_face_motion(
-            x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], ROUNDOFF
-        )
+        motion = vertex_face_motion(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], ROUNDOFF)
         boxes[i] = culling.vertex_face_boxes_apart(
             x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7]
         )

@@ -482,6 +482,21 @@ def test_collisions_that_the_host_decides_are_in_the_arrays(device):
         assert np.isfinite(x.grad.numpy()).all()
 
 
+@pytest.mark.parametrize("method", ["conservative", "exact"])
+def test_contact_on_an_edge_has_the_gradients_of_the_plane_once_it_is_certain(method, device):
+    """A vertex falls at 2 m a step from 1 m onto the edge of a triangle: raised by dz, it arrives dz / 4 m later."""
+    x0 = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [1, 1, 1], [3, 3, 1], [3, 4, 1]], dtype=np.float32)
+    x1 = x0 - np.array([0, 0, 2], dtype=np.float32) * (np.arange(6) >= 3)[:, None]
+    mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+    c, tape, positions = on_tape(bsc.CollisionDetector(mesh, method=method), x0, x1)
+    assert c.vertex_face.tolist() == [[3, 0]]
+    assert bool(c.arrays.vertex_face_grazing.numpy()[0]) == (method == "conservative")
+    c.arrays.vertex_face_toi.grad.fill_(1.0)
+    tape.backward()
+    for x in positions:
+        np.testing.assert_allclose(x.grad.numpy()[3], [0.0, 0.0, 0.25], atol=1e-5)
+
+
 def test_a_motion_without_collisions_has_empty_arrays(device):
     x = np.eye(3, dtype=np.float32)
     c, tape, (start, _) = on_tape(bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2]], 3, device=device)), x, x)

@@ -9,7 +9,8 @@ import pytest
 import warp as wp
 from generators import GENERATORS, integer_lattice, uniform
 
-from warp_bsc.kernels import ccd, polynomials, signs
+from warp_bsc.kernels import polynomials, signs
+from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
 
 KINDS = ("vertex_face", "edge_edge")
 AXES = range(3)
@@ -48,13 +49,13 @@ def compute(
         s6 = wp.vec3(p6)
         s7 = wp.vec3(p7)
         if edges:
-            motion = ccd.edge_edge_motion(s0, s1, s2, s3, s4, s5, s6, s7, signs.ROUNDOFF)
+            motion = edge_edge_motion(s0, s1, s2, s3, s4, s5, s6, s7, signs.ROUNDOFF)
         else:
-            motion = ccd.vertex_face_motion(s0, s1, s2, s3, s4, s5, s6, s7, signs.ROUNDOFF)
+            motion = vertex_face_motion(s0, s1, s2, s3, s4, s5, s6, s7, signs.ROUNDOFF)
     elif edges:
-        motion = ccd.edge_edge_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
+        motion = edge_edge_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
     else:
-        motion = ccd.vertex_face_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
+        motion = vertex_face_motion(p0, p1, p2, p3, p4, p5, p6, p7, signs.ROUNDOFF)
     ends[i, 0] = motion.u0
     ends[i, 1] = motion.v0
     ends[i, 2] = motion.w0

@@ -15,8 +15,9 @@ import warp as wp
 from generators import mostly_hits, uniform
 
 from warp_bsc import checker
-from warp_bsc.kernels import HIT, UNSURE, ccd, roots, signs
+from warp_bsc.kernels import HIT, UNSURE, roots, signs
 from warp_bsc.kernels.classification import classify
+from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
 from warp_bsc.kernels.polynomials import coplanarity
 
 ROUNDOFF = 2.0**-53
@@ -51,11 +52,11 @@ def answer(
 def classify_queries(edges: bool, x: wp.array2d[wp.vec3d], shape: wp.array[int], status: wp.array[int]):
     i = wp.tid()
     if edges:
-        motion = ccd.edge_edge_motion(
+        motion = edge_edge_motion(
             x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], signs.ROUNDOFF
         )
     else:
-        motion = ccd.vertex_face_motion(
+        motion = vertex_face_motion(
             x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], signs.ROUNDOFF
         )
     y = coplanarity(motion)

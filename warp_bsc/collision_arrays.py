@@ -6,6 +6,7 @@ import warp as wp
 
 from .kernels.gradients import with_gradients
 from .kernels.motion import double
+from .kernels.pairs import vertices_of_pair
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.signs import HIT, UNSURE
 from .kernels.time_of_impact import Impact
@@ -15,15 +16,6 @@ __all__ = ["CollisionArrays", "put", "take"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _REFUTED = wp.constant(int(Count.REFUTED))
-
-
-@wp.func
-def _vertices(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.vec4i:
-    first = pair[0]
-    second = pair[1]
-    if kind == VERTEX_FACE:
-        return wp.vec4i(first, elements[second, 0], elements[second, 1], elements[second, 2])
-    return wp.vec4i(elements[first, 0], elements[first, 1], elements[second, 0], elements[second, 1])
 
 
 @functools.cache
@@ -55,7 +47,7 @@ def _kernel(dtype):
             normal[i] = wp.vec3d()
             grazing[i] = False
             return
-        v = _vertices(kind, elements, pair)
+        v = vertices_of_pair(kind, elements, pair)
         found = Impact()
         found.status = wp.where(localized[i], HIT, UNSURE)
         found.localized = wp.where(localized[i], 1, 0)

@@ -14,6 +14,7 @@ import warp as wp
 from .kernels.closest import contact_at
 from .kernels.exact import NONE, TOO_WIDE, decide_in
 from .kernels.motion import edge_edge_motion, vertex_face_motion
+from .kernels.pairs import vertices_of_pair
 from .kernels.polygon import BITS
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.queues import take_slot
@@ -34,14 +35,6 @@ def _kernel(dtype, limbs):
     @wp.func
     def point(x: wp.array[dtype], vertex: int) -> wp.vec3d:
         return wp.vec3d(wp.float64(x[vertex][0]), wp.float64(x[vertex][1]), wp.float64(x[vertex][2]))
-
-    @wp.func
-    def vertices(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.vec4i:
-        first = pair[0]
-        second = pair[1]
-        if kind == VERTEX_FACE:
-            return wp.vec4i(first, elements[second, 0], elements[second, 1], elements[second, 2])
-        return wp.vec4i(elements[first, 0], elements[first, 1], elements[second, 0], elements[second, 1])
 
     @wp.func
     def motion_of(kind: int, x0: wp.array[dtype], x1: wp.array[dtype], v: wp.vec4i):
@@ -82,7 +75,7 @@ def _kernel(dtype, limbs):
         if wp.int64(slot) >= counts[filled]:
             return
         i = queue[slot]
-        v = vertices(kind, elements, contacts[i])
+        v = vertices_of_pair(kind, elements, contacts[i])
         time = decide(
             kind,
             point(x0, v[0]),

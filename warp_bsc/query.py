@@ -14,7 +14,7 @@ __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
 
 @dataclass(frozen=True)
 class QueryResult:
-    """Answers to elementary queries, one row each.
+    """Answers to elementary queries, one row each, without gradients: :mod:`warp_bsc.kernels` has those.
 
     Attributes:
         hit: Whether the query collides, by the method asked for, bool, shape [n].
