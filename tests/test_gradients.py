@@ -175,7 +175,6 @@ def test_gradients_are_those_of_central_differences(kind, dtype, bound):
     steps = 1e-3 * distance[away] ** 2 * np.minimum(shortest[away], 1.0)
     expected = differences(kind, points, found, steps)
     errors = relative_errors(found.derivatives, expected)
-    print(kind, dtype, away.mean(), np.percentile(errors, [50, 99, 100], axis=1))
     assert errors.max() < bound
 
 
@@ -221,7 +220,6 @@ def test_gradients_of_the_time_are_exact_at_the_root_of_the_checker(kind):
     expected = np.array([exact_derivative(kind, *row) for row in zip(points, times, strict=True)])
     errors = np.linalg.norm(found.derivatives[:, 0] - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
     exact = found.grazing == 0
-    print(kind, exact.mean(), np.percentile(errors[exact], [50, 99, 100]))
     assert exact.mean() > 0.99
     assert errors[exact].max() < 1e-9
 
