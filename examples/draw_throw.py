@@ -1,0 +1,73 @@
+"""Draws what the example Diffsim Throw learns with the collision stage and without it.
+
+    python examples/draw_throw.py throw.png
+
+Needs matplotlib (``pip install matplotlib``).
+"""
+
+import argparse
+
+import matplotlib.pyplot as plt
+import newton.viewer
+import numpy as np
+from example_diffsim_throw import MARK, STARTS, Example
+from rich.progress import track
+
+_ITERATIONS = 60
+_COLORS = "#2f6fb3", "#e07a2f", "#3a9a5b"
+
+
+def learn(ccd):
+    """The example after all iterations, and the paths of the first."""
+    args = Example.create_parser().parse_args(["--viewer", "null", "--ccd" if ccd else "--no-ccd"])
+    example = Example(newton.viewer.ViewerNull(), args)
+    for iteration in track(range(_ITERATIONS), "with the stage" if ccd else "without"):
+        example.step()
+        if iteration == 0:
+            first = example.path.copy()
+    return example, first
+
+
+def draw_paths(axes, example, first):
+    """Draws the sheet, the mark and the paths from the side."""
+    rest = example.model.particle_q.numpy()
+    sheet = rest[example.thrown.numpy() == 0]
+    low, high = sheet[sheet[:, 2].argmin()], sheet[sheet[:, 2].argmax()]
+    axes.plot([low[0], high[0]], [low[2], high[2]], color="#555555", linewidth=3.0, label="sheet")
+    for world, color in enumerate(_COLORS):
+        axes.plot(first[:, world, 0], first[:, world, 2], color=color, linestyle=":", linewidth=1.3)
+        axes.plot(example.path[:, world, 0], example.path[:, world, 2], color=color, linewidth=1.8)
+        axes.plot(*example.path[-1, world, [0, 2]], "o", color=color, markersize=4)
+    axes.plot(MARK[0], MARK[2], "*", color="#c22f3d", markersize=15, label="mark", zorder=5)
+    axes.set(xlabel="x [m]", ylabel="z [m]", xlim=(-1.1, 0.8 if example.ccd else 2.6), ylim=(-0.7, 1.3))
+    axes.set_aspect("equal")
+    axes.legend(loc="lower right" if example.ccd else "upper right", fontsize=8, frameon=False)
+
+
+def main():
+    """Draws what the command line asks for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("picture", help="File to write, .png or another format that matplotlib knows.")
+    picture = parser.parse_args().picture
+    figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.7), dpi=110, width_ratios=(3.7, 1.9, 2.9))
+    for column, ccd in enumerate((False, True)):
+        example, first = learn(ccd)
+        draw_paths(axes[column], example, first)
+        axes[column].set_title(
+            "with it: a bounce" if ccd else "without the stage: the cloth flies through the sheet", fontsize=10
+        )
+        losses = np.array(example.loss_history)
+        for world, color in enumerate(_COLORS):
+            start = ", ".join(f"{v:g}" for v in STARTS[world])
+            label = f"begins at ({start}) m/s" if ccd else None
+            axes[2].plot(losses[:, world], color=color, linestyle="-" if ccd else "--", linewidth=1.5, label=label)
+    axes[2].plot([], [], color="#555555", linestyle="--", label="without the stage")
+    axes[2].set(xlabel="iteration", ylabel="loss", yscale="log", ylim=(4e-4, 2.0))
+    axes[2].legend(fontsize=7, frameon=False, loc="upper right", bbox_to_anchor=(1.0, 0.9))
+    axes[2].set_title("loss: 0 on the mark, 1 far from it", fontsize=10)
+    figure.tight_layout()
+    figure.savefig(picture)
+
+
+if __name__ == "__main__":
+    main()
