@@ -31,7 +31,7 @@ class Example(PaperScene):
 
     def build(self, builder, triangles):
         """Adds the dancer and the skirt."""
-        add_mannequin(builder, 0.3)
+        add_mannequin(builder, 0.3, "legs")
         rows = max(round(math.sqrt(0.5 * triangles / COLUMNS_PER_ROW)), 5)
         columns = round(0.5 * triangles / rows)
         along = np.linspace(0.0, LENGTH, rows + 1)[:, None]

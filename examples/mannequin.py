@@ -1,4 +1,4 @@
-"""The dancer of the scenes Dancer and Flamenco: a mannequin whose hips turn and sway, and whose legs step."""
+"""The dancer of the scenes Dancer and Flamenco: a mannequin that turns and sways, on legs or in a petticoat."""
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ LEG = [  # radius and height over the joint [m]
     *[(0.0, -0.74), (0.04, -0.73), (0.042, -0.7), (0.034, -0.62), (0.05, -0.45), (0.046, -0.38)],
     *[(0.066, -0.15), (0.073, 0.0), (0.062, 0.045), (0.036, 0.068), (0.0, 0.075)],
 ]
+PETTICOAT = [(0.0, 0.2), (0.26, 0.21), (0.22, 0.45), (0.17, 0.7), (0.14, 0.82), (0.0, 0.835)]
 ARM = [  # path [m] and radius of the left one, over the head
     *[((0.19, 0.0, 1.385), 0.03), ((0.2, 0.0, 1.4), 0.042), ((0.26, 0.0, 1.44), 0.042), ((0.34, 0.0, 1.5), 0.038)],
     *[((0.39, 0.0, 1.56), 0.036), ((0.39, 0.0, 1.64), 0.034), ((0.34, 0.0, 1.74), 0.03), ((0.27, 0.0, 1.83), 0.024)],
@@ -36,7 +37,7 @@ def dance(time: wp.array[float], rate: float, turn: float, sway: float, stride: 
         turn: How far the trunk turns [rad], to each side.
         sway: How far it goes [m], to each side.
         stride: How far each leg swings [rad], to the front and to the back.
-        body_q: Trunk, left leg, right leg.
+        body_q: Trunk, and left and right leg if there are any.
     """
     t = wp.max(time[0] - SETTLING, 0.0)
     ease = wp.clamp(t / RAMP, 0.0, 1.0)
@@ -46,7 +47,7 @@ def dance(time: wp.array[float], rate: float, turn: float, sway: float, stride: 
     trunk = wp.transform(wp.vec3(ease * sway * wp.sin(0.5 * phase), 0.0, 0.0), yaw)
     swing = ease * stride * wp.sin(phase)
     body_q[0] = trunk
-    for leg in range(2):
+    for leg in range(body_q.shape[0] - 1):
         side = 1.0 - 2.0 * float(leg)
         joint = wp.vec3(side * HIP[0], HIP[1], HIP[2])
         body_q[1 + leg] = trunk * wp.transform(joint, wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), side * swing))
@@ -71,15 +72,22 @@ def tube(path, segments=16):
     return positions, np.concatenate([grid_faces(len(path), segments, around=True), start, end])
 
 
-def add_mannequin(builder, friction):
-    """Adds the bodies trunk, left leg and right leg, as the first of the model, for :func:`dance`."""
+def add_mannequin(builder, friction, below):
+    """Adds the trunk, with head and arms, and what is below it, as the first bodies of the model, for :func:`dance`.
+
+    Args:
+        builder: The builder.
+        friction: Coefficient of all parts.
+        below: "legs", each a body, or "petticoat", which hides them and moves with the trunk.
+    """
     trunk = builder.add_body(is_kinematic=True)
-    positions, faces = lathe(TRUNK, 32)
-    add_collider(builder, trunk, positions * (1.0, FLATNESS, 1.0), faces, friction)
     arm, faces = tube(ARM)
     add_collider(builder, trunk, arm, faces, friction)
     add_collider(builder, trunk, arm * (-1.0, 1.0, 1.0), faces[:, ::-1], friction)
-    for side in (1.0, -1.0):
+    for profile in [TRUNK, PETTICOAT] if below == "petticoat" else [TRUNK]:
+        positions, faces = lathe(profile, 32)
+        add_collider(builder, trunk, positions * (1.0, FLATNESS, 1.0), faces, friction)
+    for side in (1.0, -1.0) if below == "legs" else ():
         joint = wp.vec3(side * HIP[0], HIP[1], HIP[2])
         leg = builder.add_body(xform=wp.transform(joint, wp.quat_identity()), is_kinematic=True)
         add_collider(builder, leg, *lathe(LEG, 20), friction)

@@ -33,8 +33,8 @@ RECORDINGS = {
     "twisting": Recording(first=76, count=26, every=2),
     "funnel": Recording(first=22, count=28, every=1),
     "dancer": Recording(first=50, count=36, every=1),
-    "flamenco": Recording(first=50, count=25, every=1),
-    "crashing": Recording(first=10, count=25, every=2),
+    "flamenco": Recording(first=46, count=36, every=1),
+    "crashing": Recording(first=8, count=26, every=2),
 }
 
 
