@@ -19,6 +19,7 @@ from warp_bsc.scene import Scene
 
 PIXELS = 360
 """Width and height of the picture of a scene; four times as many are computed."""
+_CAPTION_PIXELS = 50
 _SHADOW_PIXELS = 1000
 _RIGID, _SMALL_PARTS = "#cfc6b8", "#4a4a4f"
 
@@ -32,7 +33,8 @@ class View(NamedTuple):
         elevation: Of the eye [degrees].
         azimuth: Of the eye [degrees].
         centre: What is in the middle of the picture [m].
-        extent: Width of the picture [m].
+        extent: Height of the picture [m].
+        width: Of the picture, as a share of its height.
         opened: Whether what is rigid is drawn only where it is behind the z axis.
     """
 
@@ -42,15 +44,16 @@ class View(NamedTuple):
     azimuth: float
     centre: tuple[float, float, float]
     extent: float
+    width: float = 1.0
     opened: bool = False
 
 
 VIEWS = {
-    "twisting": View(15, "#4f86c6", 24.0, -60.0, (0.0, 0.0, 0.3), 1.8),
-    "funnel": View(10, "#3d9e8f", 25.0, -60.0, (0.0, 0.0, 0.2), 1.7, opened=True),
-    "dancer": View(10, "#d96c8a", 6.0, -60.0, (0.0, 0.0, 0.98), 2.0),
-    "flamenco": View(10, "#c8322f", 6.0, -60.0, (0.0, 0.0, 0.98), 2.0),
-    "crashing": View(10, "#e0912f", 20.0, -125.0, (1.6, 0.0, 0.6), 4.6),
+    "twisting": View(18, "#4f86c6", 24.0, -60.0, (0.0, 0.0, 0.3), 1.25),
+    "funnel": View(12, "#3d9e8f", 25.0, -60.0, (0.0, 0.0, 0.16), 1.85, opened=True),
+    "dancer": View(29, "#d96c8a", 6.0, -92.0, (0.0, 0.0, 0.97), 2.05, width=0.72),
+    "flamenco": View(29, "#c8322f", 6.0, -75.0, (0.0, 0.0, 0.97), 2.05, width=0.72),
+    "crashing": View(14, "#e0912f", 16.0, -72.0, (1.35, 0.0, 0.7), 3.4, width=1.25),
 }
 
 
@@ -99,16 +102,17 @@ def project(axes, points, view, extent, pixels):
 
 
 def shade(x, faces, colors, view):
-    """A picture of triangles with light from the upper left and the shadows that they cast, shape [n, n, 3]."""
+    """A picture of triangles with light from the upper left and the shadows that they cast, shape [h, w, 3]."""
     normals = np.zeros_like(x)
     across = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
     np.add.at(normals, faces, across[:, None])
 
     eye = axes_of(view.elevation, view.azimuth)
     lamp = axes_of(50.0, view.azimuth - 25.0)
-    pixels = 2 * PIXELS
-    _, triangle, coordinates = rasterise(project(eye, x, view, view.extent, pixels)[faces], (pixels, pixels))
-    lamp_extent = 1.7 * view.extent
+    pixels = 2 * round(PIXELS * max(view.width, 1.0))
+    extent = view.extent * max(view.width, 1.0)
+    _, triangle, coordinates = rasterise(project(eye, x, view, extent, pixels)[faces], (pixels, pixels))
+    lamp_extent = 1.7 * extent
     corners = project(lamp, x, view, lamp_extent, _SHADOW_PIXELS)[faces]
     lit_depth, _, _ = rasterise(corners, (_SHADOW_PIXELS, _SHADOW_PIXELS))
 
@@ -119,16 +123,19 @@ def shade(x, faces, colors, view):
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal *= np.sign(normal @ -eye[2])[:, None]
     # a little towards the lamp, so that what is lit does not shade itself
-    lifted = project(lamp, position - 6.0e-3 * view.extent * lamp[2], view, lamp_extent, _SHADOW_PIXELS)
+    lifted = project(lamp, position - 6.0e-3 * extent * lamp[2], view, lamp_extent, _SHADOW_PIXELS)
     column, row = np.clip(np.round(lifted[:, :2]).astype(int), 0, _SHADOW_PIXELS - 1).T
-    lit = lifted[:, 2] <= lit_depth[row, column]
+    outside = ((lifted[:, :2] < 0.0) | (lifted[:, :2] >= _SHADOW_PIXELS)).any(axis=1)
+    lit = outside | (lifted[:, 2] <= lit_depth[row, column])
     half = -(lamp[2] + eye[2]) / np.linalg.norm(lamp[2] + eye[2])
     diffuse = np.maximum(normal @ -lamp[2], 0.0) * np.where(lit, 1.0, 0.25)
     gloss = 0.12 * np.maximum(normal @ half, 0.0) ** 30 * lit
     picture = np.ones((pixels, pixels, 3))
     light = 0.38 + 0.14 * normal[:, 2] + 0.6 * diffuse
     picture[drawn] = np.clip(colors[triangle[drawn]] * light[:, None] + gloss[:, None], 0.0, 1.0)
-    return picture.reshape(PIXELS, 2, PIXELS, 2, 3).mean(axis=(1, 3))
+    picture = picture.reshape(pixels // 2, 2, pixels // 2, 2, 3).mean(axis=(1, 3))
+    height, width = (pixels // 2 - PIXELS) // 2, (pixels // 2 - round(PIXELS * view.width)) // 2
+    return picture[height : height + PIXELS, width : width + round(PIXELS * view.width)]
 
 
 def parts(faces, vertex_count):
@@ -166,15 +173,18 @@ def main():
     parser.add_argument("folder", type=Path, help="Where the recordings are, named after the scenes.")
     parser.add_argument("picture", help="File to write, .png.")
     arguments = parser.parse_args()
-    figure, all_axes = plt.subplots(
-        1, len(VIEWS), figsize=(len(VIEWS) * PIXELS / 100.0, 1.13 * PIXELS / 100.0), dpi=100
-    )
-    for axes, (name, view) in zip(all_axes, VIEWS.items(), strict=True):
+    size = sum(round(PIXELS * view.width) for view in VIEWS.values()), PIXELS + _CAPTION_PIXELS
+    figure = plt.figure(figsize=(size[0] / 100.0, size[1] / 100.0), dpi=100)
+    left = 0.0
+    for name, view in VIEWS.items():
         scene = Scene(arguments.folder / f"{name}.usd")
+        width = view.width * PIXELS / size[0]
+        axes = figure.add_axes((left, _CAPTION_PIXELS / size[1], width, PIXELS / size[1]))
         axes.imshow(picture_of(scene, view))
         axes.set_axis_off()
-        axes.set_title(f"{name.capitalize()}, {scene.face_count:,} triangles", y=-0.11, fontsize=13)
-    figure.subplots_adjust(left=0.0, right=1.0, bottom=0.115, top=1.0, wspace=0.0)
+        caption = f"{name.capitalize()}\n{scene.face_count:,} triangles"
+        figure.text(left + 0.5 * width, 0.5 * _CAPTION_PIXELS / size[1], caption, ha="center", va="center", fontsize=13)
+        left += width
     buffer = io.BytesIO()
     figure.savefig(buffer)
     Image.open(buffer).convert("RGB").quantize(256).save(arguments.picture, optimize=True)

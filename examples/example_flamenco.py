@@ -93,7 +93,7 @@ class Example(PaperScene):
         assert length > 1.2, f"a hem is {length} times as long as a circle of its width"
         assert distance > 0.05, f"two hems are {distance} m from each other in height"
         assert lowest > -0.1, f"the dress hangs down to {lowest} m"
-        assert speed > 0.1, f"the dress moves with {speed} m/s"
+        assert speed > 0.3, f"the dress moves with {speed} m/s"
 
 
 def revolve(height, offset, columns):

@@ -66,21 +66,16 @@ def record(name, folder, triangles):
 
 
 def shorten(stage):
-    """Leaves out the normals, which are half of the file, and lets the time begin at the first sample."""
+    """Leaves out the normals and what is not shown, most of the file, and lets the time begin at the first sample."""
     layer = stage.GetRootLayer()
-    normals, times = [], set()
-
-    def collect(path):
-        if path.name == "normals":
-            normals.append(path)
-        elif path.name == "points":
-            times.update(layer.ListTimeSamplesForPath(path))
-
-    layer.Traverse("/", collect)
+    for name in ("particles", "joints", "com", "inertia_boxes"):
+        stage.RemovePrim(f"/root/model/{name}")
+    normals = []
+    layer.Traverse("/", lambda path: normals.append(path) if path.name == "normals" else None)
     for path in normals:
         prim = layer.GetPrimAtPath(path.GetPrimPath())
         prim.RemoveProperty(prim.properties[path.name])
-    stage.SetStartTimeCode(min(times))
+    stage.SetStartTimeCode(layer.ListTimeSamplesForPath("/root/model/triangles.points")[0])
 
 
 def main():

@@ -12,8 +12,17 @@ from newton.viewer import ViewerNull
 FOLDER = Path(__file__).parents[1] / "examples"
 EXAMPLES = sorted(FOLDER.glob("example_*.py"))
 BULLET = FOLDER / "example_cloth_bullet.py"
-PAPER_SCENES = ["twisting", "funnel", "dancer", "flamenco", "crashing"]
+PAPER_SCENES = {
+    "twisting": "degrees",
+    "funnel": "from the axis",
+    "dancer": "hem",
+    "flamenco": "m/s",
+    "crashing": "length",
+}
+"""What each of them complains of at first."""
 FRAMES = 3
+COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
+COMPARED += ["tet_indices", "tet_poses", "tet_materials"]
 
 each_paper_scene = pytest.mark.parametrize("name", PAPER_SCENES)
 each_example = pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
@@ -89,7 +98,7 @@ def test_resolution(name, triangles):
 
 @each_paper_scene
 def test_scene_has_to_become_what_it_is_called(name):
-    with pytest.raises(AssertionError, match=r"particles|m/s|degrees|folded|length"):
+    with pytest.raises(AssertionError, match=PAPER_SCENES[name]):
         run(path_of(name), 1, "--triangles", "2000").test_final()
 
 
@@ -106,7 +115,7 @@ def test_funnel_without_stage():
 
 
 def test_car_is_crushed():
-    run(path_of("crashing"), 50, "--triangles", "2000").test_final()
+    run(path_of("crashing"), 40, "--triangles", "1500").test_final()
 
 
 def test_car_is_as_if_added_one_tetrahedron_at_a_time():
@@ -129,9 +138,6 @@ def test_car_is_as_if_added_one_tetrahedron_at_a_time():
             add_surface_mesh_edges=False,
         )
     models = [builder.finalize() for builder in (added, expected)]
-    for (
-        name
-    ) in "particle_q particle_qd particle_mass tri_indices tri_materials tet_indices tet_poses tet_materials".split():
-        np.testing.assert_allclose(
-            *[getattr(model, name).numpy() for model in models], rtol=1e-4, atol=1e-5, err_msg=name
-        )
+    for name in COMPARED:
+        values = [getattr(model, name).numpy() for model in models]
+        np.testing.assert_allclose(*values, rtol=1e-4, atol=1e-5, err_msg=name)
