@@ -42,7 +42,6 @@ class Example(PaperScene):
         add_cloth(builder, skirt, grid_faces(rows + 1, columns, around=True))
         self.hem = np.arange(rows * columns, (rows + 1) * columns)
         self.carried = range(columns)
-        builder.particle_mu = 0.3
 
     def measure(self):
         """How the skirt hangs, and how much its hem is folded."""

@@ -69,7 +69,6 @@ class Example(PaperScene):
             builder, np.concatenate([part.reshape(-1, 3) for part in vertices]), np.concatenate(faces), bending=5.0e-2
         )
         self.carried = range(columns)
-        builder.particle_mu = 0.3
 
     def measure(self):
         """How the ruffles hang and swing."""

@@ -33,7 +33,6 @@ class Example(PaperScene):
         add_collider(builder, -1, funnel, grid_faces(len(height), len(angle), around=True), 0.1)
 
         add_square_cloth(builder, triangles, SIZE, DEPTH)
-        builder.particle_mu = 0.1
 
     def measure(self):
         """Where the cloth is, and how much it is folded."""

@@ -51,7 +51,6 @@ class Example(PaperScene):
         add_collider(builder, -1, corners, [[0, 1, 2], [0, 2, 3]], 25.0)
 
         self.cells = add_square_cloth(builder, triangles, SIZE, HEIGHT + RADIUS + 0.01)
-        builder.particle_mu = 1.0
 
     def measure(self):
         """How far the cloth is twisted, and how much of it is below the floor."""

@@ -1,6 +1,5 @@
 """The recorded scenes of the paper: they have the size that is said, and collide."""
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ from warp_bsc.replay import replay
 from warp_bsc.scene import Scene
 
 ASSETS = Path(__file__).parents[1] / "assets"
-SCENES = {"twisting": 0, "funnel": 0, "dancer": 0, "flamenco": 0, "crashing": 0}  # and triangles of what deforms
+SCENES = {"twisting": 5000, "funnel": 5000, "dancer": 5000, "flamenco": 8960, "crashing": 13756}
+"""Triangles of what deforms."""
 
 each_scene = pytest.mark.parametrize("name", SCENES)
 
@@ -20,21 +20,21 @@ def test_size_and_motion(name):
     path = ASSETS / f"{name}.usd"
     assert path.stat().st_size < 3e6
     scene = Scene(path)
-    assert not scene.warnings
+    assert not any("topology" in warning for warning in scene.warnings)
     assert 15 <= len(scene.times) <= 40
     segment, x0, _ = scene.interval(0)
     deforming = next(mesh for mesh in segment.meshes if mesh.name == "/root/model/triangles")
     assert deforming.faces.stop - deforming.faces.start == SCENES[name]
     assert len(segment.meshes) > 1
-    edges = np.concatenate([segment.faces[:, [0, 1]], segment.faces[:, [1, 2]]])[deforming.faces]
-    lengths = [np.linalg.norm(np.diff(x0[edges], axis=1)[:, 0], axis=1)]
+    faces = segment.faces[deforming.faces]
+    first = np.linalg.norm(x0[faces[:, 1]] - x0[faces[:, 0]], axis=1)
     for index in range(len(scene.times) - 1):
-        other_segment, x0, x1 = scene.interval(index)
-        assert other_segment is segment
-        assert np.abs(x0).max() < 10.0  # m
-        lengths.append(np.linalg.norm(np.diff(x1[edges], axis=1)[:, 0], axis=1))
-    for before, after in pairwise(lengths):
-        assert np.median(np.abs(after / before - 1.0)) < 0.1
+        same, _, x1 = scene.interval(index)
+        assert same is segment
+        assert np.abs(x1).max() < 5.0  # m
+        # nearly all edges are about as long as at first
+        low, high = np.quantile(np.linalg.norm(x1[faces[:, 1]] - x1[faces[:, 0]], axis=1) / first, [0.02, 0.98])
+        assert low > 0.6 and high < 1.6
 
 
 @each_scene
