@@ -17,6 +17,7 @@ import warp_bsc as bsc
 __all__ = ["PaperScene", "SolverDrivenVBD", "add_cloth", "add_collider", "add_square_cloth", "grid_faces", "lathe"]
 
 FRAMES_PER_CAPTURE = 6
+FEWEST_TRIANGLES = 1000
 RECORDED_FPS = 60
 """Frames a second of a recording: where a scene has more, it is shown in slow motion."""
 
@@ -31,36 +32,34 @@ def advance(dt: float, time: wp.array[float]):
 def carry(
     carried: wp.array[int],
     rest: wp.array[wp.vec3],
-    body: int,
     rest_body_q: wp.array[wp.transform],
     body_q: wp.array[wp.transform],
     particle_q: wp.array[wp.vec3],
 ):
-    """Puts the particles that are fastened to a body to where it is."""
+    """Puts the particles that are fastened to the first body to where it is."""
     particle = carried[wp.tid()]
-    local = wp.transform_point(wp.transform_inverse(rest_body_q[body]), rest[particle])
-    particle_q[particle] = wp.transform_point(body_q[body], local)
+    local = wp.transform_point(wp.transform_inverse(rest_body_q[0]), rest[particle])
+    particle_q[particle] = wp.transform_point(body_q[0], local)
 
 
 class SolverDrivenVBD(newton.solvers.SolverVBD):
     """VBD that also moves bodies and what is fastened to them, as a part of the step that the stage sees as a whole."""
 
-    def __init__(self, model, motion, motion_inputs, carried, carrier, **options):
+    def __init__(self, model, motion, motion_inputs, carried, **options):
         """Fastens particles.
 
         Args:
             model: The model.
             motion: Kernel that writes the poses of all bodies at a time: ``time``, its inputs, ``body_q``; or None.
             motion_inputs: Its inputs.
-            carried: Particles that move with a body, int, shape [n].
-            carrier: The body.
+            carried: Particles that move with the first body, int, shape [n].
             options: As for VBD.
         """
         # it leaves the bodies to others, so that both states keep the poses that they are given
         super().__init__(
             model, particle_enable_self_contact=False, integrate_with_external_rigid_solver=True, **options
         )
-        self.motion, self.motion_inputs, self.carrier = motion, motion_inputs, carrier
+        self.motion, self.motion_inputs = motion, motion_inputs
         self.carried = wp.array(carried, dtype=int, device=model.device)
         self.time = wp.zeros(1, dtype=float, device=model.device)
 
@@ -72,7 +71,7 @@ class SolverDrivenVBD(newton.solvers.SolverVBD):
             inputs = [self.time, *self.motion_inputs]
             wp.launch(self.motion, 1, inputs=inputs, outputs=[state_out.body_q], device=device)
         if len(self.carried):
-            inputs = [self.carried, self.model.particle_q, self.carrier, self.model.body_q, state_out.body_q]
+            inputs = [self.carried, self.model.particle_q, self.model.body_q, state_out.body_q]
             wp.launch(carry, len(self.carried), inputs=inputs, outputs=[state_in.particle_q], device=device)
         super().step(state_in, state_out, control, contacts, dt, **options)
 
@@ -90,8 +89,7 @@ class PaperScene:
         camera: Position [m], pitch and yaw [degrees].
         motion: Kernel that moves the bodies, see :class:`SolverDrivenVBD`.
         motion_inputs: What it takes.
-        carried: Particles that move with a body.
-        carrier: That body.
+        carried: Particles that move with the first body.
     """
 
     triangles = 5000
@@ -104,9 +102,10 @@ class PaperScene:
     motion = None
     motion_inputs = ()
     carried = ()
-    carrier = 0
 
     def __init__(self, viewer, args):
+        if args.triangles < FEWEST_TRIANGLES:
+            raise ValueError(f"--triangles must be at least {FEWEST_TRIANGLES}, not {args.triangles}")
         self.viewer = viewer
         self.ccd = args.ccd
         self.frame_dt = 1.0 / self.fps
@@ -123,12 +122,7 @@ class PaperScene:
         builder.color()
         self.model = builder.finalize()
         self.solver = SolverDrivenVBD(
-            self.model,
-            self.motion,
-            self.motion_inputs,
-            self.carried,
-            self.carrier,
-            iterations=self.iterations,
+            self.model, self.motion, self.motion_inputs, self.carried, iterations=self.iterations
         )
         if self.ccd:
             self.solver = bsc.SolverCCD(self.solver)

@@ -1,7 +1,7 @@
 """Records the scenes of the paper as USD: what is in assets/, or of any size.
 
-    python examples/record_scenes.py                                        # all, as in assets/, into this folder
-    python examples/record_scenes.py twisting --triangles 50000 --folder .. # one of them, with so many triangles
+    python examples/record_scenes.py                              # all, as in assets/, into this folder
+    python examples/record_scenes.py twisting --triangles 50000   # one of them, with so many triangles
 
 What comes before the most interesting moments is simulated, but not recorded.
 """
@@ -52,9 +52,10 @@ def record(name, folder, triangles):
     example_class = importlib.import_module(f"example_{name}").Example
     options = ["--viewer", "usd"] if triangles is None else ["--viewer", "usd", "--triangles", str(triangles)]
     path = Path(folder) / f"{name}.usd"
-    path.unlink(missing_ok=True)
+    unfinished = path.with_name(f"{name}_unfinished.usd")
+    unfinished.unlink(missing_ok=True)
     first, count, every = RECORDINGS[name]
-    viewer = newton.viewer.ViewerUSD(str(path), num_frames=count)
+    viewer = newton.viewer.ViewerUSD(str(unfinished), num_frames=count)
     example = example_class(viewer, example_class.create_parser().parse_args(options))
     while viewer.is_running():
         if example.frame >= first and (example.frame - first) % every == 0:
@@ -62,6 +63,7 @@ def record(name, folder, triangles):
         example.step()
     shorten(viewer.stage)
     viewer.close()
+    unfinished.replace(path)
     return example, path
 
 
@@ -86,6 +88,9 @@ def main():
     parser.add_argument("--folder", default=".", help="where to write (default: the current folder)")
     parser.add_argument("--device", help="Warp device, such as cuda:0 (default: Warp's)")
     arguments = parser.parse_args()
+    for name in arguments.scenes:
+        if name not in RECORDINGS:
+            parser.error(f"there is no scene {name}, only {', '.join(RECORDINGS)}")
     if arguments.device:
         wp.set_device(arguments.device)
     for name in arguments.scenes or RECORDINGS:
