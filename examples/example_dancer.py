@@ -26,7 +26,7 @@ class Example(PaperScene):
     triangles = 5000
     frames = 120
     motion = dance
-    motion_inputs = (0.9, 1.3, 0.08, 0.45)
+    motion_inputs = (0.9, 1.3, 0.08, 0.45)  # rate, turn, sway and stride
     camera = (wp.vec3(1.5, -1.9, 1.2), -8.0, 128.0)
 
     def build(self, builder, triangles):

@@ -32,7 +32,7 @@ class Example(PaperScene):
     triangles = 8500
     frames = 90
     motion = dance
-    motion_inputs = (1.3, 1.1, 0.15, 0.0)
+    motion_inputs = (1.3, 1.1, 0.15, 0.0)  # rate, turn, sway and stride
     camera = (wp.vec3(1.6, -2.2, 1.1), -8.0, 126.0)
 
     def build(self, builder, triangles):
@@ -66,7 +66,7 @@ class Example(PaperScene):
             faces.append(vertex.reshape(-1)[grid_faces(ruffle_rows + 1, around, around=True)])
             self.hems.append(vertex[-1])
         add_cloth(
-            builder, np.concatenate([part.reshape(-1, 3) for part in vertices]), np.concatenate(faces), bending=5.0e-2
+            builder, np.concatenate([sheet.reshape(-1, 3) for sheet in vertices]), np.concatenate(faces), bending=5.0e-2
         )
         self.carried = range(columns)
 

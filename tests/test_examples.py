@@ -107,6 +107,25 @@ def test_scene_has_to_become_what_it_is_called(name):
         run(path_of(name), 1, "--triangles", "2000").test_final()
 
 
+def test_frame_that_a_graph_has_no_room_for_is_taken_back(monkeypatch):
+    expected, example = (run(path_of("dancer"), 2, "--triangles", "1000") for _ in range(2))
+    counts = iter([0, 3, 3])  # not certified: before, after, at the end
+
+    def spoil(graph):
+        example.state_0.particle_q.zero_()
+        example.solver.time.zero_()
+
+    monkeypatch.setattr(wp, "capture_launch", spoil)
+    monkeypatch.setattr(example, "count_uncertified", lambda: next(counts))
+    example.graph = "a graph"
+    expected.step()
+    example.step()
+    assert (expected.positions() == example.positions()).all()
+    assert example.taken_back == 3
+    with pytest.raises(AssertionError, match="hem"):  # only
+        example.test_final()
+
+
 def test_funnel_is_passed(capsys):
     example = run(path_of("funnel"), 46, "--triangles", "1000")
     example.test_final()
