@@ -205,6 +205,11 @@ class PaperScene:
         """Positions of the particles now [m], float64, shape [n, 3]."""
         return self.state_0.particle_q.numpy().astype(np.float64)
 
+    def find_intersections(self):
+        """Edges and faces of what deforms that cross now."""
+        mesh = bsc.CollisionMesh(self.model.tri_indices.numpy(), self.model.particle_count, device=self.model.device)
+        return bsc.CollisionDetector(mesh).find_intersections(self.state_0.particle_q)
+
     def measure(self):
         """What has come of the scene, a number for each name."""
         raise NotImplementedError
@@ -221,6 +226,8 @@ class PaperScene:
             assert uncertified == 0, f"{uncertified} steps are not certified"
             assert len(report.intersections) == 0, f"{len(report.intersections)} edges cross faces"
         assert np.isfinite(self.positions()).all(), "positions are not finite"
+        intersections = self.find_intersections()
+        assert len(intersections) == 0, f"{len(intersections)} edges of what deforms cross faces of it"
         self.test_scene(self.measure())
 
     def print_report(self):

@@ -138,6 +138,11 @@ def test_funnel_without_stage():
         run(path_of("funnel"), 46, "--triangles", "1000", "--no-ccd").test_final()
 
 
+def test_dancer_without_stage():
+    with pytest.raises(AssertionError, match="edges of what deforms cross faces of it"):
+        run(path_of("dancer"), 40, "--triangles", "1000", "--no-ccd").test_final()
+
+
 def test_car_is_crushed():
     run(path_of("crashing"), 38, "--triangles", "1500").test_final()
 
