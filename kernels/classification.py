@@ -68,18 +68,12 @@ def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
 
 
 @wp.func
-def classify(motion: Motion, y: Coplanarity) -> int:
-    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
-
-    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
-    there; where Y may have two extrema it is split at its inflection first, homogeneously.
+def classify_with(y: Coplanarity, tests: InsideTests) -> int:
+    """Status of a query whose cubic may have roots from the inside tests given.
 
     Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of
     size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
     """
-    if certified_sign_cubic(y.k, y.bound) != 0:
-        return FREE
-    tests = inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1))
     constant = verdict(constant_signs(tests))
     if constant == FREE:
         return FREE
@@ -118,3 +112,15 @@ def classify(motion: Motion, y: Coplanarity) -> int:
                 half = _classify_piece(k, bound, part, half_shape)
         status = either(status, half)
     return status
+
+
+@wp.func
+def classify(motion: Motion, y: Coplanarity) -> int:
+    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
+
+    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
+    there; where Y may have two extrema it is split at its inflection first, homogeneously.
+    """
+    if certified_sign_cubic(y.k, y.bound) != 0:
+        return FREE
+    return classify_with(y, inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1)))

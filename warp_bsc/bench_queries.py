@@ -1,14 +1,12 @@
 """Benchmark of elementary queries: how many a second are answered where queries and answers stay on the device."""
 
 import functools
-import statistics
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from .bench import replay_graph
+from .bench import median_milliseconds
 from .kernels.ccd import (
     ccd_edge_edge,
     ccd_vertex_face,
@@ -340,7 +338,7 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
         launch_over(find_exact_status, count, inputs=[touching], outputs=outputs, device=device, block_dim=64)
 
     runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
-    milliseconds = {mode: _median_milliseconds(runs[mode], device, repeat) for mode in MODES}
+    milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
     answers = {mode: array.numpy() for mode, array in status.items()}
     missed = int((answers["exact"] != HIT).sum())
     if missed:
@@ -362,20 +360,5 @@ def benchmark_copy(*, device=None, repeat=20) -> float:
     device = wp.get_device(device)
     source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)
     target = wp.empty_like(source)
-    milliseconds = _median_milliseconds(lambda: wp.copy(target, source), device, repeat)
+    milliseconds = median_milliseconds(lambda: wp.copy(target, source), device, repeat)
     return 2e3 * _COPIED_BYTES / milliseconds
-
-
-def _median_milliseconds(run, device, repeat) -> float:
-    """Median time of a run [ms]; a first one, which loads the kernels, is not timed."""
-    run()
-    if device.is_cuda:
-        with wp.ScopedCapture(device) as capture:
-            run()
-        return replay_graph(capture.graph, device, replays=repeat)
-    seconds = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(seconds)
