@@ -1,23 +1,24 @@
-"""What the paper's benchmarks compare: each method as a kernel that reads a query's points and writes its answer.
+"""What the paper's benchmarks compare: each method as kernels that read a query's points and write its answer.
 
-All read the same arrays, one query a thread, and answer the same question: whether the two features meet. What each
-does, and what not, so that the times can be compared:
+All read the same arrays, positions by the vertices of a pair's elements, as a detector does, and answer the same
+question: whether the two features meet. What each does, and what not, so that the times can be compared:
 
 - ``float``, ``conservative``: the stages of the detector, without and with error bounds: boxes, the signs of the
-  Bernstein coefficients, a separating direction; then, for what these leave, in a kernel of its own, classification
-  and the subdivision of what that leaves open. UNSURE is a collision.
+  Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
+  kernel of its own, classification and the subdivision of what that leaves open. UNSURE is a collision.
 - ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
 - ``cubic``: :mod:`warp_bsc.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
   knows a time, too; that time is not written.
 - ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.baselines.reduced_inside_test`. As there is
   no subdivision in the paper, what classification leaves open is a collision at once: weak inequalities, as it has
-  them.
+  them. Its culls are those of ``float``.
 
 None is asked for a time of impact, and none looks whether numbers are finite, which is done once a vertex.
 """
 
 import enum
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -28,6 +29,7 @@ from .exact_stage import launch_exact_stage
 from .kernels.ccd import edge_edge_motion, vertex_face_motion
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from .kernels.eights import EIGHT, cull_eight_of
 from .kernels.polynomials import coplanarity
 from .kernels.queues import take_slot
 from .kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -35,7 +37,7 @@ from .kernels.time_of_impact import impact
 from .launching import launch_over, launch_over_queue
 from .narrow_phase import TOLERANCE
 
-__all__ = ["METHODS", "STAGES", "MethodRun", "QuerySet", "measure_nanoseconds", "trace_stages"]
+__all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace_stages"]
 
 METHODS = ("float", "conservative", "exact", "cubic", "reduced")
 """What is compared."""
@@ -83,8 +85,12 @@ def _kernels(kind, dtype):
     solve_cubic = cubic_solver_vertex_face if vertex_face else cubic_solver_edge_edge
 
     @wp.func
-    def read(x: wp.array[dtype], i: int):
-        return x[4 * i], x[4 * i + 1], x[4 * i + 2], x[4 * i + 3]
+    def read(x: wp.array[dtype], elements: wp.array2d[int], pair: wp.vec2i):
+        first = pair[0]
+        second = pair[1]
+        if wp.static(vertex_face):
+            return x[first], x[elements[second, 0]], x[elements[second, 1]], x[elements[second, 2]]
+        return x[elements[first, 0]], x[elements[first, 1]], x[elements[second, 0]], x[elements[second, 1]]
 
     @wp.func
     def started(ticks: wp.array[wp.int64]) -> wp.int64:
@@ -102,6 +108,8 @@ def _kernels(kind, dtype):
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
         roundoff: wp.float64,
         status: wp.array[wp.int8],
         survivors: wp.array[int],
@@ -110,8 +118,8 @@ def _kernels(kind, dtype):
     ):
         i = first + wp.tid()
         start = started(ticks)
-        a0, b0, c0, d0 = read(x0, i)
-        a1, b1, c1, d1 = read(x1, i)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
         status[i] = wp.int8(FREE)
         if not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -121,11 +129,41 @@ def _kernels(kind, dtype):
                     survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i
         stop(ticks, i, start)
 
+    cull_eight = cull_eight_of(dtype, vertex_face)
+
+    @wp.kernel(**_KERNEL)
+    def cull_eights(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        roundoff: wp.float64,
+        status: wp.array[wp.int8],
+        survivors: wp.array[int],
+        counts: wp.array[wp.int64],
+        ticks: wp.array[wp.int64],
+    ):
+        i = EIGHT * (first + wp.tid())
+        start = started(ticks)
+        count = wp.min(EIGHT, pairs.shape[0] - i)
+        left = cull_eight(x0, x1, elements, pairs, i, count, roundoff)
+        for lane in range(count):
+            status[i + lane] = wp.int8(FREE)
+            if (left >> lane) & 1 == 1:
+                survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
+        if ticks:
+            passed = _cycles() - start
+            for lane in range(count):
+                wp.atomic_add(ticks, i + lane, passed // wp.int64(8))
+
     @wp.kernel(**_KERNEL)
     def classify_survivors(
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
         roundoff: wp.float64,
         survivors: wp.array[int],
         status: wp.array[wp.int8],
@@ -138,8 +176,8 @@ def _kernels(kind, dtype):
             return
         i = survivors[slot]
         start = started(ticks)
-        a0, b0, c0, d0 = read(x0, i)
-        a1, b1, c1, d1 = read(x1, i)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         y = coplanarity(motion)
         answer = classify(motion, y)
@@ -156,6 +194,8 @@ def _kernels(kind, dtype):
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
         survivors: wp.array[int],
         status: wp.array[wp.int8],
         counts: wp.array[wp.int64],
@@ -166,8 +206,8 @@ def _kernels(kind, dtype):
             return
         i = survivors[slot]
         start = started(ticks)
-        a0, b0, c0, d0 = read(x0, i)
-        a1, b1, c1, d1 = read(x1, i)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         status[i] = wp.int8(classify_reduced(motion, coplanarity(motion)))
         stop(ticks, i, start)
@@ -177,21 +217,31 @@ def _kernels(kind, dtype):
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
         status: wp.array[wp.int8],
         ticks: wp.array[wp.int64],
     ):
         i = first + wp.tid()
         start = started(ticks)
-        a0, b0, c0, d0 = read(x0, i)
-        a1, b1, c1, d1 = read(x1, i)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
         status[i] = wp.int8(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
         stop(ticks, i, start)
 
     @wp.kernel(**_KERNEL)
-    def trace(first: int, x0: wp.array[dtype], x1: wp.array[dtype], roundoff: wp.float64, stage: wp.array[wp.int8]):
+    def trace(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        roundoff: wp.float64,
+        stage: wp.array[wp.int8],
+    ):
         i = first + wp.tid()
-        a0, b0, c0, d0 = read(x0, i)
-        a1, b1, c1, d1 = read(x1, i)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         y = coplanarity(motion)
         decided = int(4)
@@ -207,11 +257,52 @@ def _kernels(kind, dtype):
 
     return {
         "cull": cull,
+        "cull_eights": cull_eights,
         "classify_survivors": classify_survivors,
         "classify_survivors_reduced": classify_survivors_reduced,
         "cubic": cubic,
         "trace": trace,
     }
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Queries of one kind as pairs of a mesh's elements.
+
+    Attributes:
+        kind: "vertex_face" or "edge_edge".
+        x0: Positions of the mesh at the start, float32 or float64, shape [vertex_count, 3].
+        x1: Positions at its end, of the same type.
+        elements: Vertices of its faces (vertex_face) or edges (edge_edge), int32, shape [element_count, 3 or 2].
+        pairs: (vertex, face) or (edge, edge), int32, shape [n, 2].
+    """
+
+    kind: str
+    x0: np.ndarray
+    x1: np.ndarray
+    elements: np.ndarray
+    pairs: np.ndarray
+
+    @classmethod
+    def of_points(cls, kind, points) -> "Queries":
+        """Queries with four vertices each of their own, from rows as of :func:`warp_bsc.query_vertex_face`."""
+        n = len(points)
+        x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
+        vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
+        if kind == "vertex_face":
+            return cls(kind, x0, x1, np.ascontiguousarray(vertices[:, 1:]), np.stack([4 * rows, rows], axis=1))
+        return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
+
+    def points(self, which=slice(None)) -> np.ndarray:
+        """Points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
+        pairs = self.pairs[which]
+        first = pairs[:, :1] if self.kind == "vertex_face" else self.elements[pairs[:, 0]]
+        corners = np.concatenate([first, self.elements[pairs[:, 1]]], axis=1)
+        return np.concatenate([self.x0[corners], self.x1[corners]], axis=1)
+
+    def __len__(self):
+        """How many queries there are."""
+        return len(self.pairs)
 
 
 class QuerySet:
@@ -220,35 +311,22 @@ class QuerySet:
     Attributes:
         kind: "vertex_face" or "edge_edge".
         count: How many.
-        x0: Their points at the start, four in a row each, Warp array of vec3 or vec3d.
-        x1: Their points at the end.
-        elements: Faces or edges of the mesh in which each query has four vertices of its own.
-        pairs: The queries as pairs of elements of that mesh, array of vec2i.
+        arrays: What all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d; elements,
+            two-dimensional array of int; and pairs, array of vec2i.
     """
 
-    def __init__(self, kind, points, device):
-        """Copies queries to a device.
-
-        Args:
-            kind: "vertex_face" or "edge_edge".
-            points: NumPy array, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3].
-            device: Warp device.
-        """
-        self.kind = kind
+    def __init__(self, queries, device, *, repeated=1):
+        """Copies :class:`Queries` to a device, their pairs so many times one after the other."""
+        self.kind = queries.kind
         self.device = wp.get_device(device)
-        self.count = n = len(points)
-        dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
-        self.x0, self.x1 = (
-            wp.array(np.ascontiguousarray(x).reshape(-1, 3), dtype=dtype, device=device)
-            for x in (points[:, :4], points[:, 4:])
-        )
-        vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
-        if kind == "vertex_face":
-            elements, pairs = vertices[:, 1:], np.stack([4 * rows, rows], axis=1)
-        else:
-            elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
-        self.elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
-        self.pairs = wp.array(pairs, dtype=wp.vec2i, device=device)
+        self.dtype = wp.vec3 if queries.x0.dtype == np.float32 else wp.vec3d
+        pairs = np.tile(queries.pairs, (repeated, 1))
+        self.count = len(pairs)
+        self.arrays = [
+            *(wp.array(x, dtype=self.dtype, device=device) for x in (queries.x0, queries.x1)),
+            wp.array(queries.elements, dtype=int, device=device),
+            wp.array(pairs, dtype=wp.vec2i, device=device),
+        ]
 
 
 class MethodRun:
@@ -277,30 +355,35 @@ class MethodRun:
             ticks: To which the clock cycles of each query are added, but for exact arithmetic's, Warp array of int64.
         """
         queries = self.queries
-        kernels = _kernels(queries.kind, queries.x0.dtype)
-        points = [queries.x0, queries.x1]
+        kernels = _kernels(queries.kind, queries.dtype)
+        arrays = queries.arrays
         if self.method == "cubic":
             outputs = [self.status, ticks]
-            launch_over(kernels["cubic"], queries.count, inputs=points, outputs=outputs, device=queries.device)
+            launch_over(kernels["cubic"], queries.count, inputs=arrays, outputs=outputs, device=queries.device)
             return
         counts = self._counts
         counts.zero_()
         roundoff = 0.0 if self.method in ("float", "reduced") else ROUNDOFF
         outputs = [self.status, self._survivors, counts, ticks]
-        inputs = [*points, roundoff]
-        launch_over(kernels["cull"], queries.count, inputs=inputs, outputs=outputs, device=queries.device)
+        inputs = [*arrays, roundoff]
+        if queries.device.is_cpu:
+            eights = -(-queries.count // EIGHT)
+            launch_over(
+                kernels["cull_eights"], eights, inputs=inputs, outputs=outputs, device=queries.device, chunk=128
+            )
+        else:
+            launch_over(kernels["cull"], queries.count, inputs=inputs, outputs=outputs, device=queries.device)
         entries = [self._survivors, counts, _Count.SURVIVORS]
         if self.method == "reduced":
-            inputs, outputs = [*points, self._survivors], [self.status, counts, ticks]
+            inputs, outputs = [*arrays, self._survivors], [self.status, counts, ticks]
             launch_over_queue(kernels["classify_survivors_reduced"], *entries, inputs=inputs, outputs=outputs)
             return
-        inputs, outputs = [*points, roundoff, self._survivors], [self.status, self._unsure[0], counts, ticks]
+        inputs, outputs = [*arrays, roundoff, self._survivors], [self.status, self._unsure[0], counts, ticks]
         launch_over_queue(kernels["classify_survivors"], *entries, inputs=inputs, outputs=outputs)
         if self.method == "exact":
             launch_exact_stage(
                 queries.kind,
-                *points,
-                queries.elements,
+                *arrays[:3],
                 timed=False,
                 tolerance=TOLERANCE,
                 queues=self._unsure,
@@ -308,7 +391,7 @@ class MethodRun:
                 asked=int(_Count.UNSURE),
                 too_wide=[int(_Count.WIDE), int(_Count.WIDER), int(_Count.WIDEST)],
                 refuted=int(_Count.REFUTED),
-                contacts=[queries.pairs, self.status, *[None] * 4],
+                contacts=[arrays[3], self.status, *[None] * 4],
                 keys=self._keys,
                 last_key=0,
             )
@@ -333,9 +416,8 @@ def measure_nanoseconds(run, *, repeat):
 def trace_stages(queries):
     """Which of :data:`STAGES` decides each query by method "exact", int8, shape [n]."""
     stage = wp.empty(queries.count, dtype=wp.int8, device=queries.device)
-    inputs = [queries.x0, queries.x1, ROUNDOFF]
-    trace = _kernels(queries.kind, queries.x0.dtype)["trace"]
-    launch_over(trace, queries.count, inputs=inputs, outputs=[stage], device=queries.device)
+    trace = _kernels(queries.kind, queries.dtype)["trace"]
+    launch_over(trace, queries.count, inputs=[*queries.arrays, ROUNDOFF], outputs=[stage], device=queries.device)
     stages = stage.numpy().copy()
     conservative = MethodRun("conservative", queries)
     conservative.launch()

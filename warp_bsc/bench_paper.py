@@ -1,7 +1,7 @@
 """The paper's benchmarks: what each method takes for the candidate pairs of five scenes, and how often it is wrong.
 
 Queries are the candidate pairs of the broad phase, which share no vertex and whose swept boxes overlap, of some of a
-scene's intervals; a random part of them where they are very many. All methods get the same arrays of points.
+scene's intervals; a random part of them where they are very many. All methods get the same arrays.
 
 Answers are compared with the exact checker's for every query that any method calls a collision, which are all that are
 UNSURE and all that methods disagree about, and for a random sample of the others.
@@ -15,7 +15,7 @@ import warp as wp
 
 from . import checker
 from .bench import benchmark_detector, count_threads
-from .bench_methods import METHODS, STAGES, MethodRun, QuerySet, measure_nanoseconds, trace_stages
+from .bench_methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
 from .bench_peers import PEERS, PeerMeasurement, ask_peer, measure_peer
 from .bench_scenes import BenchmarkScene
 from .bench_worst import WorstQuery, find_worst
@@ -189,22 +189,21 @@ def benchmark_scene(
         ValueError: If there are no candidate pairs.
     """
     progress("candidate pairs")
-    points, candidates = _gather(intervals, places[-1].device, effort.queries)
+    queries, candidates = _gather(intervals, places[-1].device, effort.queries)
     if not candidates:
         raise ValueError(f"{name}: no candidate pairs, nothing comes near anything in the intervals measured")
-    points = {kind: found for kind, found in points.items() if len(found)}
 
-    answers, unsure, disagreeing = _find_answers(points, places, progress)
+    answers, unsure, disagreeing = _find_answers(queries, places, progress)
     progress("the truth")
-    errors, collisions, checked, sample, truth = _compare(points, answers, effort)
+    errors, collisions, checked, sample, truth = _compare(queries, answers, effort)
     stages = np.zeros(len(STAGES), dtype=int)
-    for kind, found in points.items():
-        stages += np.bincount(trace_stages(QuerySet(kind, found, places[-1].device)), minlength=len(STAGES))
+    for found in queries.values():
+        stages += np.bincount(trace_stages(QuerySet(found, places[-1].device)), minlength=len(STAGES))
 
     timings = []
     for place in places:
         progress(f"times, {place.name}")
-        timings.append(_time_methods(points, place, effort))
+        timings.append(_time_methods(queries, place, effort))
     progress("detections")
     scenes = [scene for _, scene in intervals]
     frames = [benchmark_detector(s, method="exact", device=places[-1].device, repeat=3) for s in scenes]
@@ -213,14 +212,14 @@ def benchmark_scene(
     if peers:
         for peer in PEERS:
             progress(f"IPC Toolkit, {peer}")
-            found_peers[peer] = _measure_peer(peer, points, truth, effort)
+            found_peers[peer] = _measure_peer(peer, queries, truth, effort)
     return SceneBenchmark(
         name=name,
         triangles=max(len(scene.faces) for scene in scenes),
         precision=8 * scenes[0].x0.itemsize,
         intervals=[number for number, _ in intervals],
         candidates=candidates,
-        queries={kind: len(found) for kind, found in points.items()},
+        queries={kind: len(found) for kind, found in queries.items()},
         collisions=collisions,
         unsure=unsure,
         checked=checked,
@@ -235,25 +234,35 @@ def benchmark_scene(
     )
 
 
-def _gather(intervals, device, most) -> tuple[dict[str, np.ndarray], int]:
-    """Points of the candidate pairs of some intervals by kind, or of a random part of them; and how many there are."""
+def _gather(intervals, device, most) -> tuple[dict[str, Queries], int]:
+    """The candidate pairs of some intervals by kind, or a random part of them; and how many there are."""
     random = np.random.default_rng(SEED)
-    points = {kind: [] for kind in KINDS}
-    candidates = 0
+    x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
+    elements, pairs = ({kind: [] for kind in KINDS} for _ in range(2))
+    vertices = candidates = 0
     for _, scene in intervals:
-        pairs = _find_candidates(scene, device)
-        found = sum(len(pairs[kind][0]) for kind in KINDS)
-        candidates += found
-        share = min(1.0, most / len(intervals) / max(found, 1))
-        for kind, (corners, x0, x1) in pairs.items():
-            count = int(np.ceil(share * len(corners)))
-            chosen = corners[np.sort(random.permutation(len(corners))[:count])]
-            points[kind].append(np.concatenate([x0[chosen], x1[chosen]], axis=1))
-    return {kind: np.concatenate(found) for kind, found in points.items()}, candidates
+        found = _find_candidates(scene, device)
+        number = sum(len(kind_pairs) for _, kind_pairs in found.values())
+        candidates += number
+        share = min(1.0, most / len(intervals) / max(number, 1))
+        for kind, (kind_elements, kind_pairs) in found.items():
+            before = [
+                vertices if kind == "vertex_face" else sum(map(len, elements[kind])),
+                sum(map(len, elements[kind])),
+            ]
+            count = int(np.ceil(share * len(kind_pairs)))
+            chosen = np.sort(random.permutation(len(kind_pairs))[:count])
+            pairs[kind].append(kind_pairs[chosen] + np.array(before, dtype=np.int32))
+            elements[kind].append(kind_elements + vertices)
+        vertices += len(scene.x0)
+    queries = {
+        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in KINDS
+    }
+    return {kind: found for kind, found in queries.items() if len(found)}, candidates
 
 
 def _find_candidates(scene, device):
-    """Vertices of the candidate pairs by kind, shape [n, 4], and the positions that they refer to."""
+    """Vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     detector = CollisionDetector(mesh)
     detector.detect(scene.x0, scene.x1)
@@ -262,24 +271,21 @@ def _find_candidates(scene, device):
         detector.find_candidates()
     found = {}
     for kind, narrow_phase, elements in zip(KINDS, detector.narrow_phases, (mesh.faces, mesh.edges), strict=True):
-        count = int(narrow_phase.counts.numpy()[Count.NEAR])
-        pairs = narrow_phase.near.numpy()[:count]
+        pairs = narrow_phase.near.numpy()[: int(narrow_phase.counts.numpy()[Count.NEAR])]
         # a GPU finds them in any order
-        pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-        first = pairs[:, :1] if kind == "vertex_face" else elements[pairs[:, 0]]
-        found[kind] = np.concatenate([first, elements[pairs[:, 1]]], axis=1), scene.x0, scene.x1
+        found[kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     return found
 
 
-def _find_answers(points, places, progress):
+def _find_answers(queries, places, progress):
     """Which queries collide by each method and kind, how many are unsure, and how many answers depend on the place."""
     answers, unsure, disagreeing = {}, 0, 0
     for place in {str(place.device): place for place in places}.values():
         progress(f"answers, {place.device}")
-        for kind, found in points.items():
-            queries = QuerySet(kind, found, place.device)
+        for kind, found in queries.items():
+            on_device = QuerySet(found, place.device)
             for method in METHODS:
-                run = MethodRun(method, queries)
+                run = MethodRun(method, on_device)
                 run.launch()
                 hits = run.find_hits()
                 if (kind, method) in answers:
@@ -291,7 +297,7 @@ def _find_answers(points, places, progress):
     return answers, unsure, disagreeing
 
 
-def _compare(points, answers, effort):
+def _compare(queries, answers, effort):
     """Compares the answers with the truth.
 
     Returns:
@@ -299,17 +305,17 @@ def _compare(points, answers, effort):
         kind with their truth.
     """
     random = np.random.default_rng(SEED)
-    total = sum(map(len, points.values()))
+    total = sum(map(len, queries.values()))
     wrong = {method: np.zeros(3, dtype=int) for method in METHODS}
     collisions = checked = sample = 0
     truths = {}
-    for kind, found in points.items():
+    for kind, found in queries.items():
         by_method = {method: answers[kind, method] for method in METHODS}
         suspicious = np.any(list(by_method.values()), axis=0)
         others = np.flatnonzero(~suspicious)
         some = random.permutation(others)[: int(np.ceil(effort.sample * len(found) / total))]
         asked = np.concatenate([np.flatnonzero(suspicious), some])
-        truth = getattr(checker, kind)(found[asked])
+        truth = getattr(checker, kind)(found.points(asked))
         truths[kind] = asked, truth
         collisions += int(truth.sum())
         checked += len(asked)
@@ -321,49 +327,47 @@ def _compare(points, answers, effort):
     return errors, collisions, checked, sample, truths
 
 
-def _time_methods(points, place, effort) -> Timing:
+def _time_methods(queries, place, effort) -> Timing:
     """Mean times of the methods at a place, and their slowest queries where queries run one beside the other."""
     if place.cores == 1:
         with one_core():
-            return _time_methods_here(points, place, effort, worst=True)
-    return _time_methods_here(points, place, effort, worst=place.device.is_cuda)
+            return _time_methods_here(queries, place, effort, worst=True)
+    return _time_methods_here(queries, place, effort, worst=place.device.is_cuda)
 
 
-def _time_methods_here(points, place, effort, *, worst) -> Timing:
-    total = sum(map(len, points.values()))
+def _time_methods_here(queries, place, effort, *, worst) -> Timing:
+    total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
     slowest = {}
-    for kind, found in points.items():
-        queries = found
-        if place.device.is_cuda:
-            queries = np.tile(found, (-(-_GPU_QUERIES // total), 1, 1))
-        queries = QuerySet(kind, queries, place.device)
+    for found in queries.values():
+        repeated = -(-_GPU_QUERIES // total) if place.device.is_cuda else 1
+        on_device = QuerySet(found, place.device, repeated=repeated)
         for method in METHODS:
-            took = measure_nanoseconds(MethodRun(method, queries), repeat=effort.repeat)
+            took = measure_nanoseconds(MethodRun(method, on_device), repeat=effort.repeat)
             nanoseconds[method] += took * len(found) / total
         if worst:
-            for method, query in find_worst(kind, found, place.device, repeat=effort.repeat).items():
+            for method, query in find_worst(found, place.device, repeat=effort.repeat).items():
                 known = slowest.get(method)
                 if known is None or query.nanoseconds[method] > known.nanoseconds[method]:
                     slowest[method] = query
     return Timing(place, nanoseconds, slowest)
 
 
-def _measure_peer(peer, points, truths, effort) -> PeerMeasurement:
+def _measure_peer(peer, queries, truths, effort) -> PeerMeasurement:
     """Measures a method of the IPC Toolkit, on one core: Python asks one query after the other."""
     random = np.random.default_rng(SEED)
-    total = sum(map(len, points.values()))
+    total = sum(map(len, queries.values()))
     number = nanoseconds = call = 0
     wrong = np.zeros(3, dtype=int)
-    for kind, found in points.items():
+    for kind, found in queries.items():
         share = len(found) / total
         some = random.permutation(len(found))[: int(np.ceil(effort.peer_queries * share))]
-        took, called = measure_peer(peer, kind, found[some])
+        took, called = measure_peer(peer, kind, found.points(some))
         number += len(some)
         nanoseconds += took * share
         call += called * share
         asked, truth = truths[kind]
         part = random.permutation(len(asked))[: int(np.ceil(effort.peer_queries * share))]
-        hit, truth = ask_peer(peer, kind, found[asked[part]]), truth[part]
+        hit, truth = ask_peer(peer, kind, found.points(asked[part])), truth[part]
         wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
     return PeerMeasurement(number, nanoseconds, call, *map(int, wrong))

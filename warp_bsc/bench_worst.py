@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .bench_methods import METHODS, MethodRun, QuerySet, measure_nanoseconds
+from .bench_methods import METHODS, MethodRun, Queries, QuerySet, measure_nanoseconds
 from .kernels.signs import UNSURE
 
 __all__ = ["WorstQuery", "find_worst"]
@@ -42,34 +42,28 @@ class WorstQuery:
     nanoseconds: dict[str, float]
 
 
-def find_worst(kind, points, device, *, repeat) -> dict[str, WorstQuery]:
+def find_worst(queries, device, *, repeat) -> dict[str, WorstQuery]:
     """Finds the slowest query of each method.
 
     Args:
-        kind: "vertex_face" or "edge_edge".
-        points: Queries, float32 or float64, shape [n, 8, 3].
+        queries: The :class:`~warp_bsc.bench_methods.Queries`.
         device: Warp device.
         repeat: How many repetitions to take the median of.
 
     Returns:
         By method.
     """
-    queries = QuerySet(kind, points, device)
+    kind = queries.kind
+    on_device = QuerySet(queries, device)
     slowest = {}
     for method in METHODS:
-        suspects = _find_suspects(method, queries)
-        times = [_time_alone(method, kind, points[index], device, repeat) for index in suspects]
-        slowest[method] = int(suspects[np.argmax(times)])
-    return {
-        method: WorstQuery(
-            method,
-            kind,
-            index,
-            points[index],
-            {other: _time_alone(other, kind, points[index], device, repeat) for other in METHODS},
-        )
-        for method, index in slowest.items()
-    }
+        suspects = _find_suspects(method, on_device)
+        times = [_time_alone(method, kind, points, device, repeat) for points in queries.points(suspects)]
+        index = int(suspects[np.argmax(times)])
+        points = queries.points([index])[0]
+        took = {other: _time_alone(other, kind, points, device, repeat) for other in METHODS}
+        slowest[method] = WorstQuery(method, kind, index, points, took)
+    return slowest
 
 
 def _find_suspects(method, queries):
@@ -104,5 +98,5 @@ def _time_alone(method, kind, points, device, repeat) -> float:
 
 
 def _time_copies(method, kind, points, copies, device, repeat):
-    queries = QuerySet(kind, np.broadcast_to(points, (copies, 8, 3)), device)
+    queries = QuerySet(Queries.of_points(kind, points[None]), device, repeated=copies)
     return measure_nanoseconds(MethodRun(method, queries), repeat=repeat)
