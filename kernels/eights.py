@@ -25,6 +25,8 @@ _LARGEST = 1.0e150
 
 _SNIPPET = """
     typedef {scalar} Scalars __attribute__((ext_vector_type(8)));
+    typedef {scalar} Four __attribute__((ext_vector_type(4)));
+    typedef {scalar} Two __attribute__((ext_vector_type(2), aligned(sizeof({scalar}))));
     typedef double Doubles __attribute__((ext_vector_type(8)));
     typedef bool Bools __attribute__((ext_vector_type(8)));
     struct Vectors {{ Doubles x, y, z; }};
@@ -46,27 +48,45 @@ _SNIPPET = """
         return Vectors{{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}};
     }};
 
-    // the points as they are in memory, then each coordinate of all eight beside each other
-    alignas(64) {scalar} points[24][8];
+    // the points as they are in memory, x y y z each, transposed to coordinates of all eight
+    int corners[4][8];
     for (int lane = 0; lane < 8; ++lane) {{
         const int* pair = (const int*)pairs.data + 2 * (size_t)(lane < count ? first + lane : first);
-        int corner[4];
         if (vertex_face) {{
             const int* face = elements.data + 3 * (size_t)pair[1];
-            corner[0] = pair[0], corner[1] = face[0], corner[2] = face[1], corner[3] = face[2];
+            corners[0][lane] = pair[0], corners[1][lane] = face[0];
+            corners[2][lane] = face[1], corners[3][lane] = face[2];
         }} else {{
             const int* edge = elements.data + 2 * (size_t)pair[0];
             const int* other = elements.data + 2 * (size_t)pair[1];
-            corner[0] = edge[0], corner[1] = edge[1], corner[2] = other[0], corner[3] = other[1];
+            corners[0][lane] = edge[0], corners[1][lane] = edge[1];
+            corners[2][lane] = other[0], corners[3][lane] = other[1];
         }}
-        for (int i = 0; i < 4; ++i) {{
-            const {scalar}* start = (const {scalar}*)x0.data + 3 * (size_t)corner[i];
-            const {scalar}* end = (const {scalar}*)x1.data + 3 * (size_t)corner[i];
-            for (int axis = 0; axis < 3; ++axis) {{
-                points[3 * i + axis][lane] = start[axis];
-                points[12 + 3 * i + axis][lane] = end[axis];
-            }}
+    }}
+    Scalars points[24];
+    auto read = [&](const {scalar}* x, const int* corner, Scalars* to) {{
+        Four at[8], low[3], high[3];
+        for (int lane = 0; lane < 8; ++lane) {{
+            const {scalar}* from = x + 3 * (size_t)corner[lane];
+            at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
         }}
+        auto transpose = [](const Four* at, Four* to) {{
+            const Four xy = __builtin_shufflevector(at[0], at[1], 0, 4, 1, 5);
+            const Four yz = __builtin_shufflevector(at[0], at[1], 2, 6, 3, 7);
+            const Four more_xy = __builtin_shufflevector(at[2], at[3], 0, 4, 1, 5);
+            const Four more_yz = __builtin_shufflevector(at[2], at[3], 2, 6, 3, 7);
+            to[0] = __builtin_shufflevector(xy, more_xy, 0, 1, 4, 5);
+            to[1] = __builtin_shufflevector(xy, more_xy, 2, 3, 6, 7);
+            to[2] = __builtin_shufflevector(yz, more_yz, 2, 3, 6, 7);
+        }};
+        transpose(at, low);
+        transpose(at + 4, high);
+        for (int axis = 0; axis < 3; ++axis)
+            to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
+    }};
+    for (int i = 0; i < 4; ++i) {{
+        read((const {scalar}*)x0.data, corners[i], points + 3 * i);
+        read((const {scalar}*)x1.data, corners[i], points + 12 + 3 * i);
     }}
     int left = (1 << count) - 1;
 
@@ -76,7 +96,7 @@ _SNIPPET = """
         for (int axis = 0; axis < 3; ++axis) {{
             Scalars p[4];
             for (int i = 0; i < 4; ++i)
-                p[i] = *(const Scalars*)points[12 * end + 3 * i + axis];
+                p[i] = points[12 * end + 3 * i + axis];
             low[end][axis] = high[end][axis] = p[0];
             if (!vertex_face) {{
                 low[end][axis] = __builtin_elementwise_min(p[0], p[1]);
@@ -101,9 +121,9 @@ _SNIPPET = """
     // Bernstein signs
     auto point = [&](int i) {{
         return Vectors{{
-            __builtin_convertvector(*(const Scalars*)points[3 * i], Doubles),
-            __builtin_convertvector(*(const Scalars*)points[3 * i + 1], Doubles),
-            __builtin_convertvector(*(const Scalars*)points[3 * i + 2], Doubles)}};
+            __builtin_convertvector(points[3 * i], Doubles),
+            __builtin_convertvector(points[3 * i + 1], Doubles),
+            __builtin_convertvector(points[3 * i + 2], Doubles)}};
     }};
     Vectors u0, v0, w0, u1, v1, w1;
     if (vertex_face) {{

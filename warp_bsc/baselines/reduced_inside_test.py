@@ -91,4 +91,4 @@ def classify_reduced(motion: Motion, y: Coplanarity) -> int:
     """
     if certified_sign_cubic(y.k, y.bound) != 0:
         return FREE
-    return classify_with(y, reduced_inside_tests(motion, y))
+    return classify_with(y.k, y.bound, reduced_inside_tests(motion, y))
