@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .bench_figure import draw_paper_benchmarks
-from .bench_paper import Effort, benchmark_scene, find_places
+from .bench_paper import Effort, benchmark_scene, find_adversarial_worst, find_places
 from .bench_peers import has_peers
 from .bench_report import paper_benchmarks_to_dict, print_paper_benchmarks
 from .bench_scenes import PAPER_SCENES, load_intervals, paper_scenes
@@ -68,10 +68,12 @@ def run_paper_benchmarks(arguments, find_device, limited_threads) -> int:
     try:
         scenes = [(name, load_intervals(name, most=effort.intervals)) for name in names]
         with limited_threads(arguments.threads):
-            benchmarks = _measure(scenes, find_places(devices), effort)
-        found = paper_benchmarks_to_dict(benchmarks, quick=arguments.quick)
+            places = find_places(devices)
+            benchmarks = _measure(scenes, places, effort)
+            adversarial = find_adversarial_worst(places, effort)
+        found = paper_benchmarks_to_dict(benchmarks, adversarial, quick=arguments.quick)
         if arguments.json != _STDOUT:
-            print_paper_benchmarks(Console(), benchmarks)
+            print_paper_benchmarks(Console(), benchmarks, adversarial)
         else:
             print(json.dumps(found))
         if "json" in files:

@@ -7,6 +7,7 @@ Answers are compared with the exact checker's for every query that any method ca
 UNSURE and all that methods disagree about, and for a random sample of the others.
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,14 +19,24 @@ from .bench import benchmark_detector, count_threads
 from .bench_methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
 from .bench_peers import PEERS, PeerMeasurement, ask_peer, measure_peer
 from .bench_scenes import BenchmarkScene
-from .bench_worst import WorstQuery, find_worst
+from .bench_worst import WorstQuery, adversarial_queries, find_worst
 from .detector import CollisionDetector
 from .kernels.signs import UNSURE
 from .launching import one_core
 from .mesh import CollisionMesh
 from .narrow_phase import Count
 
-__all__ = ["KINDS", "Effort", "Errors", "Place", "SceneBenchmark", "Timing", "benchmark_scene", "find_places"]
+__all__ = [
+    "KINDS",
+    "Effort",
+    "Errors",
+    "Place",
+    "SceneBenchmark",
+    "Timing",
+    "benchmark_scene",
+    "find_adversarial_worst",
+    "find_places",
+]
 
 KINDS = ("vertex_face", "edge_edge")
 SEED = 0
@@ -41,6 +52,7 @@ class Effort:
         queries: Of a scene at most.
         sample: How many queries that no method calls a collision are checked, of a scene.
         peer_queries: How many queries peers are timed on, of a scene.
+        adversaries: How many queries of each kind aim at trouble.
         repeat: How many repetitions the medians are of.
     """
 
@@ -48,17 +60,18 @@ class Effort:
     queries: int
     sample: int
     peer_queries: int
+    adversaries: int
     repeat: int
 
     @classmethod
     def full(cls) -> "Effort":
         """That of the whole benchmark."""
-        return cls(intervals=8, queries=2**19, sample=20_000, peer_queries=4000, repeat=9)
+        return cls(intervals=8, queries=2**19, sample=20_000, peer_queries=4000, adversaries=100_000, repeat=9)
 
     @classmethod
     def quick(cls) -> "Effort":
         """That of a first look."""
-        return cls(intervals=2, queries=2**15, sample=1000, peer_queries=500, repeat=3)
+        return cls(intervals=2, queries=2**15, sample=1000, peer_queries=500, adversaries=5000, repeat=3)
 
 
 @dataclass(frozen=True)
@@ -335,22 +348,42 @@ def _time_methods(queries, place, effort) -> Timing:
     return _time_methods_here(queries, place, effort, worst=place.device.is_cuda)
 
 
+def find_adversarial_worst(places, effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
+    """The slowest of queries that aim at trouble, by method, on one core and on GPUs.
+
+    Args:
+        places: Where methods are timed.
+        effort: How much to measure.
+    """
+    found = []
+    for place in places:
+        if place.cores in (1, None):
+            queries = [adversarial_queries(kind, effort.adversaries) for kind in KINDS]
+            with one_core() if place.cores == 1 else contextlib.nullcontext():
+                found.append((place, _find_slowest(queries, place, effort)))
+    return found
+
+
+def _find_slowest(queries, place, effort) -> dict[str, WorstQuery]:
+    slowest = {}
+    for of_kind in queries:
+        for method, query in find_worst(of_kind, place.device, repeat=effort.repeat).items():
+            known = slowest.get(method)
+            if known is None or query.nanoseconds[method] > known.nanoseconds[method]:
+                slowest[method] = query
+    return slowest
+
+
 def _time_methods_here(queries, place, effort, *, worst) -> Timing:
     total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
-    slowest = {}
     for found in queries.values():
         repeated = -(-_GPU_QUERIES // total) if place.device.is_cuda else 1
         on_device = QuerySet(found, place.device, repeated=repeated)
         for method in METHODS:
             took = measure_nanoseconds(MethodRun(method, on_device), repeat=effort.repeat)
             nanoseconds[method] += took * len(found) / total
-        if worst:
-            for method, query in find_worst(found, place.device, repeat=effort.repeat).items():
-                known = slowest.get(method)
-                if known is None or query.nanoseconds[method] > known.nanoseconds[method]:
-                    slowest[method] = query
-    return Timing(place, nanoseconds, slowest)
+    return Timing(place, nanoseconds, _find_slowest(queries.values(), place, effort) if worst else {})
 
 
 def _measure_peer(peer, queries, truths, effort) -> PeerMeasurement:

@@ -194,10 +194,10 @@ def _kernels(kind):
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
-        if direction_separates(motion, centroid_direction(motion)):
-            return
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        if direction_separates(motion, centroid_direction(motion)):
             return
         survivors[wp.int32(take_slot(counts, 0))] = i
 

@@ -24,19 +24,20 @@ METHOD_NAMES = {
 _STAGE_HEADERS = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
 
 
-def print_paper_benchmarks(console: Console, benchmarks: list[SceneBenchmark]) -> None:
+def print_paper_benchmarks(console: Console, benchmarks: list[SceneBenchmark], adversarial) -> None:
     """Print what was measured, scene by scene.
 
     Args:
         console: Where to.
         benchmarks: The measurements of each scene.
+        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
     """
     rows = [(_short(found.name), found) for found in benchmarks]
     _print_queries(console, rows)
     _print_stages(console, rows)
     for number in range(len(benchmarks[0].timings)):
         _print_times(console, [(name, found.timings[number]) for name, found in rows])
-    _print_worst(console, rows)
+    _print_worst(console, rows, adversarial)
     _print_errors(console, rows)
     _print_frames(console, rows)
     if any(found.peers for found in benchmarks):
@@ -89,31 +90,30 @@ def _print_times(console, rows: list[tuple[str, Timing]]):
     console.print()
 
 
-def _print_worst(console, rows):
-    for number in range(len(rows[0][1].timings)):
-        found = [(name, scene.timings[number]) for name, scene in rows]
-        if not any(timing.worst for _, timing in found):
-            continue
+def _print_worst(console, rows, adversarial):
+    for place, worst_of_trouble in adversarial:
+        found = [(name, timing.worst) for name, scene in rows for timing in scene.timings if timing.place == place]
+        found.append(("adversarial", worst_of_trouble))
         table = make_table(
-            f"Slowest query, ns, {found[0][1].place.name}",
+            f"Slowest query, ns, {place.name}",
             *METHOD_NAMES.values(),
             "cubic /\nfloat",
             caption="Each method's own slowest. In the paper: float 105, exact 876, El Topo's cubic solver 953.",
         )
-        for name, timing in found:
-            worst = {method: query.nanoseconds[method] for method, query in timing.worst.items()}
-            ratio = f"{worst['cubic'] / worst['float']:.2f}"
-            table.add_row(name, *(f"{worst[method]:,.0f}" for method in METHODS), ratio)
+        for name, worst in found:
+            took = {method: query.nanoseconds[method] for method, query in worst.items()}
+            ratio = f"{took['cubic'] / took['float']:.2f}"
+            table.add_row(name, *(f"{took[method]:,.0f}" for method in METHODS), ratio)
         console.print(table)
         console.print()
-        table = make_table("The slowest of all", "Scene", "Kind", "Number", *METHOD_NAMES.values())
+        table = make_table("The slowest of all", "Kind", "Number", *METHOD_NAMES.values())
         for method in METHODS:
             name, query = max(
-                ((name, timing.worst[method]) for name, timing in found),
-                key=lambda pair, method=method: pair[1].nanoseconds[method],
+                ((name, worst[method]) for name, worst in found),
+                key=lambda named, method=method: named[1].nanoseconds[method],
             )
             took = (f"{query.nanoseconds[other]:,.0f}" for other in METHODS)
-            table.add_row(method, name, query.kind.replace("_", "-"), str(query.index), *took)
+            table.add_row(f"for {method}, in {name}", query.kind.replace("_", "-"), str(query.index), *took)
         console.print(table)
         console.print()
 
@@ -166,11 +166,12 @@ def _print_peers(console, rows):
     console.print()
 
 
-def paper_benchmarks_to_dict(benchmarks: list[SceneBenchmark], *, quick: bool) -> dict:
+def paper_benchmarks_to_dict(benchmarks: list[SceneBenchmark], adversarial, *, quick: bool) -> dict:
     """Every measurement, to be written as JSON.
 
     Args:
         benchmarks: The measurements of each scene.
+        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
         quick: Whether only a first look was taken.
     """
     return {
@@ -179,6 +180,7 @@ def paper_benchmarks_to_dict(benchmarks: list[SceneBenchmark], *, quick: bool) -
         "methods": list(METHODS),
         "ipc_toolkit": version_of_peers() if any(found.peers for found in benchmarks) else None,
         "scenes": [_scene_to_dict(found) for found in benchmarks],
+        "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
     }
 
 
@@ -211,13 +213,17 @@ def _timing_to_dict(timing):
         "device": str(timing.place.device),
         "cores": timing.place.cores,
         "nanoseconds": timing.nanoseconds,
-        "worst": {
-            method: {
-                "kind": query.kind,
-                "number": query.index,
-                "points": query.points.tolist(),
-                "nanoseconds": query.nanoseconds,
-            }
-            for method, query in timing.worst.items()
-        },
+        "worst": _worst_to_dict(timing.worst),
+    }
+
+
+def _worst_to_dict(worst):
+    return {
+        method: {
+            "kind": query.kind,
+            "number": query.index,
+            "points": query.points.tolist(),
+            "nanoseconds": query.nanoseconds,
+        }
+        for method, query in worst.items()
     }
