@@ -170,16 +170,17 @@ def classify(motion: Motion, y: Coplanarity) -> int:
     tests = inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1))
     k = y.k
     status = UNSURE
-    for attempt in range(2):
+    for _ in range(2):
         status = classify_with(k, y.bound, tests)
         if status != UNSURE or motion.roundoff > _ZERO:
             return status
-        if attempt == 0:
-            if _touches(k, tests):
-                return HIT
-            k = _without_zeros(k)
-            if certified_sign_cubic(k, _ZERO) != 0:
-                return FREE
+        if k[0] != _ZERO and k[3] != _ZERO:
+            break
+        if _touches(k, tests):
+            return HIT
+        k = _without_zeros(k)
+        if certified_sign_cubic(k, _ZERO) != 0:
+            return FREE
     u = motion.u0 + motion.u1
     v = motion.v0 + motion.v1
     w = motion.w0 + motion.w1

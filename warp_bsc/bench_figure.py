@@ -55,7 +55,9 @@ def draw_paper_benchmarks(benchmarks: list[dict], path) -> None:
 
 
 def _draw_panel(axes, place, scenes):
-    """Draws the bars of one place; returns those of one scene by the names of the methods."""
+    """Draws the bars of one place; returns those of each method by its name."""
+    from matplotlib.ticker import NullFormatter  # noqa: PLC0415 (optional)
+
     methods = {key: style for key, style in (_METHODS | _PEERS).items() if any(key in bars for bars in scenes.values())}
     width = _WIDTH / len(methods)
     shown = {}
@@ -78,8 +80,10 @@ def _draw_panel(axes, place, scenes):
                 )
     axes.set(yscale="log", ylabel="time a query [ns]")
     axes.set_xticks(range(len(scenes)), scenes.keys())
+    times = [took for bars in scenes.values() for took in bars.values() if took > 0.0]
+    axes.set_ylim(10.0 ** np.floor(np.log10(0.8 * min(times))), 10.0 ** np.ceil(np.log10(2.0 * max(times))))
     axes.yaxis.set_major_formatter(lambda time, _: f"{time:,g}")
-    axes.margins(y=0.2)
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -5,7 +5,7 @@ question: whether the two features meet. What each does, and what not, so that t
 
 - ``float``, ``conservative``: the stages of the detector, without and with error bounds: boxes, the signs of the
   Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
-  kernel of its own, classification and the subdivision of what that leaves open. UNSURE is a collision.
+  kernel of its own, classification and, with bounds, the subdivision of what that leaves open. UNSURE is a collision.
 - ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
 - ``cubic``: :mod:`warp_bsc.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
   knows a time, too; that time is not written.
@@ -51,6 +51,8 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 _CYCLES = """
 #if defined(__CUDA_ARCH__)
     return clock64();
+#elif defined(__aarch64__)
+    return (int64_t)__builtin_arm_rsr64("cntvct_el0");
 #else
     return (int64_t)__builtin_readcyclecounter();
 #endif

@@ -106,14 +106,14 @@ def _print_worst(console, rows, adversarial):
             table.add_row(name, *(f"{took[method]:,.0f}" for method in METHODS), ratio)
         console.print(table)
         console.print()
-        table = make_table("The slowest of all", "Kind", "Number", *METHOD_NAMES.values())
+        table = make_table("Slowest of all", "Kind", "Number", *METHOD_NAMES.values())
         for method in METHODS:
             name, query = max(
                 ((name, worst[method]) for name, worst in found),
                 key=lambda named, method=method: named[1].nanoseconds[method],
             )
             took = (f"{query.nanoseconds[other]:,.0f}" for other in METHODS)
-            table.add_row(f"for {method}, in {name}", query.kind.replace("_", "-"), str(query.index), *took)
+            table.add_row(f"{method}: {name}", query.kind.replace("_", "-"), str(query.index), *took)
         console.print(table)
         console.print()
 
@@ -211,6 +211,7 @@ def _timing_to_dict(timing):
     return {
         "place": timing.place.name,
         "device": str(timing.place.device),
+        "device_name": timing.place.device.name,
         "cores": timing.place.cores,
         "nanoseconds": timing.nanoseconds,
         "worst": _worst_to_dict(timing.worst),
