@@ -113,7 +113,6 @@ def _kernels(kind, dtype):
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
         roundoff: wp.float64,
-        status: wp.array[wp.int8],
         survivors: wp.array[int],
         counts: wp.array[wp.int64],
         ticks: wp.array[wp.int64],
@@ -122,7 +121,6 @@ def _kernels(kind, dtype):
         start = started(ticks)
         a0, b0, c0, d0 = read(x0, elements, pairs[i])
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        status[i] = wp.int8(FREE)
         if not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             y = coplanarity(motion)
@@ -141,7 +139,6 @@ def _kernels(kind, dtype):
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
         roundoff: wp.float64,
-        status: wp.array[wp.int8],
         survivors: wp.array[int],
         counts: wp.array[wp.int64],
         ticks: wp.array[wp.int64],
@@ -150,10 +147,10 @@ def _kernels(kind, dtype):
         start = started(ticks)
         count = wp.min(EIGHT, pairs.shape[0] - i)
         left = cull_eight(x0, x1, elements, pairs, i, count, roundoff)
-        for lane in range(count):
-            status[i + lane] = wp.int8(FREE)
-            if (left >> lane) & 1 == 1:
-                survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
+        if left != 0:
+            for lane in range(EIGHT):
+                if (left >> lane) & 1 == 1:
+                    survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
         if ticks:
             passed = _cycles() - start
             for lane in range(count):
@@ -365,8 +362,9 @@ class MethodRun:
             return
         counts = self._counts
         counts.zero_()
+        self.status.zero_()  # FREE, but for what the culls leave
         roundoff = 0.0 if self.method in ("float", "reduced") else ROUNDOFF
-        outputs = [self.status, self._survivors, counts, ticks]
+        outputs = [self._survivors, counts, ticks]
         inputs = [*arrays, roundoff]
         if queries.device.is_cpu:
             eights = -(-queries.count // EIGHT)

@@ -169,9 +169,10 @@ def _kernels(kind, dtype):
         i = EIGHT * (first + wp.tid())
         filled = wp.int32(wp.min(counts[_NEAR], wp.int64(near.shape[0])))
         left = cull_eight(x0, x1, elements, near, i, wp.min(EIGHT, filled - i), roundoff)
-        for lane in range(EIGHT):
-            if (left >> lane) & 1 == 1:
-                append(near[i + lane], survivors, counts, _SURVIVORS)
+        if left != 0:
+            for lane in range(EIGHT):
+                if (left >> lane) & 1 == 1:
+                    append(near[i + lane], survivors, counts, _SURVIVORS)
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
