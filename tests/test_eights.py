@@ -94,11 +94,11 @@ def cull(kind, points, roundoff):
 def test_numbers_too_large_to_trust_are_left():
     """Where products could lose what matters to underflow, or overflow, nothing is culled but by boxes."""
     rng = np.random.default_rng(7)
-    points = rng.uniform(-1.0, 1.0, (80, 8, 3))
-    points[:, 4] = -points[:, 0] * rng.uniform(0.2, 5.0, (80, 3))  # passes the triangle, along each axis
+    points = rng.uniform(-1.0, 1.0, (4000, 8, 3))
+    points[:, 4] = -points[:, 0] * rng.uniform(0.2, 5.0, (4000, 3))  # passes the triangle, along each axis
     points *= np.where(np.arange(8) % 4 == 0, 1e120, 1e-60)[None, :, None]
     _, together = cull("vertex_face", points, float(ROUNDOFF))
-    assert 0.1 < together.mean() < 0.9
+    assert 0 < (~together).sum() < 1000
     assert not checker.vertex_face(points[~together]).any()
     points *= np.where(np.arange(8) % 4 == 0, 1e40, 1.0)[None, :, None]
     _, together = cull("vertex_face", points, float(ROUNDOFF))
