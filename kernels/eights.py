@@ -7,7 +7,7 @@ on their errors.
 Pairs are not scaled, because powers of two change nothing but overflow and underflow. A sum that overflows is culled by
 no comparison. What underflows is lost once in a component of the normal, 2^-1074 for each of at most four products,
 before w multiplies it: for coordinates up to 1e150 that is less than the UNDERFLOW that bounds add, times the roundoff,
-and larger ones are not culled.
+and larger ones are not culled. Without a roundoff there is nothing to certify.
 """
 
 import functools
@@ -36,10 +36,12 @@ _SNIPPET = """
     }};
     auto least = [](Doubles a, Doubles b) {{ return __builtin_elementwise_min(a, b); }};
     auto most = [](Doubles a, Doubles b) {{ return __builtin_elementwise_max(a, b); }};
-    auto size = [](Doubles a, Doubles b) {{
+    auto larger = [](Doubles a, Doubles b) {{
         return __builtin_elementwise_max(__builtin_elementwise_abs(a), __builtin_elementwise_abs(b));
     }};
-    auto sizes = [size](Vectors a, Vectors b) {{ return Vectors{{size(a.x, b.x), size(a.y, b.y), size(a.z, b.z)}}; }};
+    auto sizes = [larger](Vectors a, Vectors b) {{
+        return Vectors{{larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}};
+    }};
     auto plus = [](Vectors a, Vectors b) {{ return Vectors{{a.x + b.x, a.y + b.y, a.z + b.z}}; }};
     auto minus = [](Vectors a, Vectors b) {{ return Vectors{{a.x - b.x, a.y - b.y, a.z - b.z}}; }};
     auto times = [](double a, Vectors b) {{ return Vectors{{a * b.x, a * b.y, a * b.z}}; }};
@@ -133,18 +135,23 @@ _SNIPPET = """
         u0 = minus(point(1), point(0)), v0 = minus(point(3), point(2)), w0 = minus(point(2), point(0));
         u1 = minus(point(5), point(4)), v1 = minus(point(7), point(6)), w1 = minus(point(6), point(4));
     }}
-    const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
-    const Doubles largest
-        = most(most(most(u.x, u.y), most(u.z, v.x)), most(most(v.y, v.z), most(most(w.x, w.y), w.z)));
     const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
     const Vectors nh = times(0.5, plus(cross(u0, v1), cross(u1, v0)));
     const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
     const Doubles k1 = (2.0 * dot(w0, nh) + dot(w1, n0)) * (1.0 / 3.0);
     const Doubles k2 = (2.0 * dot(w1, nh) + dot(w0, n1)) * (1.0 / 3.0);
-    const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
-    const Doubles bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow});
+    // without a roundoff all bounds are zero
+    Vectors size = {{0.0, 0.0, 0.0}};
+    Doubles bound = 0.0;
+    int trusted = 255;
+    if (roundoff > 0.0) {{
+        const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
+        const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
+        bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow});
+        size = plus(plus(u, v), w);
+        trusted = bits(most(most(size.x, size.y), size.z) < {largest});
+    }}
     auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
-    const int trusted = bits(largest < {largest});
     left &= ~(bits(culled) & trusted);
     if (!left)
         return 0;
@@ -165,7 +172,7 @@ _SNIPPET = """
         highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
     }}
     const Vectors along = sizes(direction, direction);
-    const Doubles slack = roundoff * ({direction_error} * dot(along, plus(plus(u, v), w)) + {underflow});
+    const Doubles slack = roundoff * ({direction_error} * dot(along, size) + {underflow});
     culled = (lowest > slack) | (highest < -slack);
     return left & ~(bits(culled) & trusted);
 """
