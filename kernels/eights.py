@@ -136,10 +136,10 @@ _SNIPPET = """
         u1 = minus(point(5), point(4)), v1 = minus(point(7), point(6)), w1 = minus(point(6), point(4));
     }}
     const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
-    const Vectors nh = times(0.5, plus(cross(u0, v1), cross(u1, v0)));
+    const Vectors twice_nh = plus(cross(u0, v1), cross(u1, v0));
     const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
-    const Doubles k1 = (2.0 * dot(w0, nh) + dot(w1, n0)) * (1.0 / 3.0);
-    const Doubles k2 = (2.0 * dot(w1, nh) + dot(w0, n1)) * (1.0 / 3.0);
+    const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
+    const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
     // without a roundoff all bounds are zero
     Vectors size = {{0.0, 0.0, 0.0}};
     Doubles bound = 0.0;

@@ -5,7 +5,7 @@ question: whether the two features meet. What each does, and what not, so that t
 
 - ``float``, ``conservative``: the stages of the detector, without and with error bounds: boxes, the signs of the
   Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
-  kernel of its own, classification and, with bounds, the subdivision of what that leaves open. UNSURE is a collision.
+  kernel of its own, classification, and with bounds the subdivision of what that leaves open. UNSURE is a collision.
 - ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
 - ``cubic``: :mod:`warp_bsc.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
   knows a time, too; that time is not written.
@@ -60,7 +60,7 @@ _CYCLES = """
 
 
 class _Count(enum.IntEnum):
-    """Places of the counts of a run: the queries that the culls leave, that floating point does, that are too wide."""
+    """Places of the counts of a run: queries that culls, floating point, each width, and classification leave."""
 
     SURVIVORS = 0
     UNSURE = 1
@@ -68,10 +68,12 @@ class _Count(enum.IntEnum):
     WIDER = 3
     WIDEST = 4
     REFUTED = 5
+    OPEN = 6
 
 
 _SURVIVORS = wp.constant(int(_Count.SURVIVORS))
 _UNSURE = wp.constant(int(_Count.UNSURE))
+_OPEN = wp.constant(int(_Count.OPEN))
 
 
 @wp.func_native(_CYCLES)
@@ -166,7 +168,7 @@ def _kernels(kind, dtype):
         roundoff: wp.float64,
         survivors: wp.array[int],
         status: wp.array[wp.int8],
-        unsure: wp.array[int],
+        open: wp.array[int],
         counts: wp.array[wp.int64],
         ticks: wp.array[wp.int64],
     ):
@@ -178,11 +180,35 @@ def _kernels(kind, dtype):
         a0, b0, c0, d0 = read(x0, elements, pairs[i])
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        y = coplanarity(motion)
-        answer = classify(motion, y)
+        answer = classify(motion, coplanarity(motion))
+        status[i] = wp.int8(answer)
         if answer == UNSURE:
-            result = impact(motion, y, answer, wp.float64(TOLERANCE))
-            answer = result.status
+            open[wp.int32(take_slot(counts, _OPEN))] = i
+        stop(ticks, i, start)
+
+    @wp.kernel(**_KERNEL)
+    def subdivide(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        roundoff: wp.float64,
+        open: wp.array[int],
+        status: wp.array[wp.int8],
+        unsure: wp.array[int],
+        counts: wp.array[wp.int64],
+        ticks: wp.array[wp.int64],
+    ):
+        slot = first + wp.tid()
+        if wp.int64(slot) >= counts[_OPEN]:
+            return
+        i = open[slot]
+        start = started(ticks)
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+        answer = impact(motion, coplanarity(motion), UNSURE, wp.float64(TOLERANCE)).status
         status[i] = wp.int8(answer)
         if answer == UNSURE:
             unsure[wp.int32(take_slot(counts, _UNSURE))] = i
@@ -258,6 +284,7 @@ def _kernels(kind, dtype):
         "cull": cull,
         "cull_eights": cull_eights,
         "classify_survivors": classify_survivors,
+        "subdivide": subdivide,
         "classify_survivors_reduced": classify_survivors_reduced,
         "cubic": cubic,
         "trace": trace,
@@ -344,7 +371,7 @@ class MethodRun:
         n, device = queries.count, queries.device
         self.status = wp.zeros(n, dtype=wp.int8, device=device)
         self._counts = wp.zeros(len(_Count), dtype=wp.int64, device=device)
-        self._survivors, *self._unsure = (wp.empty(n, dtype=int, device=device) for _ in range(3))
+        self._survivors, self._open, *self._unsure = (wp.empty(n, dtype=int, device=device) for _ in range(4))
         self._keys = wp.empty(n if method == "exact" else 0, dtype=wp.int64, device=device)
 
     def launch(self, *, ticks=None):
@@ -378,8 +405,14 @@ class MethodRun:
             inputs, outputs = [*arrays, self._survivors], [self.status, counts, ticks]
             launch_over_queue(kernels["classify_survivors_reduced"], *entries, inputs=inputs, outputs=outputs)
             return
-        inputs, outputs = [*arrays, roundoff, self._survivors], [self.status, self._unsure[0], counts, ticks]
+        inputs, outputs = [*arrays, roundoff, self._survivors], [self.status, self._open, counts, ticks]
         launch_over_queue(kernels["classify_survivors"], *entries, inputs=inputs, outputs=outputs)
+        if self.method == "float":
+            return  # nothing is open
+        inputs, outputs = [*arrays, roundoff, self._open], [self.status, self._unsure[0], counts, ticks]
+        launch_over_queue(
+            kernels["subdivide"], self._open, counts, _Count.OPEN, inputs=inputs, outputs=outputs, block_dim=32
+        )
         if self.method == "exact":
             launch_exact_stage(
                 queries.kind,
