@@ -121,8 +121,8 @@ time of a query, mean and worst, by this project's methods, a floating-point
 cubic solver, the paper's own inside tests and, if installed, the IPC Toolkit's
 methods; their wrong answers, held against exact arithmetic; what decides the
 queries; and the time of a detection by stage. A scene is one of the five by
-name, or what warp-bsc bench detector takes. The whole takes a quarter of an
-hour, a quick look two minutes."""
+name, or what warp-bsc bench detector takes. The whole takes some minutes, a
+quick look one or two."""
 
 _BENCH_PAPER_EXAMPLES = f"""\
 examples:
