@@ -82,7 +82,7 @@ def _draw_panel(axes, place, scenes):
     axes.set_xticks(range(len(scenes)), scenes.keys())
     times = [took for bars in scenes.values() for took in bars.values() if took > 0.0]
     axes.set_ylim(10.0 ** np.floor(np.log10(0.8 * min(times))), 10.0 ** np.ceil(np.log10(2.0 * max(times))))
-    axes.yaxis.set_major_formatter(lambda time, _: f"{time:,g}")
+    axes.yaxis.set_major_formatter(lambda time, _: f"{time:,.0f}" if time >= 1.0 else f"{time:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
     axes.set_axisbelow(True)

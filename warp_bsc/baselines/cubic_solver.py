@@ -13,8 +13,8 @@ they have in common:
 - at each root, earliest first, the closest points of the two features are found. Closer than a tolerance, they collide.
 
 On the 2,324 hand-made queries of Wang et al. 2021 that the tests read, of which 308 collide, it has 88 false positives
-and 2 false negatives, where El Topo has 242 and 2, and it takes less than half of El Topo's time: nobody is made to
-look slow here.
+and 2 false negatives, where El Topo has 242 and 2. It takes about 100 ns a query there on one core, where El Topo took
+330 to 357 ns on a larger set that they are part of: nobody is made to look slow here.
 
 All is in double precision, as it is there. Queries that need no root are out early: by the same boxes as in
 :mod:`warp_bsc.kernels.ccd`, and by the signs at the ends of monotone intervals.
