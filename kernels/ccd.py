@@ -9,7 +9,7 @@ from .culling import centroid_direction, direction_separates, edge_edge_boxes_ap
 from .gradients import with_gradients
 from .motion import all_finite, doubles, relative_motion
 from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion, coplanarity
-from .signs import FREE, ROUNDOFF, UNSURE
+from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from .time_of_impact import Impact, impact
 
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
@@ -20,9 +20,10 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
     """Status of a query that no coordinate axis separates and, if ``timed``, its first contact."""
     result = Impact()
     result.toi = wp.float64(2.0)
-    if direction_separates(motion, centroid_direction(motion)):
-        return result
     y = coplanarity(motion)
+    # this cull first: of pairs whose boxes overlap it decides more than the other, which is for flat sheets
+    if certified_sign_cubic(y.k, y.bound) != 0 or direction_separates(motion, centroid_direction(motion)):
+        return result
     status = classify(motion, y)
     result.status = status
     if status == UNSURE or (timed and status != FREE):

@@ -3,10 +3,14 @@
 import warp as wp
 
 from .bernstein import split_cubic, split_quadratic
+from .closest import between, closest_coordinates
+from .culling import direction_separates
 from .polynomials import Coplanarity, InsideTests, Motion, inside_tests, largest_axis
 from .roots import TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quadratic_signs
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic, certified_sign_quadratic
 
+_ZERO = wp.constant(wp.float64(0.0))
+_TINY = wp.constant(wp.float64(2.0**-80))
 _SPLIT = wp.constant(wp.float64(2.5))
 
 
@@ -68,53 +72,117 @@ def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
 
 
 @wp.func
-def classify(motion: Motion, y: Coplanarity) -> int:
-    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
-
-    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
-    there; where Y may have two extrema it is split at its inflection first, homogeneously.
+def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
+    """Status of a query whose cubic may have roots from the inside tests given.
 
     Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of
     size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
     """
-    if certified_sign_cubic(y.k, y.bound) != 0:
-        return FREE
-    tests = inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1))
     constant = verdict(constant_signs(tests))
     if constant == FREE:
         return FREE
-    end_signs = certified_sign(y.k[0], y.bound) * certified_sign(y.k[3], y.bound)
+    end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)
     if constant == HIT and end_signs < 0:
         return HIT
-    shape = curve_class(y.k, y.bound)
+    shape = curve_class(k, bound)
     if end_signs == 0 or shape == UNKNOWN:
         return UNSURE
     if shape != TWO_EXTREMA:
-        return _classify_piece(y.k, y.bound, tests, shape)
+        return _classify_piece(k, bound, tests, shape)
 
-    e0 = (y.k[2] - y.k[1]) - (y.k[1] - y.k[0])
-    e1 = (y.k[3] - y.k[2]) - (y.k[2] - y.k[1])
+    e0 = (k[2] - k[1]) - (k[1] - k[0])
+    e1 = (k[3] - k[2]) - (k[2] - k[1])
     a = wp.abs(e0)
     b = wp.abs(e1)
     square = (a + b) * (a + b)
-    bound = _SPLIT * square * (a + b) * y.bound
-    k_first, k_second = split_cubic(y.k, a, b)
+    part_bound = _SPLIT * square * (a + b) * bound
+    k_first, k_second = split_cubic(k, a, b)
     status = FREE
     for piece in range(2):
         first = piece == 0
-        k = wp.where(first, k_first, k_second)
+        part_k = wp.where(first, k_first, k_second)
         part = InsideTests()
         part.bounds = _SPLIT * square * tests.bounds
         part.q0 = _half(tests.q0, a, b, first)
         part.q1 = _half(tests.q1, a, b, first)
         part.q2 = _half(tests.q2, a, b, first)
         part.q3 = _half(tests.q3, a, b, first)
-        half_shape = curve_class(k, bound)
+        half_shape = curve_class(part_k, part_bound)
         half = UNSURE
-        if certified_sign_cubic(k, bound) != 0 or verdict(constant_signs(part)) == FREE:
+        if certified_sign_cubic(part_k, part_bound) != 0 or verdict(constant_signs(part)) == FREE:
             half = FREE
-        elif certified_sign(k[0], bound) * certified_sign(k[3], bound) != 0 and half_shape != UNKNOWN:
+        elif (
+            certified_sign(part_k[0], part_bound) * certified_sign(part_k[3], part_bound) != 0 and half_shape != UNKNOWN
+        ):
             if half_shape != TWO_EXTREMA:
-                half = _classify_piece(k, bound, part, half_shape)
+                half = _classify_piece(part_k, part_bound, part, half_shape)
         status = either(status, half)
     return status
+
+
+@wp.func
+def _weakly_inside(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64) -> bool:
+    """Whether inside tests at one time have one weak sign, and not all are zero."""
+    low = wp.min(wp.min(a, b), wp.min(c, d))
+    high = wp.max(wp.max(a, b), wp.max(c, d))
+    return (low >= _ZERO and high > _ZERO) or (high <= _ZERO and low < _ZERO)
+
+
+@wp.func
+def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
+    """Whether a query touches at the start or at the end, by the signs that floating point computes."""
+    q0 = tests.q0
+    q1 = tests.q1
+    q2 = tests.q2
+    q3 = tests.q3
+    starts = k[0] == _ZERO and _weakly_inside(q0[0], q1[0], q2[0], q3[0])
+    ends = k[3] == _ZERO and _weakly_inside(q0[2], q1[2], q2[2], q3[2])
+    return starts or ends
+
+
+@wp.func
+def _without_zeros(k: wp.vec4d) -> wp.vec4d:
+    """The cubic without its roots at the ends: moved by far less than a rounding to where it goes from, or comes to."""
+    tiny = _TINY * largest(k)
+    start = wp.where(k[1] != _ZERO, k[1], wp.where(k[2] != _ZERO, k[2], k[3]))
+    end = wp.where(k[2] != _ZERO, k[2], wp.where(k[1] != _ZERO, k[1], k[0]))
+    return wp.vec4d(
+        wp.where(k[0] == _ZERO, wp.where(start < _ZERO, -tiny, tiny), k[0]),
+        k[1],
+        k[2],
+        wp.where(k[3] == _ZERO, wp.where(end < _ZERO, -tiny, tiny), k[3]),
+    )
+
+
+@wp.func
+def classify(motion: Motion, y: Coplanarity) -> int:
+    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
+
+    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
+    there; where Y may have two extrema it is split at its inflection first, homogeneously.
+
+    Where signs are those that floating point computes, roundoff 0, those that are zero need no subdivision: contact at
+    an end of the step is what the inside tests say there. All that is left open then counts as contact, as it does by
+    the paper's weak inequalities, unless the direction between the closest points at half time separates the features.
+    """
+    if certified_sign_cubic(y.k, y.bound) != 0:
+        return FREE
+    tests = inside_tests(motion, y, largest_axis(y.n0 + y.nh + y.nh + y.n1))
+    k = y.k
+    status = UNSURE
+    for _ in range(2):
+        status = classify_with(k, y.bound, tests)
+        if status != UNSURE or motion.roundoff > _ZERO:
+            return status
+        if k[0] != _ZERO and k[3] != _ZERO:
+            break
+        if _touches(k, tests):
+            return HIT
+        k = _without_zeros(k)
+        if certified_sign_cubic(k, _ZERO) != 0:
+            return FREE
+    u = motion.u0 + motion.u1
+    v = motion.v0 + motion.v1
+    w = motion.w0 + motion.w1
+    direction = between(motion.kind, closest_coordinates(motion.kind, u, v, w), u, v, w)
+    return wp.where(direction_separates(motion, direction), FREE, HIT)

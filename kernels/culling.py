@@ -14,7 +14,7 @@ from .signs import UNDERFLOW
 
 _HALF = wp.constant(wp.float64(0.5))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
-_DIRECTION_ERROR = wp.constant(wp.float64(10.0))
+DIRECTION_ERROR = wp.constant(wp.float64(10.0))
 
 
 @wp.func
@@ -68,7 +68,7 @@ def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
         low = wp.min(w0 - wp.max(u0, low) + wp.min(v0, high), w1 - wp.max(u1, low) + wp.min(v1, high))
         high = wp.max(w0 - wp.min(u0, high) + wp.max(v0, high), w1 - wp.min(u1, high) + wp.max(v1, high))
     size = wp.dot(wp.abs(direction), motion.u_size + motion.v_size + motion.w_size)
-    bound = motion.roundoff * (_DIRECTION_ERROR * size + UNDERFLOW)
+    bound = motion.roundoff * (DIRECTION_ERROR * size + UNDERFLOW)
     return low > bound or high < -bound
 
 

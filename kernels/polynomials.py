@@ -33,7 +33,7 @@ EDGE_EDGE = wp.constant(1)
 
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _HALF = wp.constant(wp.float64(0.5))
-_COPLANARITY_ERROR = wp.constant(wp.float64(14.0))
+COPLANARITY_ERROR = wp.constant(wp.float64(14.0))
 _PRODUCT_ERROR = wp.constant(wp.float64(6.0))
 _DIFFERENCE_ERROR = wp.constant(wp.float64(7.0))
 _REMAINDER_ERROR = wp.constant(wp.float64(8.0))
@@ -111,7 +111,7 @@ def coplanarity(motion: Motion) -> Coplanarity:
         wp.dot(motion.w1, y.n1),
     )
     size = wp.dot(motion.w_size, _cross_size(motion.u_size, motion.v_size))
-    y.bound = motion.roundoff * (_COPLANARITY_ERROR * size + UNDERFLOW)
+    y.bound = motion.roundoff * (COPLANARITY_ERROR * size + UNDERFLOW)
     return y
 
 

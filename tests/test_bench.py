@@ -98,7 +98,6 @@ def test_usd_scene(capsys, request):
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        ([], "BENCHMARK"),
         (["juggler"], "juggler"),
         (["detector", "gone.usd"], "gone.usd: no such file"),
         (["detector", "flood:5000"], "flood:5000: there is no generator flood, only cloth, crash"),

@@ -304,7 +304,9 @@ def test_device_that_is_not_there(capsys, falling_scene):
     assert "--device cuda:99: there is no such device" in fail(capsys, "replay", falling_scene, "--device", "cuda:99")
 
 
-@pytest.mark.parametrize("command", [[], ["replay"], ["query"], ["bench"], ["bench", "detector"], ["bench", "queries"]])
+@pytest.mark.parametrize(
+    "command", [[], ["replay"], ["query"], ["bench"], ["bench", "paper"], ["bench", "detector"], ["bench", "queries"]]
+)
 def test_help_has_examples(capsys, command):
     with pytest.raises(SystemExit) as end:
         main([*command, "--help"])

@@ -121,6 +121,21 @@ def test_touching_is_contact_that_floating_point_leaves_open():
     assert bsc.query_vertex_face(touching, method="exact").toi.tolist() == [1.0]
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_float_decides_zeros_without_subdivision(kind):
+    """Contact at rest, where the cubic starts at zero or is zero, and features apart in one plane or on one line."""
+    query = getattr(bsc, f"query_{kind}")
+    points = GENERATORS["resting_contact"](np.random.default_rng(9), 400, kind, np.float32)
+    truth = getattr(checker, kind)(points)
+    assert 100 < truth.sum() < 350
+    found = query(points, method="float")
+    assert (found.hit != truth).sum() <= 4
+    assert np.array_equal(found.hit, query(points, method="float", toi=False).hit)
+    on_a_line = np.zeros((8, 3))
+    on_a_line[:, 0] = [5, 0, 1, 2, 5, 0, 1, 2] if kind == "vertex_face" else [0, 1, 3, 5, 0, 1, 3, 5]
+    assert not query(on_a_line[None], method="float").hit.any()
+
+
 def test_float_points_are_taken_as_the_doubles_they_are():
     points = GENERATORS["uniform"](np.random.default_rng(5), 500, "edge_edge", np.float32)
     single = bsc.query_edge_edge(points)

@@ -22,6 +22,7 @@ __all__ = [
     "benchmark_ipc_toolkit",
     "count_threads",
     "limited_threads",
+    "median_milliseconds",
     "replay_graph",
 ]
 
@@ -192,6 +193,21 @@ def replay_graph(graph, device, *, replays) -> float:
         stream.record_event(end)
         milliseconds.append(wp.get_event_elapsed_time(start, end))
     return statistics.median(milliseconds)
+
+
+def median_milliseconds(run, device, repeat) -> float:
+    """Median time of a run [ms], a CUDA graph's on a GPU; a first one, which loads the kernels, is not timed."""
+    run()
+    if device.is_cuda:
+        with wp.ScopedCapture(device) as capture:
+            run()
+        return replay_graph(capture.graph, device, replays=repeat)
+    seconds = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        run()
+        seconds.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(seconds)
 
 
 def benchmark_ipc_toolkit(scene, edges, *, repeat=5) -> IpcToolkitBenchmark:

@@ -1,14 +1,12 @@
 """Benchmark of elementary queries: how many a second are answered where queries and answers stay on the device."""
 
 import functools
-import statistics
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from .bench import replay_graph
+from .bench import median_milliseconds
 from .kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
@@ -190,10 +188,10 @@ def _kernels(kind):
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
-        if direction_separates(motion, centroid_direction(motion)):
-            return
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        if direction_separates(motion, centroid_direction(motion)):
             return
         survivors[wp.int32(take_slot(counts, 0))] = i
 
@@ -334,7 +332,7 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
         launch_over(find_exact_status, count, inputs=[touching], outputs=outputs, device=device, block_dim=64)
 
     runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
-    milliseconds = {mode: _median_milliseconds(runs[mode], device, repeat) for mode in MODES}
+    milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
     answers = {mode: array.numpy() for mode, array in status.items()}
     missed = int((answers["exact"] != HIT).sum())
     if missed:
@@ -356,20 +354,5 @@ def benchmark_copy(*, device=None, repeat=20) -> float:
     device = wp.get_device(device)
     source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)
     target = wp.empty_like(source)
-    milliseconds = _median_milliseconds(lambda: wp.copy(target, source), device, repeat)
+    milliseconds = median_milliseconds(lambda: wp.copy(target, source), device, repeat)
     return 2e3 * _COPIED_BYTES / milliseconds
-
-
-def _median_milliseconds(run, device, repeat) -> float:
-    """Median time of a run [ms]; a first one, which loads the kernels, is not timed."""
-    run()
-    if device.is_cuda:
-        with wp.ScopedCapture(device) as capture:
-            run()
-        return replay_graph(capture.graph, device, replays=repeat)
-    seconds = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(seconds)

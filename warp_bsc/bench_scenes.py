@@ -11,12 +11,18 @@ from .scene import Scene
 
 __all__ = [
     "GENERATORS",
+    "PAPER_SCENES",
     "BenchmarkScene",
     "default_scenes",
     "generate_cloth",
     "generate_crash",
+    "load_intervals",
     "load_scene",
+    "paper_scenes",
 ]
+
+PAPER_SCENES = ("twisting", "funnel", "dancer", "flamenco", "crashing")
+"""Names of the scenes of the paper's benchmarks (paper, 5.2)."""
 
 _FEWEST_TRIANGLES, _MOST_TRIANGLES = 1000, 20_000_000
 
@@ -69,6 +75,43 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
         raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene.times) - 2}")
     segment, x0, x1 = scene.interval(interval)
     return BenchmarkScene(name, segment.faces, x0, x1)
+
+
+def paper_scenes() -> list[str]:
+    """The scenes of the paper's benchmarks, which a checkout has.
+
+    Raises:
+        FileNotFoundError: If this is none, or a scene is missing.
+    """
+    assets = Path(__file__).parents[1] / "assets"
+    paths = [assets / f"{name}.usd" for name in PAPER_SCENES]
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(
+                f"{path}: no such file: the paper's scenes come with a checkout of the project, where examples/"
+                f"example_{path.stem}.py makes this one; or name other scenes, such as cloth:20000"
+            )
+    return [str(path) for path in paths]
+
+
+def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
+    """Reads some intervals of a scene, evenly spaced, with their numbers; one of what is no USD file.
+
+    Arguments and errors as of :func:`load_scene`.
+    """
+    if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
+        return [(0, load_scene(name))]
+    scene = Scene(name)
+    count = len(scene.times) - 1
+    if count < 1:
+        raise ValueError(f"{name}: there is no interval, its meshes never move")
+    # the middles of so many equal parts
+    chosen = sorted({(2 * i + 1) * count // (2 * min(most, count)) for i in range(min(most, count))})
+    intervals = []
+    for index in chosen:
+        segment, x0, x1 = scene.interval(index)
+        intervals.append((index, BenchmarkScene(name, segment.faces, x0, x1)))
+    return intervals
 
 
 def _find_generator(name, generator, triangles):

@@ -1,14 +1,29 @@
 """Launches over the entries of a queue, of which only the device knows how many there are; on no tape."""
 
+import contextlib
+import contextvars
 import functools
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
-__all__ = ["launch_over", "launch_over_queue"]
+__all__ = ["launch_over", "launch_over_queue", "one_core"]
 
 _THREADS = os.cpu_count() or 1
+
+_threads = contextvars.ContextVar("threads", default=_THREADS)
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """Keeps launches on the CPU that are made within to the thread that makes them."""
+    token = _threads.set(1)
+    try:
+        yield
+    finally:
+        _threads.reset(token)
 
 
 @functools.cache
@@ -33,14 +48,15 @@ def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=
         inputs = [0, *inputs]
         wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim, record_tape=False)
         return
-    chunk = max(chunk, -(-count // (8 * _THREADS)))
+    threads = _threads.get()
+    chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
 
     def launch(first):
         dim = min(chunk, count - first)
         wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device, record_tape=False)
 
     starts = range(0, count, chunk)
-    if _THREADS == 1 or len(starts) < 2:
+    if len(starts) < 2:
         for first in starts:
             launch(first)
     else:

@@ -20,12 +20,13 @@ from .kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
+from .kernels.eights import EIGHT, cull_eight_of
 from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polynomials import coplanarity
 from .kernels.queues import append, is_filled, take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
-from .launching import launch_over_queue
+from .launching import launch_over, launch_over_queue
 
 __all__ = [
     "METHODS",
@@ -142,15 +143,36 @@ def _kernels(kind, dtype):
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        if direction_separates(motion, centroid_direction(motion)):
-            return
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        if direction_separates(motion, centroid_direction(motion)):
             return
         # last, because what the broad phase calls near passes, in single precision always; but exact at any scale
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         append(pair, survivors, counts, _SURVIVORS)
+
+    cull_eight = cull_eight_of(dtype, kind == "vertex_face")
+
+    @wp.kernel(**_KERNEL)
+    def cull_eights(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        roundoff: wp.float64,
+        near: wp.array[wp.vec2i],
+        counts: wp.array[wp.int64],
+        survivors: wp.array[wp.vec2i],
+    ):
+        i = EIGHT * (first + wp.tid())
+        filled = wp.int32(wp.min(counts[_NEAR], wp.int64(near.shape[0])))
+        left = cull_eight(x0, x1, elements, near, i, wp.min(EIGHT, filled - i), roundoff)
+        if left != 0:
+            for lane in range(EIGHT):
+                if (left >> lane) & 1 == 1:
+                    append(near[i + lane], survivors, counts, _SURVIVORS)
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
@@ -249,7 +271,7 @@ def _kernels(kind, dtype):
         coordinates[i] = at
         normal[i] = direction
 
-    return cull, classify_survivors, find_impacts, find_contact_points
+    return cull, cull_eights, classify_survivors, find_impacts, find_contact_points
 
 
 @wp.kernel(**_KERNEL)
@@ -404,13 +426,17 @@ class NarrowPhase:
             tolerance: Of the times of impact, as a share of the step.
             lap: Called with the name of each stage at its end.
         """
-        cull, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
+        cull, cull_eights, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
         roundoff = 0.0 if method == "float" else ROUNDOFF
         motion = [x0, x1, elements, roundoff]
         counts, found = self.counts, self.unsorted
 
         inputs = [*motion, self.near, counts]
-        launch_over_queue(cull, self.near, counts, Count.NEAR, inputs=inputs, outputs=[self._survivors])
+        if counts.device.is_cpu:
+            eights = -(-min(len(self.near), int(counts.numpy()[Count.NEAR])) // EIGHT)
+            launch_over(cull_eights, eights, inputs=inputs, outputs=[self._survivors], device=counts.device, chunk=128)
+        else:
+            launch_over_queue(cull, self.near, counts, Count.NEAR, inputs=inputs, outputs=[self._survivors])
         lap("cull")
 
         inputs = [*motion, self._survivors, counts]

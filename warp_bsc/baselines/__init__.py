@@ -1,0 +1,6 @@
+"""What the benchmarks compare with: other methods of the literature as device code, written from their papers."""
+
+from .cubic_solver import cubic_solver_edge_edge, cubic_solver_vertex_face
+from .reduced_inside_test import classify_reduced
+
+__all__ = ["classify_reduced", "cubic_solver_edge_edge", "cubic_solver_vertex_face"]
