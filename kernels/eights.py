@@ -1,8 +1,9 @@
-"""The culls of eight pairs at once, with the vector instructions of a CPU.
+"""The culls of many pairs at once, with the vector instructions of a CPU.
 
-They need additions, multiplications and comparisons alone, the same for every pair: what the paper's polynomials are
-good for. The operations are those of :mod:`.culling` and :mod:`.polynomials`, in the same order, and so are the bounds
-on their errors.
+Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the
+other culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
+polynomials are good for. The operations are those of :mod:`.culling` and :mod:`.polynomials`, in the same order, and so
+are the bounds on their errors.
 
 Pairs are not scaled, because powers of two change nothing but overflow and underflow. A sum that overflows is culled by
 no comparison. What underflows is lost once in a component of the normal, 2^-1074 for each of at most four products,
@@ -18,14 +19,15 @@ from .culling import DIRECTION_ERROR
 from .polynomials import COPLANARITY_ERROR
 from .signs import UNDERFLOW
 
-EIGHT = wp.constant(8)
-"""Pairs that are culled at once."""
+BATCH = wp.constant(64)
+"""Pairs that one call culls."""
 
 _LARGEST = 1.0e150
 
 _SNIPPET = """
     typedef {scalar} Scalars __attribute__((ext_vector_type(8)));
     typedef {scalar} Four __attribute__((ext_vector_type(4)));
+    typedef {scalar} Loaded __attribute__((ext_vector_type(4), aligned(sizeof({scalar}))));
     typedef {scalar} Two __attribute__((ext_vector_type(2), aligned(sizeof({scalar}))));
     typedef double Doubles __attribute__((ext_vector_type(8)));
     typedef bool Bools __attribute__((ext_vector_type(8)));
@@ -50,140 +52,155 @@ _SNIPPET = """
         return Vectors{{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}};
     }};
 
-    // the points as they are in memory, x y y z each, transposed to coordinates of all eight
-    int corners[4][8];
-    for (int lane = 0; lane < 8; ++lane) {{
-        const int* pair = (const int*)pairs.data + 2 * (size_t)(lane < count ? first + lane : first);
+    auto corners_of = [&](int slot, int* corner) {{
+        const int* pair = (const int*)pairs.data + 2 * (size_t)slot;
         if (vertex_face) {{
             const int* face = elements.data + 3 * (size_t)pair[1];
-            corners[0][lane] = pair[0], corners[1][lane] = face[0];
-            corners[2][lane] = face[1], corners[3][lane] = face[2];
+            corner[0] = pair[0], corner[1] = face[0], corner[2] = face[1], corner[3] = face[2];
         }} else {{
             const int* edge = elements.data + 2 * (size_t)pair[0];
             const int* other = elements.data + 2 * (size_t)pair[1];
-            corners[0][lane] = edge[0], corners[1][lane] = edge[1];
-            corners[2][lane] = other[0], corners[3][lane] = other[1];
+            corner[0] = edge[0], corner[1] = edge[1], corner[2] = other[0], corner[3] = other[1];
         }}
+    }};
+
+    // axis boxes, pair by pair: x y z of both ends in one vector
+    const int last = x0.shape[0] - 1;
+    auto load = [last](const void* x, int corner) -> Four {{
+        const {scalar}* from = (const {scalar}*)x + 3 * (size_t)corner;
+        if (corner < last)
+            return *(const Loaded*)from;
+        return Four{{from[0], from[1], from[2], 0}};
+    }};
+    auto both = [&](int corner) -> Scalars {{
+        return __builtin_shufflevector(load(x0.data, corner), load(x1.data, corner), 0, 1, 2, 3, 4, 5, 6, 7);
+    }};
+    int near[{batch} + 8];
+    int near_count = 0;
+    for (int i = 0; i < count; ++i) {{
+        int corner[4];
+        corners_of(first + i, corner);
+        const Scalars a = both(corner[0]), b = both(corner[1]), c = both(corner[2]), d = both(corner[3]);
+        Scalars low = a, high = a;
+        Scalars other_low = __builtin_elementwise_min(c, d), other_high = __builtin_elementwise_max(c, d);
+        if (vertex_face) {{
+            other_low = __builtin_elementwise_min(other_low, b);
+            other_high = __builtin_elementwise_max(other_high, b);
+        }} else {{
+            low = __builtin_elementwise_min(a, b);
+            high = __builtin_elementwise_max(a, b);
+        }}
+        const int above = bits(other_low > high), below = bits(low > other_high);
+        const int apart = ((above & (above >> 4)) | (below & (below >> 4))) & 7;
+        near[near_count] = i;
+        near_count += apart == 0;
     }}
-    Scalars points[24];
-    auto read = [&](const {scalar}* x, const int* corner, Scalars* to) {{
-        Four at[8], low[3], high[3];
+
+    unsigned long long left = 0;
+    for (int group = 0; group < near_count; group += 8) {{
+        const int filled = near_count - group < 8 ? near_count - group : 8;
+        // the points as they are in memory, x y y z each, transposed to coordinates of all eight
+        int corners[4][8];
         for (int lane = 0; lane < 8; ++lane) {{
-            const {scalar}* from = x + 3 * (size_t)corner[lane];
-            at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
-        }}
-        auto transpose = [](const Four* at, Four* to) {{
-            const Four xy = __builtin_shufflevector(at[0], at[1], 0, 4, 1, 5);
-            const Four yz = __builtin_shufflevector(at[0], at[1], 2, 6, 3, 7);
-            const Four more_xy = __builtin_shufflevector(at[2], at[3], 0, 4, 1, 5);
-            const Four more_yz = __builtin_shufflevector(at[2], at[3], 2, 6, 3, 7);
-            to[0] = __builtin_shufflevector(xy, more_xy, 0, 1, 4, 5);
-            to[1] = __builtin_shufflevector(xy, more_xy, 2, 3, 6, 7);
-            to[2] = __builtin_shufflevector(yz, more_yz, 2, 3, 6, 7);
-        }};
-        transpose(at, low);
-        transpose(at + 4, high);
-        for (int axis = 0; axis < 3; ++axis)
-            to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
-    }};
-    for (int i = 0; i < 4; ++i) {{
-        read((const {scalar}*)x0.data, corners[i], points + 3 * i);
-        read((const {scalar}*)x1.data, corners[i], points + 12 + 3 * i);
-    }}
-    int left = (1 << count) - 1;
-
-    // axis boxes
-    Scalars low[2][3], high[2][3], other_low[2][3], other_high[2][3];
-    for (int end = 0; end < 2; ++end)
-        for (int axis = 0; axis < 3; ++axis) {{
-            Scalars p[4];
+            int corner[4];
+            corners_of(first + near[group + (lane < filled ? lane : 0)], corner);
             for (int i = 0; i < 4; ++i)
-                p[i] = points[12 * end + 3 * i + axis];
-            low[end][axis] = high[end][axis] = p[0];
-            if (!vertex_face) {{
-                low[end][axis] = __builtin_elementwise_min(p[0], p[1]);
-                high[end][axis] = __builtin_elementwise_max(p[0], p[1]);
-            }}
-            other_low[end][axis] = __builtin_elementwise_min(p[2], p[3]);
-            other_high[end][axis] = __builtin_elementwise_max(p[2], p[3]);
-            if (vertex_face) {{
-                other_low[end][axis] = __builtin_elementwise_min(other_low[end][axis], p[1]);
-                other_high[end][axis] = __builtin_elementwise_max(other_high[end][axis], p[1]);
-            }}
+                corners[i][lane] = corner[i];
         }}
-    auto apart = (other_low[0][0] > high[0][0]) & (other_low[1][0] > high[1][0]);
-    for (int axis = 0; axis < 3; ++axis) {{
-        apart |= (other_low[0][axis] > high[0][axis]) & (other_low[1][axis] > high[1][axis]);
-        apart |= (low[0][axis] > other_high[0][axis]) & (low[1][axis] > other_high[1][axis]);
-    }}
-    left &= ~bits(apart);
-    if (!left)
-        return 0;
+        Scalars points[24];
+        auto read = [&](const {scalar}* x, const int* corner, Scalars* to) {{
+            Four at[8], low[3], high[3];
+            for (int lane = 0; lane < 8; ++lane) {{
+                const {scalar}* from = x + 3 * (size_t)corner[lane];
+                at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
+            }}
+            auto transpose = [](const Four* at, Four* to) {{
+                const Four xy = __builtin_shufflevector(at[0], at[1], 0, 4, 1, 5);
+                const Four yz = __builtin_shufflevector(at[0], at[1], 2, 6, 3, 7);
+                const Four more_xy = __builtin_shufflevector(at[2], at[3], 0, 4, 1, 5);
+                const Four more_yz = __builtin_shufflevector(at[2], at[3], 2, 6, 3, 7);
+                to[0] = __builtin_shufflevector(xy, more_xy, 0, 1, 4, 5);
+                to[1] = __builtin_shufflevector(xy, more_xy, 2, 3, 6, 7);
+                to[2] = __builtin_shufflevector(yz, more_yz, 2, 3, 6, 7);
+            }};
+            transpose(at, low);
+            transpose(at + 4, high);
+            for (int axis = 0; axis < 3; ++axis)
+                to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
+        }};
+        for (int i = 0; i < 4; ++i) {{
+            read((const {scalar}*)x0.data, corners[i], points + 3 * i);
+            read((const {scalar}*)x1.data, corners[i], points + 12 + 3 * i);
+        }}
 
-    // Bernstein signs
-    auto point = [&](int i) {{
-        return Vectors{{
-            __builtin_convertvector(points[3 * i], Doubles),
-            __builtin_convertvector(points[3 * i + 1], Doubles),
-            __builtin_convertvector(points[3 * i + 2], Doubles)}};
-    }};
-    Vectors u0, v0, w0, u1, v1, w1;
-    if (vertex_face) {{
-        u0 = minus(point(2), point(1)), v0 = minus(point(3), point(1)), w0 = minus(point(0), point(1));
-        u1 = minus(point(6), point(5)), v1 = minus(point(7), point(5)), w1 = minus(point(4), point(5));
-    }} else {{
-        u0 = minus(point(1), point(0)), v0 = minus(point(3), point(2)), w0 = minus(point(2), point(0));
-        u1 = minus(point(5), point(4)), v1 = minus(point(7), point(6)), w1 = minus(point(6), point(4));
-    }}
-    const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
-    const Vectors twice_nh = plus(cross(u0, v1), cross(u1, v0));
-    const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
-    const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
-    const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
-    // without a roundoff all bounds are zero
-    Vectors size = {{0.0, 0.0, 0.0}};
-    Doubles bound = 0.0;
-    int trusted = 255;
-    if (roundoff > 0.0) {{
-        const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
-        const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
-        bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow});
-        size = plus(plus(u, v), w);
-        trusted = bits(most(most(size.x, size.y), size.z) < {largest});
-    }}
-    auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
-    left &= ~(bits(culled) & trusted);
-    if (!left)
-        return 0;
+        // Bernstein signs
+        auto point = [&](int i) {{
+            return Vectors{{
+                __builtin_convertvector(points[3 * i], Doubles),
+                __builtin_convertvector(points[3 * i + 1], Doubles),
+                __builtin_convertvector(points[3 * i + 2], Doubles)}};
+        }};
+        Vectors u0, v0, w0, u1, v1, w1;
+        if (vertex_face) {{
+            u0 = minus(point(2), point(1)), v0 = minus(point(3), point(1)), w0 = minus(point(0), point(1));
+            u1 = minus(point(6), point(5)), v1 = minus(point(7), point(5)), w1 = minus(point(4), point(5));
+        }} else {{
+            u0 = minus(point(1), point(0)), v0 = minus(point(3), point(2)), w0 = minus(point(2), point(0));
+            u1 = minus(point(5), point(4)), v1 = minus(point(7), point(6)), w1 = minus(point(6), point(4));
+        }}
+        const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
+        const Vectors twice_nh = plus(cross(u0, v1), cross(u1, v0));
+        const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
+        const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
+        const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
+        // without a roundoff all bounds are zero
+        Vectors size = {{0.0, 0.0, 0.0}};
+        Doubles bound = 0.0;
+        int trusted = 255;
+        if (roundoff > 0.0) {{
+            const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
+            const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
+            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow});
+            size = plus(plus(u, v), w);
+            trusted = bits(most(most(size.x, size.y), size.z) < {largest});
+        }}
+        auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
+        int undecided = ((1 << filled) - 1) & ~(bits(culled) & trusted);
+        if (!undecided)
+            continue;
 
-    // separating direction
-    const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
-    const Vectors direction
-        = vertex_face ? minus(ws, times(1.0 / 3.0, plus(us, vs))) : plus(ws, times(0.5, minus(vs, us)));
-    const Doubles du0 = dot(direction, u0), du1 = dot(direction, u1), zero = 0.0;
-    const Doubles dv0 = dot(direction, v0), dv1 = dot(direction, v1);
-    const Doubles dw0 = dot(direction, w0), dw1 = dot(direction, w1);
-    Doubles lowest, highest;
-    if (vertex_face) {{
-        lowest = least(dw0 - most(most(du0, dv0), zero), dw1 - most(most(du1, dv1), zero));
-        highest = most(dw0 - least(least(du0, dv0), zero), dw1 - least(least(du1, dv1), zero));
-    }} else {{
-        lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
-        highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
+        // separating direction
+        const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
+        const Vectors direction
+            = vertex_face ? minus(ws, times(1.0 / 3.0, plus(us, vs))) : plus(ws, times(0.5, minus(vs, us)));
+        const Doubles du0 = dot(direction, u0), du1 = dot(direction, u1), zero = 0.0;
+        const Doubles dv0 = dot(direction, v0), dv1 = dot(direction, v1);
+        const Doubles dw0 = dot(direction, w0), dw1 = dot(direction, w1);
+        Doubles lowest, highest;
+        if (vertex_face) {{
+            lowest = least(dw0 - most(most(du0, dv0), zero), dw1 - most(most(du1, dv1), zero));
+            highest = most(dw0 - least(least(du0, dv0), zero), dw1 - least(least(du1, dv1), zero));
+        }} else {{
+            lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
+            highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
+        }}
+        const Vectors along = sizes(direction, direction);
+        const Doubles slack = roundoff * ({direction_error} * dot(along, size) + {underflow});
+        culled = (lowest > slack) | (highest < -slack);
+        undecided &= ~(bits(culled) & trusted);
+        for (int lane = 0; lane < filled; ++lane)
+            left |= (unsigned long long)((undecided >> lane) & 1) << near[group + lane];
     }}
-    const Vectors along = sizes(direction, direction);
-    const Doubles slack = roundoff * ({direction_error} * dot(along, size) + {underflow});
-    culled = (lowest > slack) | (highest < -slack);
-    return left & ~(bits(culled) & trusted);
+    return left;
 """
 
 
 @functools.cache
-def cull_eight_of(dtype, vertex_face: bool):
-    """The function that culls eight pairs, for one type of position and one kind of pair.
+def cull_batch_of(dtype, vertex_face: bool):
+    """The function that culls a batch of pairs, for one type of position and one kind of pair.
 
     It takes positions at both ends, the vertices of the elements, a queue of pairs, the first of them and how many from
-    there on count, up to eight, and the roundoff. It returns which of them no cull decides, as bits.
+    there on count, up to :data:`BATCH`, and the roundoff. It returns which of them no cull decides, as bits.
     """
     snippet = _SNIPPET.format(
         scalar="float" if dtype is wp.vec3 else "double",
@@ -191,10 +208,11 @@ def cull_eight_of(dtype, vertex_face: bool):
         direction_error=float(DIRECTION_ERROR),
         underflow=repr(float(UNDERFLOW)),
         largest=repr(_LARGEST),
+        batch=int(BATCH),
     )
 
     @wp.func_native(f"    constexpr bool vertex_face = {'true' if vertex_face else 'false'};\n{snippet}")
-    def cull_eight(
+    def cull_batch(
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
@@ -202,6 +220,12 @@ def cull_eight_of(dtype, vertex_face: bool):
         first: int,
         count: int,
         roundoff: wp.float64,
-    ) -> int: ...
+    ) -> wp.uint64: ...
 
-    return cull_eight
+    return cull_batch
+
+
+@wp.func_native("return bits ? __builtin_ctzll(bits) : 64;")
+def lowest_bit(bits: wp.uint64) -> int:
+    """The number of the lowest bit that is set; 64 if there is none."""
+    ...

@@ -13,7 +13,7 @@ from warp_bsc.kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from warp_bsc.kernels.eights import EIGHT, cull_eight_of
+from warp_bsc.kernels.eights import BATCH, cull_batch_of, lowest_bit
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import ROUNDOFF, certified_sign_cubic
@@ -27,7 +27,7 @@ def kernels_of(kind, dtype):
     vertex_face = kind == "vertex_face"
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
-    cull_eight = cull_eight_of(dtype, vertex_face)
+    cull_batch = cull_batch_of(dtype, vertex_face)
 
     @wp.kernel(**_KERNEL)
     def cull(x0: wp.array[dtype], x1: wp.array[dtype], roundoff: wp.float64, left: wp.array[int]):
@@ -41,7 +41,7 @@ def kernels_of(kind, dtype):
             left[i] = 1
 
     @wp.kernel(**_KERNEL)
-    def cull_eights(
+    def cull_batches(
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
@@ -49,13 +49,13 @@ def kernels_of(kind, dtype):
         roundoff: wp.float64,
         left: wp.array[int],
     ):
-        i = EIGHT * wp.tid()
-        bits = cull_eight(x0, x1, elements, pairs, i, wp.min(EIGHT, pairs.shape[0] - i), roundoff)
-        for lane in range(EIGHT):
-            if (bits >> lane) & 1 == 1:
-                left[i + lane] = 1
+        i = BATCH * wp.tid()
+        bits = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), roundoff)
+        while bits != wp.uint64(0):
+            left[i + lowest_bit(bits)] = 1
+            bits = bits & (bits - wp.uint64(1))
 
-    return cull, cull_eights
+    return cull, cull_batches
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -81,12 +81,12 @@ def test_culls_are_those_of_one_query(kind, dtype):
 def cull(kind, points, roundoff):
     """What the culls leave, one by one and eight at once."""
     queries = QuerySet(Queries.of_points(kind, points), "cpu")
-    alone, together = (wp.zeros(queries.count + EIGHT, dtype=int, device="cpu") for _ in range(2))
+    alone, together = (wp.zeros(queries.count + BATCH, dtype=int, device="cpu") for _ in range(2))
     one, eight = kernels_of(kind, queries.dtype)
     x0, x1, elements, pairs = queries.arrays
     wp.launch(one, queries.count, inputs=[x0, x1, roundoff], outputs=[alone], device="cpu")
     inputs = [x0, x1, elements, pairs, roundoff]
-    wp.launch(eight, -(-queries.count // EIGHT), inputs=inputs, outputs=[together], device="cpu")
+    wp.launch(eight, -(-queries.count // BATCH), inputs=inputs, outputs=[together], device="cpu")
     assert not together.numpy()[queries.count :].any()
     return alone.numpy()[: queries.count] == 1, together.numpy()[: queries.count] == 1
 

@@ -28,7 +28,7 @@ from .bench import median_milliseconds
 from .exact_stage import launch_exact_stage
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from .kernels.eights import EIGHT, cull_eight_of
+from .kernels.eights import BATCH, cull_batch_of, lowest_bit
 from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polynomials import coplanarity
 from .kernels.queues import take_slot
@@ -131,10 +131,10 @@ def _kernels(kind, dtype):
                     survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i
         stop(ticks, i, start)
 
-    cull_eight = cull_eight_of(dtype, vertex_face)
+    cull_batch = cull_batch_of(dtype, vertex_face)
 
     @wp.kernel(**_KERNEL)
-    def cull_eights(
+    def cull_batches(
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
@@ -145,18 +145,18 @@ def _kernels(kind, dtype):
         counts: wp.array[wp.int64],
         ticks: wp.array[wp.int64],
     ):
-        i = EIGHT * (first + wp.tid())
+        i = BATCH * (first + wp.tid())
         start = started(ticks)
-        count = wp.min(EIGHT, pairs.shape[0] - i)
-        left = cull_eight(x0, x1, elements, pairs, i, count, roundoff)
-        if left != 0:
-            for lane in range(EIGHT):
-                if (left >> lane) & 1 == 1:
-                    survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
+        count = wp.min(BATCH, pairs.shape[0] - i)
+        left = cull_batch(x0, x1, elements, pairs, i, count, roundoff)
+        while left != wp.uint64(0):
+            lane = lowest_bit(left)
+            survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
+            left = left & (left - wp.uint64(1))
         if ticks:
             passed = _cycles() - start
             for lane in range(count):
-                wp.atomic_add(ticks, i + lane, passed // wp.int64(8))
+                wp.atomic_add(ticks, i + lane, passed // wp.int64(count))
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
@@ -282,7 +282,7 @@ def _kernels(kind, dtype):
 
     return {
         "cull": cull,
-        "cull_eights": cull_eights,
+        "cull_batches": cull_batches,
         "classify_survivors": classify_survivors,
         "subdivide": subdivide,
         "classify_survivors_reduced": classify_survivors_reduced,
@@ -394,9 +394,9 @@ class MethodRun:
         outputs = [self._survivors, counts, ticks]
         inputs = [*arrays, roundoff]
         if queries.device.is_cpu:
-            eights = -(-queries.count // EIGHT)
+            batches = -(-queries.count // BATCH)
             launch_over(
-                kernels["cull_eights"], eights, inputs=inputs, outputs=outputs, device=queries.device, chunk=128
+                kernels["cull_batches"], batches, inputs=inputs, outputs=outputs, device=queries.device, chunk=16
             )
         else:
             launch_over(kernels["cull"], queries.count, inputs=inputs, outputs=outputs, device=queries.device)

@@ -20,7 +20,7 @@ from .kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from .kernels.eights import EIGHT, cull_eight_of
+from .kernels.eights import BATCH, cull_batch_of, lowest_bit
 from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polynomials import coplanarity
 from .kernels.queues import append, is_filled, take_slot
@@ -153,10 +153,10 @@ def _kernels(kind, dtype):
             return
         append(pair, survivors, counts, _SURVIVORS)
 
-    cull_eight = cull_eight_of(dtype, kind == "vertex_face")
+    cull_batch = cull_batch_of(dtype, kind == "vertex_face")
 
     @wp.kernel(**_KERNEL)
-    def cull_eights(
+    def cull_batches(
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
@@ -166,13 +166,13 @@ def _kernels(kind, dtype):
         counts: wp.array[wp.int64],
         survivors: wp.array[wp.vec2i],
     ):
-        i = EIGHT * (first + wp.tid())
+        i = BATCH * (first + wp.tid())
         filled = wp.int32(wp.min(counts[_NEAR], wp.int64(near.shape[0])))
-        left = cull_eight(x0, x1, elements, near, i, wp.min(EIGHT, filled - i), roundoff)
-        if left != 0:
-            for lane in range(EIGHT):
-                if (left >> lane) & 1 == 1:
-                    append(near[i + lane], survivors, counts, _SURVIVORS)
+        left = cull_batch(x0, x1, elements, near, i, wp.min(BATCH, filled - i), roundoff)
+        while left != wp.uint64(0):
+            lane = lowest_bit(left)
+            append(near[i + lane], survivors, counts, _SURVIVORS)
+            left = left & (left - wp.uint64(1))
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
@@ -271,7 +271,7 @@ def _kernels(kind, dtype):
         coordinates[i] = at
         normal[i] = direction
 
-    return cull, cull_eights, classify_survivors, find_impacts, find_contact_points
+    return cull, cull_batches, classify_survivors, find_impacts, find_contact_points
 
 
 @wp.kernel(**_KERNEL)
@@ -426,15 +426,15 @@ class NarrowPhase:
             tolerance: Of the times of impact, as a share of the step.
             lap: Called with the name of each stage at its end.
         """
-        cull, cull_eights, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
+        cull, cull_batches, classify_survivors, find_impacts, _ = _kernels(self.kind, x0.dtype)
         roundoff = 0.0 if method == "float" else ROUNDOFF
         motion = [x0, x1, elements, roundoff]
         counts, found = self.counts, self.unsorted
 
         inputs = [*motion, self.near, counts]
         if counts.device.is_cpu:
-            eights = -(-min(len(self.near), int(counts.numpy()[Count.NEAR])) // EIGHT)
-            launch_over(cull_eights, eights, inputs=inputs, outputs=[self._survivors], device=counts.device, chunk=128)
+            batches = -(-min(len(self.near), int(counts.numpy()[Count.NEAR])) // BATCH)
+            launch_over(cull_batches, batches, inputs=inputs, outputs=[self._survivors], device=counts.device, chunk=16)
         else:
             launch_over_queue(cull, self.near, counts, Count.NEAR, inputs=inputs, outputs=[self._survivors])
         lap("cull")
