@@ -66,7 +66,7 @@ class Effort:
     @classmethod
     def full(cls) -> "Effort":
         """That of the whole benchmark."""
-        return cls(intervals=8, queries=2**19, sample=20_000, peer_queries=4000, adversaries=100_000, repeat=9)
+        return cls(intervals=8, queries=2**19, sample=20_000, peer_queries=4000, adversaries=100_000, repeat=25)
 
     @classmethod
     def quick(cls) -> "Effort":

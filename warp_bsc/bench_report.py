@@ -90,6 +90,11 @@ def _print_times(console, rows: list[tuple[str, Timing]]):
     console.print()
 
 
+def _few_digits(number):
+    """A number without fractions, or with two digits where it is small: times on a GPU are of many queries at once."""
+    return f"{number:,.0f}" if number >= 10.0 else f"{number:.2g}"
+
+
 def _print_worst(console, rows, adversarial):
     for place, worst_of_trouble in adversarial:
         found = [(name, timing.worst) for name, scene in rows for timing in scene.timings if timing.place == place]
@@ -103,7 +108,7 @@ def _print_worst(console, rows, adversarial):
         for name, worst in found:
             took = {method: query.nanoseconds[method] for method, query in worst.items()}
             ratio = f"{took['cubic'] / took['float']:.2f}"
-            table.add_row(name, *(f"{took[method]:,.0f}" for method in METHODS), ratio)
+            table.add_row(name, *(_few_digits(took[method]) for method in METHODS), ratio)
         console.print(table)
         console.print()
         table = make_table("Slowest of all", "Kind", "Number", *METHOD_NAMES.values())
@@ -112,7 +117,7 @@ def _print_worst(console, rows, adversarial):
                 ((name, worst[method]) for name, worst in found),
                 key=lambda named, method=method: named[1].nanoseconds[method],
             )
-            took = (f"{query.nanoseconds[other]:,.0f}" for other in METHODS)
+            took = (_few_digits(query.nanoseconds[other]) for other in METHODS)
             table.add_row(f"{method}: {name}", query.kind.replace("_", "-"), str(query.index), *took)
         console.print(table)
         console.print()
