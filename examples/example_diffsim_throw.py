@@ -200,11 +200,13 @@ class Example:
         return positions.reshape(len(self.states), len(STARTS), -1, 3).mean(axis=2)
 
     def render(self):
-        """Shows the throws as they were before this improvement."""
-        for i in range(0, STEPS + 1, 8):
-            self.viewer.begin_frame((self.iteration * (STEPS + 8) + i) * self.sim_dt)
-            self.viewer.log_state(self.states[i])
-            self.viewer.end_frame()
+        """Shows where the throws have just landed, and the paths that they took."""
+        ends = self.centre_paths()[::8].astype(np.float32)
+        starts, ends = (wp.array(part.reshape(-1, 3), dtype=wp.vec3) for part in (ends[:-1], ends[1:]))
+        self.viewer.begin_frame(float(self.iteration))
+        self.viewer.log_state(self.states[-1])
+        self.viewer.log_lines("/paths", starts, ends, (0.9, 0.5, 0.2))
+        self.viewer.end_frame()
 
     def test_final(self):
         """All throws reach the mark within two centimetres; without the stage none has moved."""

@@ -12,6 +12,7 @@ from newton.viewer import ViewerNull
 FOLDER = Path(__file__).parents[1] / "examples"
 EXAMPLES = sorted(FOLDER.glob("example_*.py"))
 BULLET = FOLDER / "example_cloth_bullet.py"
+THROW = FOLDER / "example_diffsim_throw.py"
 PAPER_SCENES = {
     "twisting": "degrees",
     "funnel": "from the axis",
@@ -77,6 +78,17 @@ def test_bullet_is_stopped(capsys):
     example.test_final()
     example.print_report()
     assert "0 particles of the patch are behind the sheet" in capsys.readouterr().out
+
+
+def test_throw_is_learnt_through_the_stage():
+    first, *_, last = run(THROW, 6).loss_history
+    assert (last < 0.5 * first).all()
+
+
+def test_throw_is_not_learnt_without_stage():
+    example = run(THROW, 3, "--no-ccd")
+    example.test_final()
+    assert np.min(example.loss_history) > 0.999999
 
 
 def test_bullet_passes_without_stage():
