@@ -373,8 +373,7 @@ class Response:
         """Iterates until no constraint acts any more, or long enough."""
 
         def batch():
-            if self._records and not self.device.is_capturing:
-                self._progress.history = self.history.reserve_entries(BATCH * int(self.constraints.count.numpy()[0]))
+            self._reserve_entries(BATCH)
             for _ in range(BATCH):
                 iteration(**options)
 
