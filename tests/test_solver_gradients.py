@@ -325,5 +325,7 @@ def test_a_step_that_was_not_all_taken_down_gives_nan(device):
     Undoing(recording, response).backward(*arrays)
     assert all(np.isfinite(array.numpy()).all() for array in arrays)
     recording.complete.zero_()
+    for name in ("constraint", "multiplier", "reached", "momentum"):  # nothing may be read where nothing is
+        setattr(recording.history, name, getattr(recording.history, name)[:1])
     Undoing(recording, response).backward(*arrays)
     assert all(np.isnan(array.numpy()).all() for array in arrays)

@@ -3,8 +3,7 @@
 A clock that is read before and after a query sees interrupts and waits for memory as well, so that all queries are
 measured a few times, the fewest cycles of each count, and the slowest few dozen are measured once more: each one alone,
 in so many copies that reading the clock, and starting a kernel, no longer matters; the shortest of several launches
-counts, as interrupts are no part of a query. On a GPU the copies fill it, so that
-every warp is full of the same query.
+counts, as interrupts are no part of a query. On a GPU the copies fill it, so that every warp is full of the same query.
 """
 
 from dataclasses import dataclass

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .history import History
+from .kernels.pairs import vertices_of_pair
 from .kernels.queues import is_filled
 from .kernels.signs import FREE
 from .narrow_phase import Count
@@ -127,7 +128,7 @@ class Progress:
 class Contacts:
     """The contacts of one kind of pair, unsorted."""
 
-    edges: int  # 1 where they are of edges
+    edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
@@ -202,16 +203,7 @@ def touch_in(vertices: Vertices, vertex: int, time: wp.float64, kind: int, i: in
 @wp.func
 def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
     """The four vertices of a contact, those of its first element first."""
-    first = contacts.pairs[i][0]
-    second = contacts.pairs[i][1]
-    if contacts.edges == 1:
-        return wp.vec4i(
-            contacts.elements[first, 0],
-            contacts.elements[first, 1],
-            contacts.elements[second, 0],
-            contacts.elements[second, 1],
-        )
-    return wp.vec4i(first, contacts.elements[second, 0], contacts.elements[second, 1], contacts.elements[second, 2])
+    return vertices_of_pair(contacts.edges, contacts.elements, contacts.pairs[i])
 
 
 @wp.func

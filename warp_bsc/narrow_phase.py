@@ -12,6 +12,7 @@ import warp as wp
 
 from . import checker
 from .exact_stage import launch_exact_stage
+from .kernels.batch_culling import BATCH, cull_batch_of, lowest_bit
 from .kernels.classification import classify
 from .kernels.closest import contact_at
 from .kernels.culling import (
@@ -20,7 +21,6 @@ from .kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from .kernels.eights import BATCH, cull_batch_of, lowest_bit
 from .kernels.motion import edge_edge_motion, vertex_face_motion
 from .kernels.polynomials import coplanarity
 from .kernels.queues import append, is_filled, take_slot

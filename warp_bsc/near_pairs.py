@@ -17,6 +17,7 @@ from .constraints import (
     to_double,
 )
 from .kernels.closest import closest_coordinates
+from .kernels.pairs import vertices_of_pair
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.queues import is_filled
 from .narrow_phase import Count
@@ -36,7 +37,7 @@ _KERNEL = {"enable_backward": False}
 class NearPairs:
     """The candidate pairs of one kind."""
 
-    edges: int  # 1 where they are of edges
+    edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
@@ -82,13 +83,7 @@ def collect_near_pairs(
     i = wp.tid()
     if not is_filled(i, near.pairs, near.counts, _NEAR):
         return
-    first = near.pairs[i][0]
-    second = near.pairs[i][1]
-    corners = wp.vec4i(first, near.elements[second, 0], near.elements[second, 1], 0)
-    if near.edges == 1:
-        corners = wp.vec4i(near.elements[first, 0], near.elements[first, 1], corners[1], corners[2])
-    else:
-        corners[3] = near.elements[second, 2]
+    corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
     if wp.min(corners) >= vertices.movable or not is_projecting(progress, vertices.world[corners[0]]):
         return
     if is_slow(vertices, corners, near.edges) == 0:

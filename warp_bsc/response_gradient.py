@@ -108,11 +108,17 @@ def _begin_undoing(
     history: History,
     steer: wp.array[int],
     projections: int,
+    complete: wp.array[int],
     cursor: wp.array[int],
     more: wp.array[int],
     back: wp.array[int],
 ):
     """Puts the cursor behind the last iteration on velocities; ``more`` says of iterations and rounds if there are."""
+    cursor[CURRENT] = -1
+    if complete[0] == 0:  # what is missing cannot be undone, and where it would be there is nothing to read
+        cursor[FIRST] = 0
+        cursor[NEXT] = -1
+        return
     mark = wp.min(steer[ROUND], projections + TRUNCATIONS + 1)
     cursor[MARK] = mark
     cursor[FIRST] = history.iterations[mark + 1]
@@ -379,7 +385,7 @@ class Undoing:
         history, of_vertices = recording.history, self._of_vertices
         inputs = [vertices, gradients, recording.steer, particle_q, particle_qd]
         self._launch(_begin, len(vertices.x0), inputs, [of_vertices.x0])
-        inputs = [history, recording.steer, self._response.projections]
+        inputs = [history, recording.steer, self._response.projections, recording.complete]
         self._launch(_begin_undoing, 1, inputs, [self._cursor, self._more, self._progress.steer])
         self._undo_turn()
         wp.capture_while(self._more_iterations, self._batch, undo=self._undo_acceleration)
