@@ -64,16 +64,20 @@ _SNIPPET = """
         }}
     }};
 
-    // axis boxes, pair by pair: x y z of both ends in one vector
-    const int last = x0.shape[0] - 1;
-    auto load = [last](const void* x, int corner) -> Four {{
-        const {scalar}* from = (const {scalar}*)x + 3 * (size_t)corner;
-        if (corner < last)
+    // positions may be a view: with any number of bytes from one to the next
+    auto position = [](const auto& x, int corner) {{
+        return (const {scalar}*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
+    }};
+
+    // axis boxes, pair by pair: x y z of both ends in one vector, the fourth being the next one's x, if there is one
+    auto load = [&](const auto& x, int corner) -> Four {{
+        const {scalar}* from = position(x, corner);
+        if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof({scalar}))
             return *(const Loaded*)from;
         return Four{{from[0], from[1], from[2], 0}};
     }};
     auto both = [&](int corner) -> Scalars {{
-        return __builtin_shufflevector(load(x0.data, corner), load(x1.data, corner), 0, 1, 2, 3, 4, 5, 6, 7);
+        return __builtin_shufflevector(load(x0, corner), load(x1, corner), 0, 1, 2, 3, 4, 5, 6, 7);
     }};
     int near[{batch} + 8];
     int near_count = 0;
@@ -108,10 +112,10 @@ _SNIPPET = """
                 corners[i][lane] = corner[i];
         }}
         Scalars points[24];
-        auto read = [&](const {scalar}* x, const int* corner, Scalars* to) {{
+        auto read = [&](const auto& x, const int* corner, Scalars* to) {{
             Four at[8], low[3], high[3];
             for (int lane = 0; lane < 8; ++lane) {{
-                const {scalar}* from = x + 3 * (size_t)corner[lane];
+                const {scalar}* from = position(x, corner[lane]);
                 at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
             }}
             auto transpose = [](const Four* at, Four* to) {{
@@ -129,8 +133,8 @@ _SNIPPET = """
                 to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
         }};
         for (int i = 0; i < 4; ++i) {{
-            read((const {scalar}*)x0.data, corners[i], points + 3 * i);
-            read((const {scalar}*)x1.data, corners[i], points + 12 + 3 * i);
+            read(x0, corners[i], points + 3 * i);
+            read(x1, corners[i], points + 12 + 3 * i);
         }}
 
         // Bernstein signs

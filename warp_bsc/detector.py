@@ -13,6 +13,7 @@ from .arrays import checked_coordinates
 from .blocks import BlockBroadPhase
 from .bvh import BvhBroadPhase
 from .collision_arrays import CollisionArrays, put, take
+from .host_function import run_on_host
 from .kernels.crossing import edge_crosses_face
 from .kernels.signs import HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly, roomy
@@ -126,7 +127,8 @@ class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
     They stay on the device until an attribute is asked for, or until the next detection would overwrite them. Those of
-    a detection in a CUDA graph are read anew each time, and say what the detector found last.
+    a detection in a graph are read anew each time: on CUDA they say what the detector found last, on the CPU what the
+    last replay found.
 
     Attributes:
         vertex_face: (vertex, face), int32, shape [n, 2].
@@ -159,12 +161,17 @@ class Collisions:
         self._run = detector._run
         self._growth = detector._growth
         self._read = None
+        self._replayed = None  # on the CPU the results of the last replay
 
     def _results(self):
         """The results by name, from the device if need be."""
         if self._read is not None:
             return self._read
+        if self._replayed is not None:
+            return self._replayed._results()
         if self._clock is None:
+            if self._detector.mesh.device.is_cpu:
+                raise RuntimeError("the graph in which this detection was captured has not been launched")
             if self._growth != self._detector._growth:
                 raise RuntimeError("the detector's queues have grown since this detection was captured: capture again")
             return self._detector._read(None)
@@ -254,11 +261,13 @@ class CollisionDetector:
             ValueError: If the positions have another shape or type, differ in type, or are not finite.
             RuntimeError: If the first detection is captured in a CUDA graph.
         """
-        capturing = self.mesh.device.is_cuda and self.mesh.device.is_capturing
+        capturing = self.mesh.device.is_capturing
         x0 = self._positions(x0, "x0", capturing)
         x1 = self._positions(x1, "x1", capturing)
         if x0.dtype != x1.dtype:
             raise ValueError("x0 and x1 must have the same type")
+        if capturing and self.mesh.device.is_cpu:
+            return self._capture_on_cpu(x0, x1)
         if capturing and self._run == 0:
             raise RuntimeError("detect once before capturing, so that kernels are loaded and queues are large enough")
         if capturing:
@@ -295,6 +304,18 @@ class CollisionDetector:
             else:
                 found = {n.kind: take(n.contacts, n.counts, n.counts.numpy()) for n in self.narrow_phases}
             collisions.arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, found)
+        return collisions
+
+    def _capture_on_cpu(self, x0, x1):
+        """Adds a detection to the graph that the CPU captures."""
+        if x0.requires_grad or x1.requires_grad:
+            raise ValueError("a graph on the CPU cannot capture gradients of collisions: detect outside the graph")
+        collisions = Collisions(self, None)
+
+        def detect():
+            collisions._replayed = self.detect(x0, x1)
+
+        run_on_host(detect, self.mesh.device)
         return collisions
 
     def find_intersections(self, x):
@@ -345,7 +366,7 @@ class CollisionDetector:
                 raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {x.shape}")
             return x
         if capturing or (isinstance(x, wp.array) and x.requires_grad):
-            when = "in a CUDA graph" if capturing else "to have gradients"
+            when = "in a graph" if capturing else "to have gradients"
             raise ValueError(f"{when} {name} must be a Warp array of vec3 or vec3d on {mesh.device}")
         values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
         if len(values) != mesh.vertex_count:

@@ -32,10 +32,16 @@ def _pool():
     return ThreadPoolExecutor(_THREADS)
 
 
-@functools.cache
-def _load(kernel):
-    """Compiles a kernel, which several threads must not try at once."""
-    kernel.module.load("cpu")
+def _may_share(kernel) -> bool:
+    """Whether several threads may run a kernel at once.
+
+    Warp's kernels on a CPU share a pointer to the stack of the thread that set it last, for their tiles. A kernel
+    without tiles does not follow it, once it is optimized.
+    """
+    options = kernel.module.options
+    mode, level = options["mode"] or wp.config.mode, options["optimization_level"]
+    level = wp.config.optimization_level if level is None else level
+    return mode == "release" and level != 0
 
 
 def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=1024):
@@ -43,25 +49,26 @@ def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=
 
     The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
     suit kernels of which few threads work long; a chunk, at least so large, is what a core takes at a time.
+
+    Raises:
+        RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
     """
     if device.is_cuda:
         inputs = [0, *inputs]
         wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim, record_tape=False)
         return
-    threads = _threads.get()
+    if device.is_capturing:
+        raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
+    threads = _threads.get() if _may_share(kernel) else 1
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
-
-    def launch(first):
-        dim = min(chunk, count - first)
-        wp.launch(kernel, dim, inputs=[first, *inputs], outputs=outputs, device=device, record_tape=False)
-
-    starts = range(0, count, chunk)
-    if len(starts) < 2:
-        for first in starts:
-            launch(first)
-    else:
-        _load(kernel)
-        list(_pool().map(launch, starts))
+    # Threads only run what this one has prepared: Warp loads a kernel and packs its arguments for one thread at a time.
+    options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
+    commands = [
+        wp.launch(kernel, min(chunk, count - first), inputs=[first, *inputs], **options)
+        for first in range(0, count, chunk)
+    ]
+    run = map if len(commands) < 2 else _pool().map
+    list(run(wp.Launch.launch, commands))
 
 
 def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs, block_dim=256):

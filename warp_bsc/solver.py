@@ -9,6 +9,7 @@ from newton.solvers import SolverBase
 
 from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
 from .history import GRAZING
+from .host_function import run_on_host
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
 from .response_gradient import Recording, Undoing
@@ -316,37 +317,46 @@ class SolverCCD(SolverBase):
 
     def _respond(self, state_in, state_out, dt, tape):
         """Changes what the inner solver has made of a state; a tape takes down how gradients go back."""
+        device = self.mesh.device
+        particle_q, particle_qd, body_q = state_out.particle_q, state_out.particle_qd, state_out.body_q
+        if tape is None or particle_q is None or not particle_q.requires_grad:
+            run_on_host(lambda: self._resolve(particle_q, particle_qd, body_q, dt), device)
+            return
+        recording = None
+        arrays = [state_in.particle_q, particle_q, particle_qd]
+
+        def record():
+            nonlocal recording
+            self._resolve(particle_q, particle_qd, body_q, dt, records=True)
+            recording = None
+            if device.is_capturing or self._response.vertices.done.numpy().any():
+                recording = Recording(self._response, dt)
+                inputs = [self._response.history.arrays.sizes, recording.complete]
+                wp.launch(_count_recording, 1, inputs=inputs, outputs=[self._totals], device=device)
+
+        def go_back():
+            if recording is not None:
+                Undoing(recording, self._response).backward(*(array.grad for array in arrays))
+
+        run_on_host(record, device)
+        tape.record_func(lambda: run_on_host(go_back, device), arrays)
+
+    def _resolve(self, particle_q, particle_qd, body_q, dt, *, records=False):
+        """Resolves the motion from where the step started to these positions, and changes them."""
         response, device = self._response, self.mesh.device
         vertices = response.vertices
-        records = tape is not None and state_out.particle_q is not None and state_out.particle_q.requires_grad
         self._lap(start=True)
-        response.end(state_out.particle_q, state_out.body_q)
-        inputs = [state_out.particle_qd, vertices.x0, vertices.x1, dt]
+        response.end(particle_q, body_q)
+        inputs = [particle_qd, vertices.x0, vertices.x1, dt]
         wp.launch(_start_velocities, len(vertices.x0), inputs=inputs, outputs=[vertices.velocity], device=device)
         response.resolve(dt, records=records)
         self._fallbacks.zero_()
         inputs = [vertices.done, vertices.x1, vertices.velocity]
-        outputs = [state_out.particle_q, state_out.particle_qd, self._fallbacks]
+        outputs = [particle_q, particle_qd, self._fallbacks]
         wp.launch(_write_back, self.model.particle_count, inputs=inputs, outputs=outputs, device=device)
         inputs, outputs = [response.steer, self._fallbacks], [self._totals]
         wp.launch(_count_step, 1, inputs=inputs, outputs=outputs, device=device)
         self._lap(start=False)
-        if records:
-            self._record(tape, state_in, state_out, dt)
-
-    def _record(self, tape, state_in, state_out, dt):
-        """Lets the tape carry gradients back through the response to this step, if it has changed anything."""
-        if not (self.mesh.device.is_capturing or self._response.vertices.done.numpy().any()):
-            return
-        recording = Recording(self._response, dt)
-        arrays = [state_in.particle_q, state_out.particle_q, state_out.particle_qd]
-
-        def backward():
-            Undoing(recording, self._response).backward(*(array.grad for array in arrays))
-
-        tape.record_func(backward, arrays)
-        inputs = [self._response.history.arrays.sizes, recording.complete]
-        wp.launch(_count_recording, 1, inputs=inputs, outputs=[self._totals], device=self.mesh.device)
 
     def _lap(self, *, start):
         device = self.mesh.device
