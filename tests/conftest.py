@@ -5,11 +5,26 @@ import os
 import hypothesis
 import pytest
 import warp as wp
+from guarded_memory import guard_memory
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
 hypothesis.settings.load_profile("repeatable")
+
+
+def pytest_addoption(parser):
+    """Adds the options that look for access out of bounds."""
+    parser.addoption("--guard-memory", action="store_true", help="crash on access out of bounds of an array on the CPU")
+    parser.addoption("--warp-debug", action="store_true", help="run all kernels in Warp's debug mode, which asserts")
+
+
+def pytest_configure(config):
+    """Sets what must be set before any kernel is loaded or array made."""
+    if config.getoption("--guard-memory"):
+        guard_memory()
+    if config.getoption("--warp-debug"):
+        wp.config.mode = "debug"
 
 
 @pytest.fixture(scope="session", autouse=True)
