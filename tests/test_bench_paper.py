@@ -142,6 +142,7 @@ def test_worst_query_is_one_of_those_asked():
     queries, _ = bench_paper._gather(intervals, wp.get_device("cpu"), 2000)
     with one_core():
         worst = find_worst(queries["edge_edge"], wp.get_device("cpu"), repeat=1)
+    assert list(worst) == list(METHODS)
     for method, query in worst.items():
         assert query.method == method
         assert np.array_equal(query.points, queries["edge_edge"].points([query.index])[0])

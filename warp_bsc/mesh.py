@@ -27,7 +27,7 @@ class CollisionMesh:
         """Finds the edges and puts the mesh on a device.
 
         Args:
-            faces: Vertex indices, integers, shape [face_count, 3], NumPy or Warp array.
+            faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array: what is
                 in different worlds does not collide. Default: all are in one.
@@ -43,6 +43,8 @@ class CollisionMesh:
             faces = np.empty((0, 3), np.int32)
         if faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"faces must have shape (n, 3), not {faces.shape}")
+        if len(faces) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
+            raise ValueError(f"a mesh must have less than 2^28 faces, not {len(faces)}")
         if not np.issubdtype(faces.dtype, np.integer):
             raise ValueError(f"faces must be integers, not {faces.dtype}")
         if not isinstance(vertex_count, Integral) or not 0 <= vertex_count < 2**31:
