@@ -13,6 +13,7 @@ import newton
 import newton.examples
 import numpy as np
 import warp as wp
+from common import main
 
 import warp_bsc as bsc
 
@@ -164,7 +165,4 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = newton.examples.init(Example.create_parser())
-    example = Example(viewer, args)
-    newton.examples.run(example, args)
-    example.print_report()
+    main(Example)

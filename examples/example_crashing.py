@@ -14,6 +14,7 @@ import math
 import newton
 import numpy as np
 import warp as wp
+from common import main
 from paper_scene import PaperScene, add_collider
 
 LENGTH, HALF_WIDTH, FLOOR = 4.2, 0.86, 0.25  # m
@@ -208,4 +209,4 @@ def add_shell(builder, vertices, tets):
 
 
 if __name__ == "__main__":
-    Example.main()
+    main(Example)

@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 import warp as wp
+from common import main
 from mannequin import FLATNESS, WAIST_HEIGHT, WAIST_RADIUS, add_mannequin, dance
 from paper_scene import PaperScene, add_cloth, grid_faces
 
@@ -64,4 +65,4 @@ class Example(PaperScene):
 
 
 if __name__ == "__main__":
-    Example.main()
+    main(Example)

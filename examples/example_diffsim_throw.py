@@ -17,6 +17,7 @@ import newton.examples
 import numpy as np
 import warp as wp
 import warp.optim
+from common import main
 
 import warp_bsc as bsc
 
@@ -218,6 +219,12 @@ class Example:
             assert self.distance.min() > 1.0, self.distance
             assert np.ptp(self.loss_history, axis=0).max() < 1e-6, self.loss_history
 
+    def print_report(self):
+        """Prints what the stage did, and how near the throws came."""
+        if self.ccd:
+            print(self.solver.report)
+        print(f"the throws land {', '.join(f'{distance:.3f}' for distance in self.distance)} m from the mark")
+
     @staticmethod
     def create_parser():
         """The options."""
@@ -230,5 +237,4 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = newton.examples.init(Example.create_parser())
-    newton.examples.run(Example(viewer, args), args)
+    main(Example)

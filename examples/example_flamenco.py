@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 import warp as wp
+from common import main
 from mannequin import FLATNESS, WAIST_HEIGHT, WAIST_RADIUS, add_mannequin, dance
 from paper_scene import PaperScene, add_cloth, grid_faces
 
@@ -104,4 +105,4 @@ def revolve(height, offset, columns):
 
 
 if __name__ == "__main__":
-    Example.main()
+    main(Example)

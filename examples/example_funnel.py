@@ -9,6 +9,7 @@ The fourth benchmark of the paper. Nothing but the stage keeps the cloth in the 
 
 import numpy as np
 import warp as wp
+from common import main
 from paper_scene import PaperScene, add_collider, add_square_cloth, grid_faces
 
 SIZE = 1.0  # m, of the cloth
@@ -57,4 +58,4 @@ class Example(PaperScene):
 
 
 if __name__ == "__main__":
-    Example.main()
+    main(Example)

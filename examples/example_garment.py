@@ -15,6 +15,7 @@ import newton.examples
 import newton.usd
 import numpy as np
 import warp as wp
+from common import main
 from pxr import Usd
 
 import warp_bsc as bsc
@@ -200,7 +201,4 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = newton.examples.init(Example.create_parser())
-    example = Example(viewer, args)
-    newton.examples.run(example, args)
-    example.print_report()
+    main(Example)

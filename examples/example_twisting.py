@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 import warp as wp
+from common import main
 from paper_scene import PaperScene, add_collider, add_square_cloth, lathe
 
 SIZE = 2.3  # m, of the cloth
@@ -79,4 +80,4 @@ class Example(PaperScene):
 
 
 if __name__ == "__main__":
-    Example.main()
+    main(Example)

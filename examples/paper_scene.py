@@ -249,14 +249,6 @@ class PaperScene:
         )
         return parser
 
-    @classmethod
-    def main(cls):
-        """Runs the scene as the command line asks."""
-        viewer, args = newton.examples.init(cls.create_parser())
-        example = cls(viewer, args)
-        newton.examples.run(example, args)
-        example.print_report()
-
 
 def add_collider(builder, body, vertices, faces, friction):
     """Adds a rigid mesh, which recordings contain as the triangles that they are.

@@ -1,11 +1,13 @@
 """Scenes of the benchmarks: files are read as they are, and generated ones are what they say."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
 from warp_bsc import CollisionDetector, CollisionMesh
-from warp_bsc.bench_scenes import GENERATORS, BenchmarkScene, default_scenes, load_scene
+from warp_bsc.bench_scenes import GENERATORS, default_scenes, load_scene
 
 FACES = np.array([[0, 1, 2], [3, 4, 5]])
 FLOOR = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
@@ -94,5 +96,9 @@ def test_crash_grows_by_nothing_but_triangles():
 
 
 def test_default_scenes():
-    for name in default_scenes():
-        assert isinstance(load_scene(name), BenchmarkScene)
+    of_checkout, *generated = default_scenes()
+    assert Path(of_checkout) == Path(__file__).parents[1] / "assets" / "cloth_twist.usd"
+    assert generated == ["cloth:5000", "cloth:50000"]
+    for name in (of_checkout, *generated):
+        scene = load_scene(name)
+        assert len(scene.faces) >= 1000 and (scene.x0 != scene.x1).any()

@@ -1,6 +1,7 @@
 """The command line: what it prints, and the status it exits with."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -324,6 +325,45 @@ def test_interrupt(capsys, monkeypatch, falling_scene):
     monkeypatch.setattr(replay_command, "Scene", interrupt)
     assert main(["replay", falling_scene]) == 130
     assert capsys.readouterr().err == "warp-bsc: interrupted\n"
+
+
+def run_into(output, errors, *arguments):
+    """The exit status of the program, whose output is buffered, as it is by default, and goes into files."""
+    command = [sys.executable, "-m", "warp_bsc", *map(str, arguments)]
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    return subprocess.run(command, stdout=output, stderr=errors, env=environment, check=False).returncode
+
+
+@pytest.fixture
+def unread():
+    """The end of a pipe to write to, the other being closed, as after ``| head -1``."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "wb") as pipe:
+        yield pipe
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]], ids=["table", "json"])
+@pytest.mark.parametrize("command", ["query", "replay"])
+def test_nobody_reads_the_output(tmp_path, safe_scene, unread, command, options):
+    path = write_queries(tmp_path) if command == "query" else safe_scene
+    with open(tmp_path / "errors", "wb") as errors:
+        assert run_into(unread, errors, command, path, "--device", "cpu", *options) == 141
+    assert (tmp_path / "errors").read_bytes() == b""
+
+
+def test_nobody_reads_the_error(unread):
+    assert run_into(None, unread, "query", "gone.csv") == 141
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark.parametrize("options", [[], ["--json"]], ids=["table", "json"])
+def test_no_room_for_the_output(tmp_path, options):
+    path = write_queries(tmp_path)
+    with open("/dev/full", "wb") as full, open(tmp_path / "errors", "wb") as errors:
+        assert run_into(full, errors, "query", path, "--device", "cpu", *options) == 2
+    (line,) = (tmp_path / "errors").read_text().splitlines()
+    assert line.startswith("warp-bsc: error: ")
 
 
 @pytest.mark.parametrize("program", [[Path(sys.executable).with_name("warp-bsc")], [sys.executable, "-m", "warp_bsc"]])

@@ -202,11 +202,23 @@ def test_bad_meshes_are_refused():
         ([[0, 1, -1]], "face 0"),
         ([[0, 1]], r"shape \(n, 3\)"),
         ([[0.0, 1.0, 2.0]], "integers"),
+        ([[0, 1, 2**32]], "face 0"),
+        (np.zeros((0, 4), int), r"shape \(n, 3\)"),
+        (np.zeros((3, 0), int), r"shape \(n, 3\)"),
+        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 faces"),
     ]:
         with pytest.raises(ValueError, match=message):
             bsc.CollisionMesh(faces, 4)
-    with pytest.raises(ValueError, match="vertex_count"):
-        bsc.CollisionMesh([[0, 1, 2]], -1)
+    for vertex_count in (-1, 2**31, 6.5, 6.0, np.nan, "6", None):
+        with pytest.raises(ValueError, match=f"vertex_count must be an integer .* not {vertex_count!r}"):
+            bsc.CollisionMesh([[0, 1, 2]], vertex_count)
+
+
+def test_meshes_of_any_integers_are_taken():
+    for faces in ([], np.zeros((0, 3), int), wp.zeros((0, 3), dtype=int)):
+        assert bsc.CollisionMesh(faces, np.int64(6)).faces.shape == (0, 3)
+    for faces in (np.array([[0, 1, 2]], np.uint8), wp.array([[0, 1, 2]], dtype=wp.vec3i)):
+        assert bsc.CollisionMesh(faces, np.uint8(3)).faces.tolist() == [[0, 1, 2]]
 
 
 def test_bad_positions_are_refused():
@@ -228,6 +240,32 @@ def test_bad_positions_are_refused():
         detector.find_intersections(bad)
     with pytest.raises(ValueError, match="method"):
         bsc.CollisionDetector(detector.mesh, method="fast")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("on_device", [False, True])
+def test_vertices_that_no_face_uses_take_no_part(value, on_device, broad_phase):
+    """Wherever they are, if anywhere; where one that takes part is not finite, it is named, and not they."""
+    x0, x1, faces = crumpled(0)
+    expected = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0))).detect(x0, x1)
+    crossing = bsc.CollisionDetector(expected._detector.mesh).find_intersections(x0)
+    assert len(expected.vertex_face) and len(expected.edge_edge)
+    x0, x1 = (np.concatenate([[[value] * 3], x, [[0.0, value, -value]]]).astype(np.float32) for x in (x0, x1))
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces + 1, len(x0)))
+
+    def positions(x):
+        return wp.array(x, dtype=wp.vec3) if on_device else x
+
+    c = detector.detect(positions(x0), positions(x1))
+    assert c.certified
+    np.testing.assert_array_equal(c.vertex_face, expected.vertex_face + np.array([1, 0]))
+    np.testing.assert_array_equal(c.edge_edge, expected.edge_edge)
+    np.testing.assert_array_equal(detector.find_intersections(positions(x0)), crossing)
+    x1[7] = np.nan
+    with pytest.raises(ValueError, match=r"x1\[7\]"):
+        detector.detect(positions(x0), positions(x1))
+    with pytest.raises(ValueError, match=r"x\[7\]"):
+        detector.find_intersections(positions(x1))
 
 
 def crumpled(seed, n=24):
@@ -480,7 +518,25 @@ def test_bad_worlds_are_refused():
     for world, message in [
         ([0, 0, 1], r"face 0 has vertices in worlds \[0, 0, 1\]"),
         ([0, 0], "3 integers"),
-        ([0, -1, 0], "vertex 1"),
+        ([0, -1, 0], "vertex 1 is in world -1"),
+        ([0, 0, 2**31], f"vertex 2 is in world {2**31}"),
+        (np.full(3, 2**32), f"vertex 0 is in world {2**32}"),
+        (np.full(3, 2**64 - 1, np.uint64), f"vertex 0 is in world {2**64 - 1}"),
+        (wp.full(3, 2**31, dtype=wp.int64), f"vertex 0 is in world {2**31}"),
+        ([0.0, 0.0, 0.0], "3 integers"),
     ]:
         with pytest.raises(ValueError, match=message):
             bsc.CollisionMesh([[0, 1, 2]], 3, world=world)
+
+
+def test_worlds_of_any_number_are_kept_apart(broad_phase):
+    """One triangle falls through another in world 0 and in the last world that there may be, and not across."""
+    faces = np.arange(12).reshape(4, 3)
+    low, high = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[1, 1, 1], [2, 1, 2], [1, 2, 2]])
+    x0 = np.concatenate([low, high, low, high]).astype(np.float32)
+    x1 = x0.copy()
+    x1[[3, 4, 5, 9, 10, 11], 2] -= 4.0
+    for last in (1, 2**16, 2**31 - 1):
+        world = np.repeat([0, last], 6)
+        c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 12, world=wp.array(world, dtype=wp.int64))).detect(x0, x1)
+        assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0], [9, 2], [10, 2], [11, 2]]

@@ -1,9 +1,16 @@
 """The examples: all start, keep the promise of the stage for some frames, and say how to use them."""
 
+import argparse
 import importlib.util
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
+import common
 import newton
+import newton.examples
 import numpy as np
 import pytest
 import warp as wp
@@ -21,6 +28,7 @@ PAPER_SCENES = {
     "crashing": "length",
 }
 """What each of them complains of at first."""
+PRINTED = re.findall(r"^python examples/(example_\w+)\.py", (FOLDER.parent / "README.md").read_text(), re.MULTILINE)
 FRAMES = 3
 COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
 COMPARED += ["tet_indices", "tet_poses", "tet_materials"]
@@ -63,6 +71,83 @@ def test_first_frames(path):
     report = run(path, FRAMES).solver.report
     assert report.steps >= FRAMES
     assert report.uncertified_steps == 0
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_printed_commands_run_without_a_window_and_without_a_browser(tmp_path, name):
+    for missing in ("pyglet", "viser"):
+        (tmp_path / f"{missing}.py").write_text("raise ImportError")
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment["PYTHONPATH"] = str(tmp_path)
+    command = [sys.executable, FOLDER / f"{name}.py", "--num-frames", "1", "--quiet"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said, *_, report = [line for line in done.stdout.splitlines() if not line.startswith(("Warp", " ", "Module"))]
+    assert said.startswith("No window (") and said.endswith(
+        ", and no viser for a browser: simulating 1 frames without."
+    )
+    assert "Simulating" in done.stderr
+    assert re.search(r"\d", report)
+
+
+def test_commands_are_printed():
+    assert len(PRINTED) >= 4
+
+
+class Browser:
+    """What :func:`common.open_viewer` needs of Newton's viewer in a browser."""
+
+    url = "http://localhost:8080"
+
+    def __init__(self, **options):
+        self.options = options
+
+
+@pytest.mark.parametrize(("option", "viewer"), [("--paused", Browser), ("--test", common.ViewerProgress)])
+def test_browser_where_there_is_no_window(monkeypatch, capsys, option, viewer):
+    """Only from this machine, and not for what nobody looks at, as a browser has no end."""
+    monkeypatch.setitem(sys.modules, "pyglet", None)
+    monkeypatch.setattr(common, "ViewerViser", Browser)
+    monkeypatch.setattr(sys, "argv", ["example", option])
+    opened, args = common.open_viewer(newton.examples.create_parser())
+    assert isinstance(opened, viewer)
+    assert getattr(args, option[2:]) is True
+    if viewer is Browser:
+        assert opened.options == {"host": "localhost", "paused": True, "verbose": False}
+        assert "open http://localhost:8080 in a browser" in capsys.readouterr().out
+
+
+def test_viewers_that_are_asked_for_are_not_replaced(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyglet", None)
+    monkeypatch.setattr(sys, "argv", ["example", "--viewer", "gl"])
+    with pytest.raises(Exception, match="pyglet"):
+        common.open_viewer(newton.examples.create_parser())
+    monkeypatch.setattr(sys, "argv", ["example", "--viewer", "null"])
+    opened, _ = common.open_viewer(newton.examples.create_parser())
+    assert type(opened) is ViewerNull
+
+
+def test_interrupted_browser_ends_in_the_report(monkeypatch, capsys):
+    def interrupt(example, args):
+        raise KeyboardInterrupt
+
+    class Example:
+        create_parser = staticmethod(argparse.ArgumentParser)
+
+        def __init__(self, viewer, args):
+            pass
+
+        def print_report(self):
+            print("all is well")
+
+    monkeypatch.setattr(newton.examples, "run", interrupt)
+    monkeypatch.setattr(common, "ViewerViser", Browser)
+    monkeypatch.setattr(common, "open_viewer", lambda parser: (Browser(), None))
+    common.main(Example)
+    assert capsys.readouterr().out == "all is well\n"
+    monkeypatch.setattr(common, "open_viewer", lambda parser: (None, None))
+    with pytest.raises(KeyboardInterrupt):
+        common.main(Example)
 
 
 @each_example

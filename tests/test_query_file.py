@@ -13,7 +13,7 @@ ROW = "1,2,-3,4,5,1"
 
 def write(folder, *lines, name="some_vf.csv"):
     path = folder / name
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
@@ -107,18 +107,28 @@ def test_kind_given(tmp_path):
         ([ROW] * 6 + ["1,2,3,4,5.0,1"] + [ROW], ":7: not integers"),
         ([ROW] * 6 + [""] + [ROW], ":7: not integers"),
         (["x,y,z,x,y,z"] + [ROW] * 8, ":1: not integers"),
+        ([ROW, "1_0,2,-3,4,5,1"] + [ROW] * 6, ":2: not integers"),
+        ([ROW, " 1,2,-3,4,5,1"] + [ROW] * 6, ":2: not integers"),
+        ([ROW, "1,2,-3,4,5,1 "] + [ROW] * 6, ":2: not integers"),
+        ([ROW] * 7 + ["1,2,-3,4,5,1 "], ":8: not integers"),
+        ([ROW, "+1,2,-3,4,5,1"] + [ROW] * 6, ":2: not integers"),
+        ([ROW, "1,2,-3,4,5,\u0661"] + [ROW] * 6, ":2: not integers"),
+        ([ROW + "\f" + ROW] + [ROW] * 6, ":1: 11 columns"),
+        ([ROW, f"1,2,-3,4,5,{'0' * 4300}1"] + [ROW] * 6, ":2: an integer of more than 4300 digits"),
         (["1,2,3"] * 8, ":1: 3 columns"),
         ([ROW] * 4 + [ROW + ",1"] * 4, ":5: 7 columns, but 6"),
         ([ROW] * 7 + ["1,2,3,4,1,3"], ":8: z is not exactly a double: 1/3"),
         ([ROW] * 7 + [f"{2**53 + 1},1,3,4,1,2"], ":8: x is not exactly a double"),
         ([ROW] * 7 + [f"1,{2**1080},3,4,1,2"], ":8: x is not exactly a double"),
-        ([ROW] * 7 + [f"{2**1080},1,3,4,1,2"], ":8: x is larger than any double"),
+        ([ROW] * 7 + [f"{2**1080},1,3,4,1,2"], ":8: x is larger than any double: 129"),
         ([ROW + ",1"] * 12 + [ROW + ",0"] * 4, ":13: the true answer must be 0 or 1, and the same"),
         ([ROW + ",2"] * 8, ":1: the true answer must be 0 or 1"),
     ],
 )
 def test_broken_file(tmp_path, lines, message):
-    assert error_of(write(tmp_path, *lines)).startswith(message)
+    error = error_of(write(tmp_path, *lines))
+    assert error.startswith(message)
+    assert len(error) < 200
 
 
 def test_file_that_is_not_text(tmp_path):
@@ -129,7 +139,13 @@ def test_file_that_is_not_text(tmp_path):
 
 @pytest.mark.parametrize(
     ("truth", "message"),
-    [("[true]", "1 true answers for the 2 queries"), ("[0, 1]", "not a list of true and false"), ("[tru", "not JSON")],
+    [
+        ("[true]", "1 true answers for the 2 queries"),
+        ("[0, 1]", "not a list of true and false"),
+        (f"[{'9' * 5000}, true]", "not a list of true and false"),
+        ("[tru", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+    ],
 )
 def test_broken_truth_beside(tmp_path, truth, message):
     path = write(tmp_path, *[ROW] * 16)
@@ -140,10 +156,20 @@ def test_broken_truth_beside(tmp_path, truth, message):
     assert str(error.value).startswith(str(truth_path))
 
 
+def test_true_answers_in_both_places(tmp_path):
+    path = write(tmp_path, *[ROW + ",1"] * 8, *[ROW + ",0"] * 8)
+    truth_path = tmp_path / "some_vf_mma_bool.json"
+    truth_path.write_text("[true, false]")
+    assert read_query_file(path).truth.tolist() == [True, False]
+    truth_path.write_text("[true, true]")
+    assert error_of(path) == f":9: the true answer is 0, but 1 in {truth_path}"
+
+
 def test_find_files_of_folder(tmp_path):
     (tmp_path / "b/edge-edge").mkdir(parents=True)
     paths = [write(tmp_path, ROW, name=name) for name in ("a.csv", "b/edge-edge/c.csv")]
     (tmp_path / "a_mma_bool.json").write_text(json.dumps([]))
+    (tmp_path / "folder_vf.csv").mkdir()
     assert find_query_files([tmp_path]) == paths
     assert find_query_files(reversed(paths)) == paths[::-1]
 

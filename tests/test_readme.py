@@ -66,7 +66,8 @@ def test_continuous_integration_runs_the_command_of_the_readme():
 
 
 def test_files_that_the_readme_names_exist():
-    for name in re.findall(r"`((?:kernels|warp_bsc|assets|examples)/[\w./]+)`", README) + re.findall(
-        r"\]\((\w[\w./]+)\)", README
-    ):
+    quoted = re.findall(r"`((?:kernels|warp_bsc|assets|examples)/[\w./]+)`", README)
+    linked = re.findall(r"\]\((\w[\w./]+)\)", README)
+    assert len(quoted) > 5 and len(linked) > 5
+    for name in quoted + linked:
         assert (ROOT / name).exists(), name

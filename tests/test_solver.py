@@ -333,6 +333,9 @@ def test_the_inner_solver_is_asked_for_the_rest(device):
         ({"separation": 0.0}, "separation"),
         ({"separation": np.nan}, "separation"),
         ({"friction": -1.0}, "friction"),
+        ({"friction": 1e39}, "friction"),
+        ({"friction": np.nan}, "friction"),
+        ({"restitution": np.nan}, "restitution"),
         ({"restitution": 1.5}, "restitution"),
     ],
 )
@@ -340,6 +343,21 @@ def test_numbers_out_of_range_are_refused(options, message, device):
     model = bullet(10.0, device=device)
     with pytest.raises(ValueError, match=message):
         bsc.SolverCCD(SOLVERS["xpbd"](model), **options)
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_friction_of_shapes_out_of_range_is_refused(plane, device):
+    builder = newton.ModelBuilder()
+    slippery = newton.ModelBuilder.ShapeConfig(mu=-1.0)
+    for collides in (False, True):
+        slippery.has_particle_collision = collides
+        if plane:
+            builder.add_ground_plane(cfg=slippery)
+        else:
+            builder.add_shape_sphere(-1, radius=0.1, cfg=slippery)
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.2))
+    with pytest.raises(ValueError, match=r"shape 1 .* has friction -1\.0"):
+        bsc.SolverCCD(newton.solvers.SolverXPBD(builder.finalize(device=device)))
 
 
 def test_a_frame_in_a_graph_is_the_frame_without(device):

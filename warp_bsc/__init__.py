@@ -1,13 +1,28 @@
 """Continuous collision detection for deforming triangle meshes: no missed collision, no dropped pair."""
 
 import importlib
+import importlib.util
+import sys
 from pathlib import Path
 
-if not (Path(__file__).parent / "kernels").is_dir():
-    # in a checkout the device code stands beside this package, not in it
-    __path__.append(str(Path(__file__).parents[1]))
-
 __version__ = "0.1.0"
+
+_KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
+"""The device code, which in a checkout stands beside this package, not in it."""
+
+
+class _KernelsFinder:
+    """Finds the device code in a checkout, and nothing else of what stands beside this package."""
+
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == f"{__name__}.kernels":
+            return importlib.util.spec_from_file_location(name, _KERNELS)
+        return None
+
+
+if not (Path(__file__).parent / "kernels").is_dir():
+    sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
     "CollisionArrays": "collision_arrays",

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import warp as wp
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .bench_figure import draw_paper_benchmarks
@@ -14,6 +13,7 @@ from .bench_peers import has_peers
 from .bench_report import paper_benchmarks_to_dict, print_paper_benchmarks
 from .bench_scenes import PAPER_SCENES, load_intervals, paper_scenes
 from .output_file import OutputFile
+from .tables import Console
 
 __all__ = ["add_paper_options", "run_paper_benchmarks"]
 

@@ -257,6 +257,7 @@ class BlockBroadPhase:
 
     def __init__(self, mesh, count):
         """Makes room for trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
+        self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
         self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world)
         self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
         self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world)
@@ -280,7 +281,7 @@ class BlockBroadPhase:
                 has moved.
             changed: Nonzero for each vertex that pairs are wanted of, array of int; None for all pairs.
         """
-        _build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
+        self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge)
 
@@ -297,20 +298,19 @@ class BlockBroadPhase:
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
         """
-        _build([self._edges, self._faces], x, x, False)
+        self._build([self._edges, self._faces], x, x, False)
         self._edges.pair(self._faces, counts, pairs)
 
+    def _build(self, trees, x0, x1, refit, changed=None):
+        """Builds trees for a motion, sorted on one grid around all that is used of it, or refits them."""
+        if not refit:
+            _sort(trees, x0, x1, self._used)
+        for tree in trees:
+            tree.fit(x0, x1, changed)
 
-def _build(trees, x0, x1, refit, changed=None):
-    """Builds trees for a motion, sorted on one grid around all of it, or refits them."""
-    if not refit:
-        _sort(trees, x0, x1)
-    for tree in trees:
-        tree.fit(x0, x1, changed)
 
-
-def _sort(trees, x0, x1):
-    ends = x0.numpy(), x1.numpy()
+def _sort(trees, x0, x1, used):
+    ends = x0.numpy()[used], x1.numpy()[used]
     low = np.array([min(x[:, axis].min(initial=np.inf) for x in ends) for axis in range(3)])
     high = np.array([max(x[:, axis].max(initial=-np.inf) for x in ends) for axis in range(3)])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):

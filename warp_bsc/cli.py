@@ -1,6 +1,7 @@
 """The command line, ``warp-bsc``."""
 
 import argparse
+import functools
 import importlib.util
 import json
 import os
@@ -11,7 +12,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import warp as wp
-from rich.console import Console
 from rich.progress import track
 
 from . import __version__
@@ -34,19 +34,31 @@ from .report import (
     queries_to_dict,
     query_benchmarks_to_dict,
 )
+from .tables import Console
 
 __all__ = ["main"]
 
-_EXIT_STATUS = """\
+_BROKEN_PIPE = 141
+"""What a shell makes of the end by SIGPIPE."""
+
+_CUT_SHORT = """\
+  130  interrupted
+  141  nobody reads the output, as after | head -1"""
+
+_STATUS = """\
 exit status:
   0  done, whether or not anything collides
   1  collisions found, with --fail-on-collision
   2  wrong use or bad input; a line on standard error says what and where"""
 
+_EXIT_STATUS = f"""\
+{_STATUS}
+{_CUT_SHORT}"""
+
 _REPLAY_EXIT_STATUS = f"""\
-{_EXIT_STATUS}
+{_STATUS}
   3  --validate found an answer that is wrong
-  130  interrupted"""
+{_CUT_SHORT}"""
 
 _EXAMPLES = f"""\
 examples:
@@ -95,10 +107,11 @@ examples:
 
 {_EXIT_STATUS}"""
 
-_BENCH_EXIT_STATUS = """\
+_BENCH_EXIT_STATUS = f"""\
 exit status:
   0  done
-  2  wrong use or bad input; a line on standard error says what and where"""
+  2  wrong use or bad input; a line on standard error says what and where
+{_CUT_SHORT}"""
 
 _BENCH = """\
 Measure how long things take. Without a benchmark's name: the paper's five
@@ -173,6 +186,26 @@ class _Parser(argparse.ArgumentParser):
         raise ValueError(f"{message}; see {self.prog} --help")
 
 
+def _ends_with_its_output(main):
+    """Lets a program end where its output does: without a word where nobody reads on, as Unix programs do."""
+
+    @functools.wraps(main)
+    def main_and_flush(argv: list[str] | None = None) -> int:
+        try:
+            try:
+                return main(argv)
+            finally:
+                print(end="", flush=True)
+        except OSError as error:
+            with open(os.devnull, "w") as nowhere:  # for what is left, which Python would try to write at exit
+                for output in (1, 2):
+                    os.dup2(nowhere.fileno(), output)
+            return _BROKEN_PIPE if isinstance(error, BrokenPipeError) else 2
+
+    return main_and_flush
+
+
+@_ends_with_its_output
 def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -184,7 +217,11 @@ def main(argv: list[str] | None = None) -> int:
     """
     try:
         arguments = _build_parser().parse_args(_with_benchmark(sys.argv[1:] if argv is None else argv))
-        return arguments.run(arguments)
+        status = arguments.run(arguments)
+        print(end="", flush=True)  # what there is no room for is an error, too
+        return status
+    except BrokenPipeError:
+        raise
     except (OSError, ValueError) as error:
         message = " ".join(str(error).split())
         print(f"warp-bsc: error: {message}", file=sys.stderr)

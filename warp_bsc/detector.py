@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from . import checker
-from .arrays import checked_coordinates
+from .arrays import check_finite, checked_shape
 from .blocks import BlockBroadPhase
 from .bvh import BvhBroadPhase
 from .collision_arrays import CollisionArrays, put, take
@@ -36,8 +36,10 @@ def _kernels(dtype):
     """The kernels for one type of position, each in a module of its own."""
 
     @wp.kernel(enable_backward=False, module="unique")
-    def count_not_finite(x0: wp.array[dtype], x1: wp.array[dtype], counts: wp.array[wp.int64]):
+    def count_not_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertices: wp.array[int], counts: wp.array[wp.int64]):
         vertex = wp.tid()
+        if vertices:
+            vertex = vertices[vertex]
         if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
             wp.atomic_add(counts, _NOT_FINITE, wp.int64(1))
 
@@ -250,8 +252,8 @@ class CollisionDetector:
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
-                array. They are taken as exact. In a CUDA graph, or if it requires gradients, a Warp array of vec3 or
-                vec3d on the mesh's device.
+                array. They are taken as exact; those of vertices that no face uses are not looked at. In a CUDA graph,
+                or if it requires gradients, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
 
         Returns:
@@ -289,7 +291,7 @@ class CollisionDetector:
             counts = self.counts.numpy()
             if counts[_NOT_FINITE]:
                 for name, x in (("x0", x0), ("x1", x1)):
-                    checked_coordinates(x.numpy(), (3,), name)
+                    check_finite(x.numpy(), name, self.mesh.vertices)
             if not self._overflowed(counts):
                 break
             self._grow(counts)
@@ -322,7 +324,8 @@ class CollisionDetector:
         """Finds the edges that meet faces in one configuration, exactly.
 
         Args:
-            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
+            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
+                vertices that no face uses are not looked at.
 
         Returns:
             (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in
@@ -332,8 +335,8 @@ class CollisionDetector:
             ValueError: If the positions have another shape or type, or are not finite.
         """
         x = self._positions(x, "x", False)
-        checked_coordinates(x.numpy(), (3,), "x")
         mesh = self.mesh
+        check_finite(x.numpy(), "x", mesh.vertices)
         candidates = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         counts = wp.zeros(1 + len(Count), dtype=wp.int64, device=mesh.device)
         broad_phase = _broad_phase(mesh, counts[:1])
@@ -368,7 +371,7 @@ class CollisionDetector:
         if capturing or (isinstance(x, wp.array) and x.requires_grad):
             when = "in a graph" if capturing else "to have gradients"
             raise ValueError(f"{when} {name} must be a Warp array of vec3 or vec3d on {mesh.device}")
-        values = checked_coordinates(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
+        values = checked_shape(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
         if len(values) != mesh.vertex_count:
             raise ValueError(f"{name} must have {mesh.vertex_count} rows, one a vertex, got {len(values)}")
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
@@ -385,7 +388,7 @@ class CollisionDetector:
         self._broad_phase.pair_elements(x0, x1, vertex_face.counts, vertex_face.near, edge_edge.counts, edge_edge.near)
         options = {"method": self.method, "tolerance": self.tolerance}
         if clock:
-            self._count_not_finite(x0, x1)
+            self._count_not_finite(x0, x1, mesh.device_vertices)
             clock.lap("broad phase")
             vertex_face.run(x0, x1, mesh.device_faces, **options, lap=clock.lap)
             edge_edge.run(x0, x1, mesh.device_edges, **options, lap=clock.lap)
@@ -394,7 +397,7 @@ class CollisionDetector:
             clock.lap("sort")
             return
         with wp.ScopedStream(self._side_stream):
-            self._count_not_finite(x0, x1)
+            self._count_not_finite(x0, x1, mesh.device_vertices)
             vertex_face.run(x0, x1, mesh.device_faces, **options)
             vertex_face.sort()
         edge_edge.run(x0, x1, mesh.device_edges, **options)
@@ -403,6 +406,8 @@ class CollisionDetector:
 
     def find_contacts(self, x0, x1, *, refit=False, changed=None):
         """Launches a detection without sorting, on one stream, for those who respond to it on the device.
+
+        They may move vertices that no face uses as well: positions of all must be finite.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
@@ -455,10 +460,12 @@ class CollisionDetector:
             self._grow(counts)
         return overflowed
 
-    def _count_not_finite(self, x0, x1):
+    def _count_not_finite(self, x0, x1, vertices=None):
+        """Counts the vertices, of some or of all, whose positions are not finite."""
         count_not_finite, _ = _kernels(x0.dtype)
-        inputs, device = [x0, x1, self.counts], self.mesh.device
-        wp.launch(count_not_finite, self.mesh.vertex_count, inputs=inputs, device=device, record_tape=False)
+        dim = self.mesh.vertex_count if vertices is None else len(vertices)
+        inputs, device = [x0, x1, vertices, self.counts], self.mesh.device
+        wp.launch(count_not_finite, dim, inputs=inputs, device=device, record_tape=False)
 
     def _room(self):
         """How much room there is for what each count counts; none for positions that are not finite."""

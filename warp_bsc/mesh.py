@@ -1,5 +1,7 @@
 """The collision mesh: what of a triangle mesh takes part in collision detection."""
 
+from numbers import Integral
+
 import numpy as np
 import warp as wp
 
@@ -25,25 +27,28 @@ class CollisionMesh:
         """Finds the edges and puts the mesh on a device.
 
         Args:
-            faces: Vertex indices, integers, shape [face_count, 3], NumPy or Warp array.
+            faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
-            world: The world of each vertex, integers from 0 on, shape [vertex_count]: what is in different
-                worlds does not collide. Default: all are in one.
+            world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array: what is
+                in different worlds does not collide. Default: all are in one.
             device: Warp device; default: Warp's default.
 
         Raises:
-            ValueError: If the faces have another shape or type, an index is not in [0, vertex_count), or the worlds
-                have another shape or type, are negative, or differ within a face.
+            ValueError: If the faces have another shape or type, an index is not in [0, vertex_count), that is no
+                integer in [0, 2^31), or the worlds have another shape or type, are out of range, or differ within a
+                face.
         """
         faces = faces.numpy() if isinstance(faces, wp.array) else np.asarray(faces)
-        if faces.size == 0:
-            faces = faces.reshape(0, 3).astype(np.int32)
+        if faces.shape == (0,):
+            faces = np.empty((0, 3), np.int32)
         if faces.ndim != 2 or faces.shape[1] != 3:
             raise ValueError(f"faces must have shape (n, 3), not {faces.shape}")
+        if len(faces) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
+            raise ValueError(f"a mesh must have less than 2^28 faces, not {len(faces)}")
         if not np.issubdtype(faces.dtype, np.integer):
             raise ValueError(f"faces must be integers, not {faces.dtype}")
-        if not 0 <= vertex_count < 2**31:
-            raise ValueError(f"vertex_count must be in [0, 2^31), not {vertex_count}")
+        if not isinstance(vertex_count, Integral) or not 0 <= vertex_count < 2**31:
+            raise ValueError(f"vertex_count must be an integer in [0, 2^31), not {vertex_count!r}")
         bad = np.flatnonzero(((faces < 0) | (faces >= vertex_count)).any(axis=1))
         if len(bad):
             raise ValueError(
@@ -63,8 +68,9 @@ class CollisionMesh:
         np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
         first_sides = first_sides[proper]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
-        self.vertex_count = vertex_count
+        self.vertex_count = int(vertex_count)
         self.device = wp.get_device(device)
+        self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
         self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
@@ -81,8 +87,9 @@ class CollisionMesh:
             raise ValueError(
                 f"world must be {self.vertex_count} integers, one a vertex, got {world.dtype} {world.shape}"
             )
-        if (world < 0).any():
-            raise ValueError(f"vertex {np.argmax(world < 0)} is in world {world[np.argmax(world < 0)]}; the first is 0")
+        bad = (world < 0) | (world >= 2**31)
+        if bad.any():
+            raise ValueError(f"vertex {np.argmax(bad)} is in world {world[np.argmax(bad)]}; worlds are in [0, 2^31)")
         worlds = world[self.faces]
         mixed = np.flatnonzero((worlds != worlds[:, :1]).any(axis=1))
         if len(mixed):

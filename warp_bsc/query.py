@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .arrays import checked_coordinates
+from .arrays import check_finite, checked_shape
 from .kernels.signs import FREE, HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
 
@@ -49,7 +49,8 @@ def query_vertex_face(points, *, method="exact", toi=True, tolerance=TOLERANCE, 
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type or are not finite, or there is no such method.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
+            method.
     """
     return _query("vertex_face", points, method, toi, tolerance, device)
 
@@ -69,7 +70,8 @@ def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, de
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type or are not finite, or there is no such method.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
+            method.
     """
     return _query("edge_edge", points, method, toi, tolerance, device)
 
@@ -80,9 +82,12 @@ def _query(kind, points, method, timed, tolerance, device):
     if isinstance(points, wp.array):
         device = points.device if device is None else device
         points = points.numpy()
-    points = checked_coordinates(points, (8, 3), "points")
-    device = wp.get_device(device)
+    points = checked_shape(points, (8, 3), "points")
     n = len(points)
+    if n >= 2**29:  # their vertices are numbered by int32
+        raise ValueError(f"at most 2^29 - 1 queries can be asked at once, not {n}")
+    check_finite(points, "points")
+    device = wp.get_device(device)
     # a mesh in which each query has four vertices of its own
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
     x0 = wp.array(np.ascontiguousarray(points[:, :4]).reshape(-1, 3), dtype=dtype, device=device)

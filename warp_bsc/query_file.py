@@ -2,14 +2,17 @@
 
 A file holds eight rows for each query, the points in the order of :func:`warp_bsc.query_vertex_face` or
 :func:`warp_bsc.query_edge_edge`. A row holds six integers, the numerator and denominator of x, y and z; or seven, the
-last being the query's true answer, 0 or 1, the same on all of its rows. Where rows have six, the true answers may stand
-next to ``NAME.csv`` in ``NAME_mma_bool.json``, as a list of true and false.
+last being the query's true answer, 0 or 1, the same on all of its rows. The true answers may stand next to ``NAME.csv``
+in ``NAME_mma_bool.json`` as well, as a list of true and false.
 
 Files of vertex-face and of edge-edge queries look the same. Which they are is told by the folder that they are in,
 ``vertex-face`` or ``edge-edge``, or by a name that ends in ``vf`` or ``ee``.
 """
 
 import json
+import re
+import reprlib
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +21,9 @@ import numpy as np
 __all__ = ["KINDS", "QueryFile", "find_query_files", "read_query_file"]
 
 KINDS = ("vertex-face", "edge-edge")
+
+_INTEGERS = re.compile("-?[0-9]+(,-?[0-9]+)*")
+"""A row; Python takes more for an integer, 1_0 for ten."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ def find_query_files(paths) -> list[Path]:
     files = []
     for path in map(Path, paths):
         if path.is_dir():
-            below = sorted(path.rglob("*.csv"))
+            below = sorted(file for file in path.rglob("*.csv") if not file.is_dir())
             if not below:
                 raise FileNotFoundError(f"{path}: no .csv file in this folder")
             files += below
@@ -67,17 +73,22 @@ def read_query_file(path, *, kind: str | None = None) -> QueryFile:
         kind: ``"vertex-face"`` or ``"edge-edge"``; None to tell it by the path.
 
     Raises:
-        ValueError: If the kind cannot be told, the file is not as described above, or a number in it is not exactly a
-            double: the answer would be that of another query. The message names the file and the line.
+        ValueError: If the kind cannot be told, the file is not as described above, a number in it is not exactly a
+            double (the answer would be that of another query), or the true answers stand in both places and differ. The
+            message names the file and the line.
     """
     path = Path(path)
     kind = kind or _kind_of(path)
     rows = _read_rows(path)
     points = _divide(path, rows[:, 0:6:2], rows[:, 1:6:2]).reshape(-1, 8, 3)
+    truth, truth_path = _truth_beside(path, len(points))
     if rows.shape[1] == 7:
-        truth, truth_path = _truth_of_rows(path, rows[:, 6]), path
-    else:
-        truth, truth_path = _truth_beside(path, len(points))
+        truth_of_rows = _truth_of_rows(path, rows[:, 6])
+        if truth is not None and (truth != truth_of_rows).any():
+            query = int(np.argmax(truth != truth_of_rows))
+            answers = f"is {truth_of_rows[query]:d}, but {truth[query]:d} in {truth_path}"
+            raise ValueError(f"{path}:{8 * query + 1}: the true answer {answers}")
+        truth, truth_path = truth_of_rows, path
     return QueryFile(path, kind, points, truth, truth_path)
 
 
@@ -93,18 +104,22 @@ def _kind_of(path: Path) -> str:
 
 def _read_rows(path: Path) -> np.ndarray:
     """The integers of a file, shape [row_count, 6 or 7], int64 where all fit and Python's own otherwise."""
-    lines = path.read_text(encoding="ascii", errors="replace").rstrip().splitlines()
-    if not lines:
+    text = path.read_text(encoding="ascii", errors="replace").rstrip("\n")
+    if not text:
         raise ValueError(f"{path}: the file is empty")
+    lines = text.split("\n")
     width = lines[0].count(",") + 1
     if width not in {6, 7}:
         raise ValueError(f"{path}:1: {width} columns; a row has 6, or 7 with the true answer")
     rows = []
     for number, line in enumerate(lines, 1):
+        if not _INTEGERS.fullmatch(line):
+            raise ValueError(f"{path}:{number}: not integers with commas between them: {line[:60]!r}")
         try:
             row = [int(field) for field in line.split(",")]
         except ValueError:
-            raise ValueError(f"{path}:{number}: not integers with commas between them: {line[:60]!r}") from None
+            most = sys.get_int_max_str_digits()
+            raise ValueError(f"{path}:{number}: an integer of more than {most} digits") from None
         if len(row) != width:
             raise ValueError(f"{path}:{number}: {len(row)} columns, but {width} on the lines before")
         rows.append(row)
@@ -132,12 +147,17 @@ def _divide(path: Path, numerators, denominators) -> np.ndarray:
         try:
             quotient = numerator / denominator
         except OverflowError:
-            raise ValueError(f"{where} is larger than any double: {numerator}/{denominator}") from None
+            raise ValueError(f"{where} is larger than any double: {_ratio(numerator, denominator)}") from None
         p, q = quotient.as_integer_ratio()
         if p * denominator != q * numerator:
-            raise ValueError(f"{where} is not exactly a double: {numerator}/{denominator}")
+            raise ValueError(f"{where} is not exactly a double: {_ratio(numerator, denominator)}")
         quotients[row, column] = quotient
     return quotients
+
+
+def _ratio(numerator, denominator) -> str:
+    """A ratio as text, shortened where it is long."""
+    return f"{reprlib.repr(numerator)}/{reprlib.repr(denominator)}"
 
 
 def _truth_of_rows(path: Path, column) -> np.ndarray:
@@ -154,8 +174,8 @@ def _truth_beside(path: Path, query_count: int) -> tuple[np.ndarray | None, Path
     if not truth_path.exists():
         return None, None
     try:
-        truth = json.loads(truth_path.read_bytes())
-    except ValueError as error:
+        truth = json.loads(truth_path.read_bytes(), parse_int=float)  # which takes any number of digits
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{truth_path}: not JSON: {error}") from None
     if not isinstance(truth, list) or not all(isinstance(answer, bool) for answer in truth):
         raise ValueError(f"{truth_path}: not a list of true and false")

@@ -9,7 +9,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .hit_files import HitsCsv, HitsJson
@@ -20,7 +19,7 @@ from .replay_tables import print_replay
 from .report_page import ReportPage
 from .scene import FrameRange, Scene
 from .selection import PURPOSES, Selection
-from .tables import say
+from .tables import Console, say
 
 __all__ = ["add_replay_options", "open_scene", "run_replay"]
 

@@ -248,7 +248,7 @@ class SolverCCD(SolverBase):
                 ``soft_contact_restitution``.
 
         Raises:
-            ValueError: If a number is out of range.
+            ValueError: If a number is out of range, or the friction of a shape that collides with particles is.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
         """
         self.solver = solver
@@ -259,8 +259,8 @@ class SolverCCD(SolverBase):
         model = solver.model
         friction = model.particle_mu if friction is None else friction
         restitution = model.soft_contact_restitution if restitution is None else restitution
-        if not 0.0 <= friction < np.inf:
-            raise ValueError(f"friction must be at least 0, not {friction!r}")
+        if not 0.0 <= friction <= float(np.finfo(np.float32).max):
+            raise ValueError(f"friction must be at least 0, and finite in single precision, not {friction!r}")
         if not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
         self.mesh = mesh = ModelMesh(model)
@@ -269,6 +269,9 @@ class SolverCCD(SolverBase):
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
         shape_friction = np.zeros(0) if model.shape_material_mu is None else model.shape_material_mu.numpy()
+        for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
+            if not shape_friction[shape] >= 0.0:
+                raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {shape_friction[shape]}")
         vertex_friction = np.full(mesh.vertex_count, friction, dtype=np.float32)
         vertex_friction[model.particle_count :] = shape_friction[mesh.shape_vertices.shape]
         self._response = Response(

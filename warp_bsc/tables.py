@@ -1,13 +1,21 @@
 """What all tables and lines on the terminal have in common."""
 
+import rich.console
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
-__all__ = ["LONGEST", "count", "make_table", "say"]
+__all__ = ["LONGEST", "Console", "count", "make_table", "say"]
 
 LONGEST = 30
 """Rows in a table, or lines in a list."""
+
+
+class Console(rich.console.Console):
+    """A terminal or a file, where that nobody reads it is an error like any other."""
+
+    def on_broken_pipe(self):
+        """Raises the error again; rich would end the program, with the status 1 of a collision."""
+        raise BrokenPipeError
 
 
 def say(console: Console, line: str) -> None:
