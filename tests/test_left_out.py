@@ -273,6 +273,23 @@ def test_a_file_inside_a_package(stage, tmp_path):
         Scene(f"{package}[other.usda]")
 
 
+def test_metres_per_unit_in_single_precision(tmp_path):
+    """Old exporters wrote them so, and OpenUSD takes nothing but double precision."""
+    stage = new_stage(tmp_path / "scene.usda", meters_per_unit=0.5)
+    add_floor(stage)
+    add_falling(stage)
+    path = tmp_path / "scene.usdc"
+    assert stage.GetRootLayer().Export(str(path))
+    crate, half = path.read_bytes(), b"\x00\x00\x00\x3f\x00\x00"  # 0.5; its type follows, 9 is double and 8 is float
+    assert crate.count(half + b"\x09") == 1
+    path.write_bytes(crate.replace(half + b"\x09", half + b"\x08"))
+    with pytest.raises(RuntimeError):
+        UsdGeom.GetStageMetersPerUnit(Usd.Stage.Open(str(path)))
+    found = find(path, "--overlay", str(tmp_path / "overlay.usda"))
+    assert hits(found) == [HIT] and found["meters_per_unit"] == 0.5
+    assert UsdGeom.GetStageMetersPerUnit(Usd.Stage.Open(str(tmp_path / "overlay.usda"))) == 0.5
+
+
 # --- Damaged files ---
 
 

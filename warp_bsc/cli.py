@@ -65,8 +65,10 @@ Find the collisions between each two consecutive time samples of a USD scene:
 of its meshes with themselves and with each other, every vertex moving straight
 from sample to sample. Meshes that never move are obstacles; where these touch
 one another is not counted, nor where a mesh touches itself that only its
-transform moves. What cannot be read is named and left out. Files appear complete or not at all; interrupted,
-they hold the intervals that are finished and say that they are partial."""
+transform moves. What turns is sampled at every whole time code too. What
+cannot be read is named and left out. Files appear complete or not at all;
+interrupted, they hold the intervals that are finished and say that they are
+partial."""
 
 _REPLAY_EXAMPLES = f"""\
 examples:

@@ -167,14 +167,16 @@ def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:
 
     Vertices of it may be welded to others' and so may its edges: all meshes that they are of count.
     """
-    stiff = np.array([not mesh.deforms for mesh in segment.meshes])
+    are_stiff = np.zeros(len(vertices) + len(ends), dtype=bool)
+    stiff = np.array([mesh.moves and not mesh.deforms for mesh in segment.meshes], dtype=bool)
+    if not stiff.any():
+        return are_stiff
     rows, meshes = segment.meshes_at_vertices(vertices)
     found = [rows[stiff[meshes] & (meshes == face_meshes[rows])]]
     keys = []
     for side in range(2):
         rows, meshes = segment.meshes_at_edges(ends[:, side])
         keys.append((rows * len(stiff) + meshes)[stiff[meshes]])
-    found.append(len(vertices) + np.intersect1d(*keys) // max(1, len(stiff)))
-    are_stiff = np.zeros(len(vertices) + len(ends), dtype=bool)
+    found.append(len(vertices) + np.intersect1d(*keys) // len(stiff))
     are_stiff[np.concatenate(found)] = True
     return are_stiff

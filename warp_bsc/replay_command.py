@@ -37,14 +37,18 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
 
     which = command.add_argument_group("what is checked")
     patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
-    which.add_argument("--prims", **patterns, help="only meshes at or below these prims; * stands for anything")
+    which.add_argument(
+        "--prims",
+        **patterns,
+        help="only meshes at or below these prims or instances, as the report names them; * stands for anything",
+    )
     which.add_argument("--exclude", **patterns, help="no meshes at or below these prims")
     which.add_argument(
         "--self",
         dest="self_collisions",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="whether a mesh is checked with itself (default: it is)",
+        help="whether a mesh is checked with itself (default: it is, if more than its transform moves it)",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"

@@ -138,6 +138,7 @@ class Scene:
         selection: Selection | None = None,
         frames: FrameRange | None = None,
         subdivide: int = 1,
+        sample_turns: bool = True,
         strict: bool = False,
     ):
         """Opens the file and finds its meshes.
@@ -147,6 +148,7 @@ class Scene:
             selection: Which of its meshes are checked; default: those to be rendered.
             frames: The part of its time; default: all.
             subdivide: Into how many intervals each one between times is divided.
+            sample_turns: Whether what turns is sampled at every whole time code too, if ``frames`` has no step.
             strict: Whether nothing may be left out.
 
         Raises:
@@ -164,18 +166,19 @@ class Scene:
         self._unreadable = usd_stage.UnreadableError
         self._left_out = usd_stage.LeftOut(path, strict)
         self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
-        self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
-        self.meters_per_unit = UsdGeom.GetStageMetersPerUnit(self.stage)
-        self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
-        texts = {"Comment": "comment", "Documentation": "documentation"}
-        self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
         self._messages = []  # OpenUSD's
         self._collecting = usd_stage.collecting
-        with self._collecting(self._messages):
+        with self._collecting(self._messages, path):
+            self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
+            # As old exporters have it, a number in single precision, which UsdGeom.GetStageMetersPerUnit does not take.
+            self.meters_per_unit = float(self.stage.GetMetadata("metersPerUnit"))
+            self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
+            texts = {"Comment": "comment", "Documentation": "documentation"}
+            self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
             self._usd_meshes, self._warnings = usd_meshes.find_meshes(self.stage, path, self.selection, self._left_out)
             self._check_meshes(bool(selection))
             self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
-            changes = self._find_times(frames or FrameRange(), subdivide)
+            changes = self._find_times(frames or FrameRange(), subdivide, sample_turns)
             self._note_changes()
             inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
@@ -223,7 +226,7 @@ class Scene:
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
         start, end = self.times[index : index + 2]
-        with self._collecting(self._messages):
+        with self._collecting(self._messages, self.path):
             while True:
                 segment = self._segment_at(index)
                 try:
@@ -245,11 +248,11 @@ class Scene:
                 f"{self.path}: nothing moves: no mesh has points or a transform that change with time{reason}"
             )
 
-    def _find_times(self, frames, subdivide) -> set[float]:
+    def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
         """Finds the times to look at. Returns those at which meshes change their topology, appear or vanish."""
         own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
         whole = set()
-        if frames.step is None:
+        if sample_turns and frames.step is None:
             low, high = frames.bounds(sorted(own))
             whole = whole.union(*(mesh.turning_times(low, high) for mesh in self._usd_meshes))
         scene_times = _merge(own | whole)

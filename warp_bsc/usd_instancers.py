@@ -139,10 +139,10 @@ def find_instances(prim, parent: Instance | None, file, left_out: LeftOut) -> li
             numbers = schema.GetProtoIndicesAttr()
             times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, numbers.GetTimeSamples())]
             pairs = sorted({pair for time in times for pair in enumerate(numbers.Get(time) or ())})
+            lost = [(index, number) for index, number in pairs if not 0 <= number < len(roots) or not roots[number]]
     except UnreadableError as error:
         left_out.add(error)
         return []
-    lost = [(index, number) for index, number in pairs if not 0 <= number < len(roots) or not roots[number]]
     if lost:
         (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
         left_out.add(UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}"))

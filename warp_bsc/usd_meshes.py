@@ -292,11 +292,10 @@ class UsdMesh:
                 raise UnreadableError(
                     f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
                 )
-            with np.errstate(over="ignore", invalid="ignore"):  # raised below
-                positions = points[used].astype(dtype)
-                if not self.is_placed:
-                    transform = self._transform(time, before=before)
-                    positions = positions @ transform[:3, :3] + transform[3, :3]
+            positions = points[used].astype(dtype)
+            if not self.is_placed:
+                transform = self._transform(time, before=before)
+                positions = positions @ transform[:3, :3] + transform[3, :3]
             finite = np.isfinite(positions).all(axis=1)
             if not finite.all():
                 first = int(np.argmin(finite))

@@ -10,6 +10,7 @@ from pxr import Ar, Gf, Tf, Ts, Usd, UsdUtils
 
 __all__ = ["LeftOut", "UnreadableError", "as_time_code", "collecting", "open_stage", "reading", "sample_times"]
 
+_DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
 _STILL = (Ts.ExtrapHeld, Ts.ExtrapValueBlock)
 _PROBES = 8  # parts of a piece of a spline at whose ends it is held against the straight line
 _BEND = 0.01  # most that a piece may leave the straight line, as a share of all that the spline goes through
@@ -59,32 +60,39 @@ class LeftOut:
 
 
 @contextlib.contextmanager
-def reading(where: str, mesh=None, time: float | None = None):
+def reading(where: str, mesh=None, time: float | None = None, errors=(ValueError, *_DAMAGE)):
     """Say of errors in damaged data, which OpenUSD raises in many types, where they are.
 
     Args:
         where: File and prim.
         mesh: The mesh that is read.
         time: The time code.
+        errors: Types of what is raised.
 
     Raises:
-        UnreadableError: If anything is raised within.
+        UnreadableError: If any of the errors is raised within.
     """
     try:
-        yield
-    except (ValueError, RuntimeError, TypeError, OverflowError) as error:
+        with np.errstate(all="ignore"):  # what is not finite is found where positions are read
+            yield
+    except errors as error:
         what = str(error) if isinstance(error, UnreadableError) else f"{where}: {_describe(error)}"
         raise UnreadableError(what, mesh, time) from error
 
 
 @contextlib.contextmanager
-def collecting(messages: list[str]):
-    """Add to messages what OpenUSD would print on standard error, each once and in one line."""
+def collecting(messages: list[str], file):
+    """Add to messages what OpenUSD would print on standard error, each once and in one line.
+
+    Raises:
+        UnreadableError: If OpenUSD raises anything.
+    """
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        yield
+        with reading(str(file), errors=_DAMAGE):
+            yield
     finally:
-        texts = (_one_line(diagnostic.commentary) for diagnostic in delegate.TakeUncoalescedDiagnostics())
+        texts = map(_commentary, delegate.TakeUncoalescedDiagnostics())
         messages += dict.fromkeys(text for text in texts if text not in messages)
 
 
@@ -107,14 +115,14 @@ def open_stage(path, left_out: LeftOut) -> Usd.Stage:
     if Path(resolved).is_dir():
         raise ValueError(f"{path}: a folder, not a USD file")
 
-    with collecting([]):  # of what is raised here
+    with collecting([], path):  # what is printed here is among the errors below
         try:
             stage = Usd.Stage.Open(str(path))
         except RuntimeError as error:
             raise ValueError(f"{path}: not a readable USD file: {_describe(error)}") from None
-    for layer in stage.GetUsedLayers():
-        if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD does not come back from asking for samples
-            raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
+        for layer in stage.GetUsedLayers():
+            if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD does not come back from asking for samples
+                raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
     for error in stage.GetCompositionErrors():
         left_out.add(UnreadableError(f"{path}: {_one_line(str(error))}"))
     return stage
@@ -179,8 +187,16 @@ def _spline_times(attribute) -> set[float]:
 def _describe(error) -> str:
     """What an exception says, in one line."""
     if isinstance(error, Tf.ErrorException) and error.args:
-        return _one_line(error.args[0].commentary)
+        return _commentary(error.args[0])
     return _one_line(str(error)) or type(error).__name__
+
+
+def _commentary(diagnostic) -> str:
+    """What OpenUSD says of something, in one line."""
+    try:
+        return _one_line(diagnostic.commentary)
+    except UnicodeError:  # it quotes what is no text
+        return "there are bytes that are no text"
 
 
 def _one_line(text: str) -> str:
