@@ -177,7 +177,7 @@ def main():
     figure = plt.figure(figsize=(size[0] / 100.0, size[1] / 100.0), dpi=100)
     left = 0.0
     for name, view in VIEWS.items():
-        scene = Scene(arguments.folder / f"{name}.usd")
+        scene = Scene(arguments.folder / f"{name}.usd", sample_turns=False)
         width = view.width * PIXELS / size[0]
         axes = figure.add_axes((left, _CAPTION_PIXELS / size[1], width, PIXELS / size[1]))
         axes.imshow(picture_of(scene, view))

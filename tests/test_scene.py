@@ -44,7 +44,7 @@ def first_segment(scene):
 
 def error_of(stage):
     with pytest.raises(ValueError) as error:
-        scene = read(stage)
+        scene = read(stage, strict=True)
         for index in range(len(scene.times) - 1):
             scene.interval(index)
     message = str(error.value)

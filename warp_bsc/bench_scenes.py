@@ -70,7 +70,7 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
         return BenchmarkScene(name, *_find_generator(name, *generated.groups()))
     if "," in name:
         return _load_pair(name)
-    scene = Scene(name)
+    scene = Scene(name, sample_turns=False)  # what was recorded
     if not 0 <= interval < len(scene.times) - 1:
         raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene.times) - 2}")
     segment, x0, x1 = scene.interval(interval)
@@ -101,7 +101,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     """
     if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
         return [(0, load_scene(name))]
-    scene = Scene(name)
+    scene = Scene(name, sample_turns=False)  # what was recorded
     count = len(scene.times) - 1
     if count < 1:
         raise ValueError(f"{name}: there is no interval, its meshes never move")

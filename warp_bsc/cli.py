@@ -58,7 +58,10 @@ _EXIT_STATUS = f"""\
 _REPLAY_EXIT_STATUS = f"""\
 {_STATUS}
   3  --validate found an answer that is wrong
-{_CUT_SHORT}"""
+  4  done, but parts of the scene could not be read and were left out; --strict
+     ends with 2 instead
+{_CUT_SHORT}
+Where several hold, 130 comes before 2, then 3, 1 and 4."""
 
 _EXAMPLES = f"""\
 examples:
@@ -73,8 +76,11 @@ _REPLAY = """\
 Find the collisions between each two consecutive time samples of a USD scene:
 of its meshes with themselves and with each other, every vertex moving straight
 from sample to sample. Meshes that never move are obstacles; where these touch
-one another is not counted. Files appear complete or not at all; interrupted,
-they hold the intervals that are finished and say that they are partial."""
+one another is not counted, nor where a mesh touches itself that only its
+transform moves. What turns is sampled at every whole time code too. What
+cannot be read is named and left out. Files appear complete or not at all;
+interrupted, they hold the intervals that are finished and say that they are
+partial."""
 
 _REPLAY_EXAMPLES = f"""\
 examples:

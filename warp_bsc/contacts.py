@@ -36,6 +36,7 @@ class Contacts:
         time: The same as time codes, shape [n].
         position: Where they meet, in world space and the scene's unit of length, shape [n, 3].
         normal: Unit normals, against the velocity of the first relative to the second, shape [n, 3].
+        counted: Which of the pairs that the detector found these are, vertex-face before edge-edge, booleans.
     """
 
     segment: Segment = field(repr=False)
@@ -49,6 +50,7 @@ class Contacts:
     time: np.ndarray
     position: np.ndarray
     normal: np.ndarray
+    counted: np.ndarray = field(repr=False)
 
     def __len__(self):
         return len(self.kind)
@@ -92,7 +94,10 @@ class Contacts:
 def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> Contacts:
     """Name what a detection found, of the pairs that count.
 
-    Pairs of meshes that never move do not, nor do those that the selection leaves out.
+    Pairs of meshes that never move do not, nor do those that the selection leaves out, nor those of a mesh with itself
+    that only its transform moves: whatever that does, what is apart in the mesh stays apart, and what touches there, at
+    T-junctions or in coplanar faces, is taken to collide by nothing but rounding. (Where a transform turns by half a
+    circle from one sample to the next, or scales by zero, the straight ways between do meet. The mesh does not.)
 
     Args:
         segment: The meshes.
@@ -140,7 +145,8 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
     position = np.concatenate([on_faces, (1.0 - s) * first[:, 0] + s * first[:, 1]])
 
     moves = np.array([part.moves for part in segment.meshes])
-    counted = moves[meshes].any(axis=1) & selection.counted_pairs([part.path for part in segment.meshes], meshes)
+    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
+    counted &= ~_are_stiff(segment, vertices, meshes[:n_vertex_face, 1], ends)
     arrays = (
         kind,
         elements,
@@ -153,4 +159,24 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
         position,
         normal,
     )
-    return Contacts(segment, *(array[counted] for array in arrays))
+    return Contacts(segment, *(array[counted] for array in arrays), counted)
+
+
+def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:
+    """Which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges.
+
+    Vertices of it may be welded to others' and so may its edges: all meshes that they are of count.
+    """
+    are_stiff = np.zeros(len(vertices) + len(ends), dtype=bool)
+    stiff = np.array([mesh.moves and not mesh.deforms for mesh in segment.meshes], dtype=bool)
+    if not stiff.any():
+        return are_stiff
+    rows, meshes = segment.meshes_at_vertices(vertices)
+    found = [rows[stiff[meshes] & (meshes == face_meshes[rows])]]
+    keys = []
+    for side in range(2):
+        rows, meshes = segment.meshes_at_edges(ends[:, side])
+        keys.append((rows * len(stiff) + meshes)[stiff[meshes]])
+    found.append(len(vertices) + np.intersect1d(*keys) // len(stiff))
+    are_stiff[np.concatenate(found)] = True
+    return are_stiff

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from .contacts import KINDS
-from .outcome import Outcome
+from .outcome import CERTIFIED_FOR, Outcome
 from .output_file import StreamedFile
 
 __all__ = ["HitsCsv", "HitsJson"]
@@ -77,8 +77,10 @@ class HitsJson(StreamedFile):
             "stopped": outcome.stopped,
             "motion": outcome.motion,
             "warnings": outcome.scene.warnings,
+            "left_out": outcome.scene.left_out,
             "hits": outcome.hits,
             "certified": outcome.certified,
+            "certified_for": CERTIFIED_FOR,
             "mesh_pairs": _mesh_pairs_to_list(outcome.mesh_pairs),
             "validation": outcome.validation,
         }

@@ -7,7 +7,10 @@ from functools import cached_property
 from .replay import TOI_BINS, Interval
 from .scene import Scene
 
-__all__ = ["Outcome"]
+__all__ = ["CERTIFIED_FOR", "Outcome"]
+
+CERTIFIED_FOR = "vertices that move straight between the times checked"
+"""What a certificate is about."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Outcome:
 
     @property
     def certified(self) -> bool:
-        """Whether no collision can be missing in what is finished."""
+        """Whether no collision of vertices that move straight can be missing in what is finished."""
         return all(interval.certified for interval in self.intervals)
 
     @cached_property
@@ -103,7 +106,10 @@ class Outcome:
         sentence = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
-            sentence += f" {which} moved by transforms or skeletons, which need not be: --subdivide N samples finer."
+            sentence += (
+                f" {which} moved by transforms or skeletons, which need not be: what turns is sampled at every whole "
+                "time code too, unless --frames has a step; --subdivide N samples finer."
+            )
         return sentence
 
     def first(self, count: int) -> "Outcome":

@@ -198,8 +198,6 @@ class Overlay:
 
     def _head(self, outcome) -> str:
         """The layer's metadata: that of the scene, which sublayers do not hand on."""
-        from pxr import UsdGeom  # noqa: PLC0415 (slow)
-
         stage, scene = self._scene.stage, self._scene
         roots = [prim.GetName() for prim in stage.GetPseudoRoot().GetChildren()]
         default = stage.GetDefaultPrim().GetName() if stage.HasDefaultPrim() else roots[0]
@@ -226,7 +224,7 @@ class Overlay:
     doc = {_quote(doc)}
     endTimeCode = {end!r}
     framesPerSecond = {stage.GetFramesPerSecond()!r}
-    metersPerUnit = {UsdGeom.GetStageMetersPerUnit(stage)!r}
+    metersPerUnit = {scene.meters_per_unit!r}
     startTimeCode = {start!r}
     subLayers = [
         @@@{asset}@@@

@@ -48,7 +48,7 @@ class Interval:
         mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
             with itself is there twice.
         earliest: The earliest contact, None if there is none.
-        certified: Whether no collision can be missing.
+        certified: Whether no collision of vertices that move straight from the start to the end can be missing.
         stats: Counts and times of the detector's stages, pairs that do not count included.
         validation: What the exact checker says of the answers, None if it was not asked.
     """
@@ -86,7 +86,8 @@ def replay(
 ) -> Iterator[tuple[Interval, Contacts]]:
     """Find the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
-    Meshes that never move are obstacles: where these touch one another is not counted.
+    Meshes that never move are obstacles: where these touch one another is not counted. Nor is where a mesh touches
+    itself that only its transform moves.
 
     Args:
         scene: The scene, whose selection says which pairs count.
@@ -111,7 +112,9 @@ def replay(
         contacts = find_contacts(segment, detector.mesh, collisions, x0, x1, start, end, scene.selection)
         validation = None
         if validate_most != 0:
-            validation = validate(detector, collisions, x0, x1, most=validate_most, seed=index)
+            validation = validate(
+                detector, collisions, x0, x1, most=validate_most, seed=index, counted=contacts.counted
+            )
         yield _summarize(index, start, end, collisions, contacts, validation), contacts
 
 

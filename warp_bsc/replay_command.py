@@ -25,7 +25,9 @@ __all__ = ["add_replay_options", "open_scene", "run_replay"]
 
 _STDOUT = "-"
 _INTERRUPTED = 130
+_COLLIDES = 1
 _DISAGREES = 3
+_LEFT_OUT = 4
 
 
 def add_replay_options(command: argparse.ArgumentParser) -> None:
@@ -34,14 +36,18 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
 
     which = command.add_argument_group("what is checked")
     patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
-    which.add_argument("--prims", **patterns, help="only meshes at or below these prims; * stands for anything")
+    which.add_argument(
+        "--prims",
+        **patterns,
+        help="only meshes at or below these prims or instances, as the report names them; * stands for anything",
+    )
     which.add_argument("--exclude", **patterns, help="no meshes at or below these prims")
     which.add_argument(
         "--self",
         dest="self_collisions",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="whether a mesh is checked with itself (default: it is)",
+        help="whether a mesh is checked with itself (default: it is, if more than its transform moves it)",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
@@ -65,7 +71,11 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         type=_at_least_one,
         default=1,
         metavar="N",
-        help="check N steps between samples, for motion that is not linear, as of transforms that turn (default: 1)",
+        help="check N steps from each time to the next, for motion that is not linear, as of what turns, for "
+        "which every whole time code is taken anyway (default: 1)",
+    )
+    which.add_argument(
+        "--strict", action="store_true", help="leave nothing out: what cannot be read is an error, with status 2"
     )
     which.add_argument(
         "--validate",
@@ -114,7 +124,13 @@ def open_scene(arguments) -> Scene:
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
     )
-    return Scene(arguments.scene, selection=selection, frames=arguments.frames, subdivide=arguments.subdivide)
+    return Scene(
+        arguments.scene,
+        selection=selection,
+        frames=arguments.frames,
+        subdivide=arguments.subdivide,
+        strict=arguments.strict,
+    )
 
 
 def run_replay(scene: Scene, arguments, device) -> int:
@@ -167,7 +183,9 @@ def run_replay(scene: Scene, arguments, device) -> int:
         return _INTERRUPTED
     if outcome.validation and outcome.validation["disagreements"]:
         return _DISAGREES
-    return 1 if arguments.fail_on_collision and outcome.hits else 0
+    if arguments.fail_on_collision and outcome.hits:
+        return _COLLIDES
+    return _LEFT_OUT if scene.left_out else 0
 
 
 def _open_outputs(stack, scene, arguments, settings):

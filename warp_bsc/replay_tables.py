@@ -3,7 +3,7 @@
 from rich.console import Console
 from rich.text import Text
 
-from .outcome import Outcome
+from .outcome import CERTIFIED_FOR, Outcome
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_replay"]
@@ -49,12 +49,25 @@ def print_replay(console: Console, outcome: Outcome) -> None:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
 
     if uncertain := sum(not interval.certified for interval in intervals):
-        say(console, f"Not certified, collisions may be missing: {uncertain} of {count(len(intervals), 'interval')}.")
+        say(
+            console,
+            f"Not certified even for {CERTIFIED_FOR}, collisions may be missing: {uncertain} of "
+            f"{count(len(intervals), 'interval')}.",
+        )
     elif outcome.method == "conservative":
         unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
-        say(console, f"No collision can be missing; hits that could not be certified: {unsure:,}.")
+        say(
+            console,
+            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that could not be told apart from "
+            f"collisions: {unsure:,}.",
+        )
     else:
-        say(console, "Every answer is certified.")
+        say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
+    if scene.left_out:
+        say(
+            console,
+            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
+        )
     if outcome.validation:
         _print_validation(console, outcome.validation)
     total = sum(outcome.milliseconds.values())

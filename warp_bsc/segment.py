@@ -17,6 +17,7 @@ class SceneMesh:
         name: The same, with the number of the instance if a point instancer places it.
         display_name: What the file says to show instead, empty if nothing.
         moves: Whether its points or its transform change with time.
+        deforms: Whether anything but its transform does, so that it may collide with itself.
         vertices: Its vertices, among those of all meshes before they were welded.
         faces: Its faces, among those of all meshes.
         points: The prim's point that each vertex is, shape [len(vertices)].
@@ -29,6 +30,7 @@ class SceneMesh:
     name: str
     display_name: str
     moves: bool
+    deforms: bool
     vertices: slice
     faces: slice
     points: np.ndarray = field(repr=False)
@@ -57,7 +59,7 @@ class Segment:
             dtype: Of the positions.
 
         Raises:
-            ValueError: If a mesh is broken.
+            UnreadableError: If a mesh is broken.
         """
         self._usd_meshes = usd_meshes
         self.dtype = dtype
@@ -74,6 +76,7 @@ class Segment:
                     name=mesh.name,
                     display_name=mesh.display_name,
                     moves=bool(mesh.times),
+                    deforms=mesh.deforms,
                     vertices=slice(vertex_count, vertex_count + len(used)),
                     faces=slice(face_count, face_count + len(triangles)),
                     points=used,
@@ -91,8 +94,8 @@ class Segment:
         self._start = np.zeros((vertex_count, 3), dtype)
         for number, mesh in enumerate(self.meshes):
             self._start[mesh.vertices] = self._read_positions(number, times[0], False)
-        welded_to = self._find_welds(times)
-        self._kept, corners = np.unique(welded_to[self._corners], return_inverse=True)
+        self._welded_to = self._find_welds(times)
+        self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
         self.faces = corners.reshape(-1, 3).astype(np.int32)
         self.vertex_count = len(self._kept)
         self.welded = vertex_count - self.vertex_count
@@ -108,7 +111,7 @@ class Segment:
             Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`.
 
         Raises:
-            ValueError: If a mesh has another number of points than at first, or a coordinate is not finite.
+            UnreadableError: If a mesh has another number of points than at first, or a coordinate is not finite.
         """
         positions = self._start.copy()
         for number, mesh in enumerate(self.meshes):
@@ -116,9 +119,29 @@ class Segment:
                 positions[mesh.vertices] = self._read_positions(number, time, before)
         return positions[self._kept]
 
+    @property
+    def vertex_meshes(self) -> np.ndarray:
+        """Of each vertex its mesh, or the first of those welded there, shape [vertex_count]."""
+        return np.searchsorted(self._vertex_ends, self._kept, side="right")
+
     def locate_vertices(self, vertices) -> tuple[np.ndarray, np.ndarray]:
         """Of each vertex its mesh, or the first of those welded there, and its number among the prim's points."""
         return self._locate(self._kept[vertices])
+
+    def meshes_at_vertices(self, vertices) -> tuple[np.ndarray, np.ndarray]:
+        """All meshes that have some vertices: of each such pair the place in the list, and the mesh."""
+        unwelded, order = self._unwelded
+        wanted = self._kept[vertices]
+        first, last = np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right")
+        rows, places = _expand(first, last)
+        return rows, np.searchsorted(self._vertex_ends, order[places], side="right")
+
+    def meshes_at_edges(self, ends) -> tuple[np.ndarray, np.ndarray]:
+        """The same of edges, shape [n, 2], smaller vertex first: all meshes with a face of which one is a side."""
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
+        return rows, np.searchsorted(self._face_ends, sides[places] // 3, side="right")
 
     def locate_faces(self, faces) -> tuple[np.ndarray, np.ndarray]:
         """Of each face its mesh, and the number of the prim's polygon that it is a part of."""
@@ -172,6 +195,12 @@ class Segment:
         return np.unique(sides[np.cumsum(marked[:-1]) > 0] // 3)
 
     @cached_property
+    def _unwelded(self):
+        """The vertex that each one was welded to, ascending, and the number of each."""
+        order = np.argsort(self._welded_to, kind="stable")
+        return self._welded_to[order], order
+
+    @cached_property
     def _sides(self):
         """Keys of the sides of all faces, ascending, and the number of each: three times its face and its corner."""
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -206,13 +235,22 @@ class Segment:
             groups = places[crowded]
             owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right"))
             moving = [number for number in owners if self.meshes[number].moves]
+            jumping = {number for number in moving if self._usd_meshes[number].may_jump}
+            moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
             positions = self._start.copy()
-            for time in times[1:] if moving else ():
+            for time, before in [*moments, (times[-1], True)] if moving else ():
                 for number in moving:
                     vertices = self.meshes[number].vertices
-                    positions[vertices] = self._read_positions(number, time, time == times[-1])
+                    positions[vertices] = self._read_positions(number, time, before)
                 motion = np.column_stack([groups, positions[crowded]])
                 groups = np.unique(motion, axis=0, return_inverse=True)[1].reshape(-1)
             _, firsts, groups = np.unique(groups, return_index=True, return_inverse=True)
             welded_to[crowded] = crowded[firsts[groups]]
         return welded_to
+
+
+def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
+    """Of ranges of places all places, and of which range each is."""
+    counts = last - first
+    rows = np.repeat(np.arange(len(counts)), counts)
+    return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)

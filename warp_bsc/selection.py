@@ -1,5 +1,6 @@
 """Which meshes of a scene are checked, and which pairs of them."""
 
+import re
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -16,7 +17,8 @@ class Selection:
     """Which meshes of a scene are checked, and which pairs of them.
 
     Patterns are those of a shell, ``*`` standing for any part of a path. A pattern stands for the prims that it
-    matches and for all below them.
+    matches and for all below them. Meshes are known by their paths, and those that point instancers place by their
+    names too, such as ``"/World/Leaves[3]/Leaf"``. What has both is given as an object with ``path`` and ``name``.
 
     Attributes:
         prims: Patterns of the meshes that are checked; all, if there is none.
@@ -32,15 +34,15 @@ class Selection:
     between: tuple[str, str] | None = None
     purposes: tuple[str, ...] = ("default", "render")
 
-    def includes(self, path: str) -> bool:
+    def includes(self, mesh) -> bool:
         """Whether a mesh is checked at all, its purpose aside."""
         return (
-            (not self.prims or any(_matches(path, pattern) for pattern in self.prims))
-            and not any(_matches(path, pattern) for pattern in self.exclude)
-            and (self.between is None or any(_matches(path, pattern) for pattern in self.between))
+            (not self.prims or any(_matches(mesh, pattern) for pattern in self.prims))
+            and not any(_matches(mesh, pattern) for pattern in self.exclude)
+            and (self.between is None or any(_matches(mesh, pattern) for pattern in self.between))
         )
 
-    def check_patterns(self, paths: list[str]):
+    def check_patterns(self, meshes):
         """See to it that every pattern matches one of all meshes.
 
         Raises:
@@ -49,14 +51,14 @@ class Selection:
         named = {"--prims": self.prims, "--exclude": self.exclude, "--between": self.between or ()}
         for option, patterns in named.items():
             for pattern in patterns:
-                if not any(_matches(path, pattern) for path in paths):
+                if not any(_matches(mesh, pattern) for mesh in meshes):
                     raise ValueError(f"{option} {pattern}: there is no such mesh")
 
-    def counted_pairs(self, paths: list[str], pairs: np.ndarray) -> np.ndarray:
+    def counted_pairs(self, meshes, pairs: np.ndarray) -> np.ndarray:
         """Which pairs of meshes are checked.
 
         Args:
-            paths: The paths of the meshes.
+            meshes: The meshes.
             pairs: Indices of meshes, shape [n, 2].
 
         Returns:
@@ -66,11 +68,17 @@ class Selection:
         if not self.self_collisions:
             counted &= pairs[:, 0] != pairs[:, 1]
         if self.between:
-            first, second = (np.array([_matches(path, pattern) for path in paths]) for pattern in self.between)
+            first, second = (np.array([_matches(mesh, pattern) for mesh in meshes]) for pattern in self.between)
             a, b = pairs.T
             counted &= (first[a] & second[b]) | (first[b] & second[a])
         return counted
 
 
-def _matches(path, pattern):
-    return fnmatchcase(path, pattern) or fnmatchcase(path, pattern.rstrip("/") + "/*")
+def _matches(mesh, pattern):
+    # No prim's path has brackets: a number in such is that of an instance, or else one of some digits.
+    instances = re.sub(r"\[(\d+)\]", r"[[]\1]", pattern)
+    return any(
+        fnmatchcase(text, form) or fnmatchcase(text, form.rstrip("/") + "/*")
+        for form in {pattern, instances}
+        for text in {mesh.path, mesh.name}
+    )

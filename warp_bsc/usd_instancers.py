@@ -2,9 +2,9 @@
 
 from pxr import Gf, Usd, UsdGeom
 
-from .usd_stage import sample_times
+from .usd_stage import LeftOut, UnreadableError, reading, sample_times
 
-__all__ = ["Instance", "find_instances", "is_shown", "transform_times", "visibility_times"]
+__all__ = ["Instance", "find_instances", "is_shown", "transform_attributes", "transform_times", "visibility_times"]
 
 # Prototypes are often kept under a class or an over, lest they be drawn where they stand.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -116,51 +116,58 @@ class _Instancer:
         return self._last_presence[1]
 
 
-def find_instances(prim, parent: Instance | None, file) -> list[Instance]:
+def find_instances(prim, parent: Instance | None, file, left_out: LeftOut) -> list[Instance]:
     """All instances that a point instancer has at some time.
 
     Args:
         prim: The instancer.
         parent: The instance that it stands in, None if it stands in the scene.
         file: The file, for messages.
+        left_out: An instancer that contains itself is left out, and instances are whose prototype is missing.
 
     Raises:
-        ValueError: If a prototype is missing, or contains the instancer.
+        UnreadableError: If these may not be left out.
     """
     where = f"{file}: {prim.GetPath()}"
-    if parent and parent.contains(prim):
-        raise ValueError(f"{where}: the point instancer contains itself")
-    instancer = _Instancer(prim, parent.root if parent else None)
-    stage = prim.GetStage()
-    roots = [
-        stage.GetPrimAtPath(path) for path in UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets()
-    ]
-    numbers = UsdGeom.PointInstancer(prim).GetProtoIndicesAttr()
-    times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, numbers.GetTimeSamples())]
-    pairs = {pair for time in times for pair in enumerate(numbers.Get(time) or ())}
-    for index, number in sorted(pairs):
-        if not 0 <= number < len(roots) or not roots[number]:
-            raise ValueError(f"{where}: instance {index} is of prototype {number}, which is not there")
-    return [Instance(instancer, index, number, roots[number], parent) for index, number in sorted(pairs)]
+    try:
+        with reading(where):
+            if parent and parent.contains(prim):
+                raise UnreadableError(f"{where}: the point instancer contains itself")
+            instancer = _Instancer(prim, parent.root if parent else None)
+            stage, schema = prim.GetStage(), UsdGeom.PointInstancer(prim)
+            roots = [stage.GetPrimAtPath(path) for path in schema.GetPrototypesRel().GetForwardedTargets()]
+            numbers = schema.GetProtoIndicesAttr()
+            times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, numbers.GetTimeSamples())]
+            pairs = sorted({pair for time in times for pair in enumerate(numbers.Get(time) or ())})
+            lost = [(index, number) for index, number in pairs if not 0 <= number < len(roots) or not roots[number]]
+    except UnreadableError as error:
+        left_out.add(error)
+        return []
+    if lost:
+        (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
+        left_out.add(UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}"))
+    present = sorted({*pairs} - {*lost})
+    return [Instance(instancer, index, number, roots[number], parent) for index, number in present]
 
 
-def transform_times(prim, root=None) -> set[float]:
-    """Times at which the transforms from a prim to the world, or to and with a root's, have samples or knots.
-
-    Of those transforms only that have two or more.
-    """
-    times = set()
+def transform_attributes(prim, root=None):
+    """The attributes that make the transforms from a prim to the world, or to and with a root's."""
     while prim:
         if xformable := UsdGeom.Xformable(prim):
-            if xformable.TransformMightBeTimeVarying():
-                times.update(xformable.GetTimeSamples())
-                times.update(sample_times(*(op.GetAttr() for op in xformable.GetOrderedXformOps())))
+            yield from (op.GetAttr() for op in xformable.GetOrderedXformOps())
             if xformable.GetResetXformStack():
                 break
         if prim == root:
             break
         prim = prim.GetParent()
-    return times
+
+
+def transform_times(prim, root=None) -> set[float]:
+    """Times at which the transforms from a prim to the world, or to and with a root's, have samples.
+
+    Of those transforms only that have two or more.
+    """
+    return sample_times(*transform_attributes(prim, root))
 
 
 def visibility_times(prim, root=None) -> set[float]:

@@ -2,9 +2,9 @@
 
 from pxr import Usd, UsdSkel
 
-from .usd_stage import sample_times
+from .usd_stage import UnreadableError, sample_times
 
-__all__ = ["Skin", "find_skins"]
+__all__ = ["Skin", "find_bindings"]
 
 
 class Skin:
@@ -15,7 +15,7 @@ class Skin:
         times: Time codes at which the animation has a sample.
     """
 
-    def __init__(self, skinning, skeleton_query, where):
+    def __init__(self, skinning, skeleton, skeleton_query, where):
         self._where = where
         self._skinning = skinning
         self._query = skeleton_query
@@ -24,7 +24,8 @@ class Skin:
         self._blend_shapes = None
         if skinning.HasBlendShapes() and self._animation:
             self._blend_shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
-        self.skeleton = skeleton_query.GetPrim() if skinning.HasJointInfluences() else None
+        # Not the query's, which is that of the prototype if the skeleton is in an instance.
+        self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
         self.times = set()
         if self._animation:
             if self.skeleton:
@@ -41,14 +42,14 @@ class Skin:
         """Deform points, a ``Vt.Vec3fArray``, in place.
 
         Raises:
-            ValueError: If the bindings are broken.
+            UnreadableError: If the bindings are broken.
         """
         if self._blend_shapes:
             self._apply_blend_shapes(points, time)
         if self.skeleton:
             transforms = self._query.ComputeSkinningTransforms(time)
             if not transforms or not self._skinning.ComputeSkinnedPoints(transforms, points, time):
-                raise ValueError(f"{self._where}: the binding to {self.skeleton.GetPath()} is broken")
+                raise UnreadableError(f"{self._where}: the binding to {self.skeleton.GetPath()} is broken")
 
     def _apply_blend_shapes(self, points, time):
         weights = self._animation.ComputeBlendShapeWeights(time)
@@ -60,28 +61,21 @@ class Skin:
         if not query.ComputeDeformedPoints(
             *shapes, query.ComputeBlendShapePointIndices(), query.ComputeSubShapePointOffsets(), points
         ):
-            raise ValueError(f"{self._where}: the blend shapes do not fit the mesh")
+            raise UnreadableError(f"{self._where}: the blend shapes do not fit the mesh")
 
     def _add_times(self, times):
         if len(times) > 1:
             self.times.update(times)
 
 
-def find_skins(root, file) -> dict:
-    """What deforms each mesh below a ``SkelRoot``, by the paths of the meshes.
-
-    Args:
-        root: The ``SkelRoot``.
-        file: Its file, for messages.
-    """
+def find_bindings(root) -> dict:
+    """What the meshes below a ``SkelRoot`` are bound to, by their paths: the first arguments of :class:`Skin`."""
     cache = UsdSkel.Cache()
     root = UsdSkel.Root(root)
     predicate = Usd.TraverseInstanceProxies()
     cache.Populate(root, predicate)
-    skins = {}
-    for binding in cache.ComputeSkelBindings(root, predicate):
-        query = cache.GetSkelQuery(binding.GetSkeleton())
-        for skinning in binding.GetSkinningTargets():
-            path = skinning.GetPrim().GetPath()
-            skins[path] = Skin(skinning, query, f"{file}: {path}")
-    return skins
+    return {
+        skinning.GetPrim().GetPath(): (skinning, binding.GetSkeleton(), cache.GetSkelQuery(binding.GetSkeleton()))
+        for binding in cache.ComputeSkelBindings(root, predicate)
+        for skinning in binding.GetSkinningTargets()
+    }

@@ -34,7 +34,7 @@ class Validation:
     false_hits: int
 
 
-def validate(detector, collisions, x0, x1, *, most: int | None, seed: int) -> Validation:
+def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, counted=None) -> Validation:
     """Ask the answers of a detection again.
 
     Reported collisions must collide, and do so at the time that was reported. Pairs that were not reported, of all
@@ -47,6 +47,7 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int) -> Va
         x1: Positions at the end, shape [vertex_count, 3].
         most: How many collisions and how many other pairs are asked, taken at random; None for all.
         seed: Of the random choice.
+        counted: Which of the reported pairs are asked, vertex-face before edge-edge, booleans; default: all.
     """
     mesh = detector.mesh
     random = np.random.default_rng(seed)
@@ -61,6 +62,8 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int) -> Va
             return np.concatenate([x0[corners], x1[corners]], axis=1)
 
         rows = np.arange(len(found))
+        if counted is not None:
+            rows, counted = np.flatnonzero(counted[: len(found)]), counted[len(found) :]
         if most is not None and len(rows) > most:
             rows = np.sort(random.choice(rows, most, replace=False))
         asked_hits += len(rows)
