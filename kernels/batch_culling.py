@@ -2,7 +2,7 @@
 
 Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the
 other culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
-polynomials are good for. The operations are those of :mod:`.culling` and :mod:`.polynomials`, in the same order, and so
+polynomials are good for. The operations are those of :mod:`.kernels.culling` and :mod:`.kernels.polynomials`, in the same order, and so
 are the bounds on their errors.
 
 Pairs are not scaled, because powers of two change nothing but overflow and underflow. A sum that overflows is culled by

@@ -275,7 +275,7 @@ def test_interrupted(stage, tmp_path, monkeypatch, capsys):
 
 
 def test_interrupted_in_the_middle_of_a_record(stage, tmp_path, monkeypatch):
-    from warp_bsc.output_file import OutputFile  # noqa: PLC0415
+    from warp_bsc._atomic_file import OutputFile  # noqa: PLC0415
 
     write = OutputFile.write
     calls = []

@@ -48,7 +48,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from .arrays import checked_coordinates
+from ._arrays import checked_coordinates
 
 __all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "vertex_face", "vertex_face_toi"]
 

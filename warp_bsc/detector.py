@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from . import checker
-from .arrays import check_finite, checked_shape
+from ._arrays import check_finite, checked_shape
 from .blocks import BlockBroadPhase
 from .bvh import BvhBroadPhase
 from .collision_arrays import CollisionArrays, put, take

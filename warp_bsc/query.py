@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .arrays import check_finite, checked_shape
+from ._arrays import check_finite, checked_shape
 from .kernels.signs import FREE, HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
 

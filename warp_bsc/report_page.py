@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ._atomic_file import OutputFile
 from .outcome import CERTIFIED_FOR, Outcome
-from .output_file import OutputFile
 
 __all__ = ["ReportPage"]
 

@@ -159,7 +159,10 @@ class Scene:
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        from . import usd_meshes, usd_stage  # noqa: PLC0415 (import pxr)
+        from . import (
+            usd_meshes,
+            usd_stage,
+        )
 
         self.path = str(path)
         self.selection = selection or Selection()
