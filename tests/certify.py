@@ -22,7 +22,7 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.kernels.polygon import BITS
+from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")
 TOLERANCE = 2.0**-20

@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_bsc.kernels.exact import decide_in
-from warp_bsc.kernels.polygon import spread
+from warp_bsc.kernels.exact.decision import decide_in
+from warp_bsc.kernels.exact.polygon import spread
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_bsc import checker
 from warp_bsc.kernels import algebraic
-from warp_bsc.kernels.wide_integers import integer
+from warp_bsc.kernels.exact.wide_integers import integer
 
 DIGITS = 30
 number = integer(2)

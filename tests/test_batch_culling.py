@@ -7,7 +7,6 @@ from generators import GENERATORS
 
 from warp_bsc import checker
 from warp_bsc.bench_methods import Queries, QuerySet
-from warp_bsc.kernels.batch_culling import BATCH, cull_batch_of, lowest_bit
 from warp_bsc.kernels.culling import (
     centroid_direction,
     direction_separates,
@@ -15,6 +14,7 @@ from warp_bsc.kernels.culling import (
     vertex_face_boxes_apart,
 )
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
+from warp_bsc.kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import ROUNDOFF, certified_sign_cubic
 

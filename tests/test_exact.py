@@ -14,9 +14,9 @@ from test_wide_integers import to_integers
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.kernels.algebraic import remainder
-from warp_bsc.kernels.polygon import BITS, coordinate, cross_component, make_polygon, spread, volume
-from warp_bsc.kernels.wide_integers import integer, minor, subtract, times
+from warp_bsc.kernels.exact.algebraic import remainder
+from warp_bsc.kernels.exact.polygon import BITS, coordinate, cross_component, make_polygon, spread, volume
+from warp_bsc.kernels.exact.wide_integers import integer, minor, subtract, times
 
 needs_data = pytest.mark.skipif(data_folder() is None, reason="no test data beside the project")
 

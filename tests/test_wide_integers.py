@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.kernels.wide_integers import (
+from warp_bsc.kernels.exact.wide_integers import (
     LIMBS,
     add,
     integer,

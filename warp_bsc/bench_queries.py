@@ -10,10 +10,10 @@ from .bench import median_milliseconds
 from .kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from .kernels.exact import NONE, decide_in
+from .kernels.exact.decision import NONE, decide_in
 from .kernels.motion import edge_edge_motion, vertex_face_motion
+from .kernels.pipeline.queues import take_slot
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
-from .kernels.queues import take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
 from .launching import launch_over, launch_over_queue

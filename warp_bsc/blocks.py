@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import warp as wp
 
-from .kernels.blocks import pair_block
-from .kernels.boxes import rounded
+from .kernels.pipeline.blocks import pair_block
+from .kernels.pipeline.boxes import rounded
 from .launching import launch_over
 from .narrow_phase import UNLIMITED, Count
 
@@ -144,7 +144,7 @@ def _pair_blocks(
 
 
 class _Tree:
-    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.blocks`."""
+    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.pipeline.blocks`."""
 
     def __init__(self, corners, numbers, world):
         """Makes an empty tree.
@@ -214,7 +214,7 @@ class _Tree:
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
     def pair(self, other, counts, pairs, *, keep_apart=False):
-        """Enqueues pairs of elements of this tree and of another or the same, see :func:`.kernels.blocks.pair_block`.
+        """Enqueues pairs of elements of this tree and of another or the same, see :func:`.kernels.pipeline.blocks.pair_block`.
 
         Args:
             other: The other tree.

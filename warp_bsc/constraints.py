@@ -3,8 +3,8 @@
 import warp as wp
 
 from .history import History
-from .kernels.pairs import vertices_of_pair
-from .kernels.queues import is_filled
+from .kernels.pipeline.pairs import vertices_of_pair
+from .kernels.pipeline.queues import is_filled
 from .kernels.signs import FREE
 from .narrow_phase import Count
 

@@ -1,7 +1,7 @@
 """The exact stage: wide integers decide, on the device, what floating point leaves open.
 
 Contacts that the stage before has put in a queue are decided in integers of one limb a coordinate, see
-:mod:`warp_bsc.kernels.exact`. Those whose exponents are too far apart for that go to the next queue, for two limbs, and
+:mod:`warp_bsc.kernels.exact.decision`. Those whose exponents are too far apart for that go to the next queue, for two limbs, and
 so on to eight, which take every query in single precision. What is too wide for that too is counted, and left to the
 host. Each width has a kernel of its own, so that the usual one stays small.
 """
@@ -12,12 +12,12 @@ import math
 import warp as wp
 
 from .kernels.closest import contact_at
-from .kernels.exact import NONE, TOO_WIDE, decide_in
+from .kernels.exact.decision import NONE, TOO_WIDE, decide_in
+from .kernels.exact.polygon import BITS
 from .kernels.motion import edge_edge_motion, vertex_face_motion
-from .kernels.pairs import vertices_of_pair
-from .kernels.polygon import BITS
+from .kernels.pipeline.pairs import vertices_of_pair
+from .kernels.pipeline.queues import take_slot
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.queues import take_slot
 from .kernels.signs import FREE, HIT
 from .launching import launch_over_queue
 

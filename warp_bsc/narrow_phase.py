@@ -1,7 +1,7 @@
 """The narrow phase: pairs that come near -> culls -> certified classification -> times of impact, sorted.
 
 Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
-the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels.queues`.
+the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels.pipeline.queues`.
 """
 
 import enum
@@ -12,7 +12,6 @@ import warp as wp
 
 from . import checker
 from .exact_stage import launch_exact_stage
-from .kernels.batch_culling import BATCH, cull_batch_of, lowest_bit
 from .kernels.classification import classify
 from .kernels.closest import contact_at
 from .kernels.culling import (
@@ -22,8 +21,9 @@ from .kernels.culling import (
     vertex_face_boxes_apart,
 )
 from .kernels.motion import edge_edge_motion, vertex_face_motion
+from .kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from .kernels.pipeline.queues import append, is_filled, take_slot
 from .kernels.polynomials import coplanarity
-from .kernels.queues import append, is_filled, take_slot
 from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
 from .launching import launch_over, launch_over_queue

@@ -17,9 +17,9 @@ from .constraints import (
     to_double,
 )
 from .kernels.closest import closest_coordinates
-from .kernels.pairs import vertices_of_pair
+from .kernels.pipeline.pairs import vertices_of_pair
+from .kernels.pipeline.queues import is_filled
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.queues import is_filled
 from .narrow_phase import Count
 
 __all__ = ["NearPairs", "closest_weights", "collect_near_pairs", "forget_near_pairs"]

@@ -15,7 +15,7 @@ from .constraints import (
     to_single,
 )
 from .history import end_iteration, is_recording, record_entry
-from .kernels.queues import take_slot
+from .kernels.pipeline.queues import take_slot
 
 __all__ = [
     "ANOTHER",

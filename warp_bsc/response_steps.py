@@ -30,8 +30,8 @@ from .constraints import (
 from .half_spaces import HalfSpaces, clearance, time_of_entry
 from .history import GRAZING, STANDS, History
 from .kernels.gradients import with_gradients
+from .kernels.pipeline.queues import is_filled
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.queues import is_filled
 from .kernels.signs import FREE, HIT, UNSURE
 from .kernels.time_of_impact import Impact
 from .narrow_phase import TOLERANCE, Count

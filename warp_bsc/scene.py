@@ -159,7 +159,7 @@ class Scene:
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        from . import (
+
             usd_meshes,
             usd_stage,
         )

@@ -26,7 +26,7 @@ from typing import Any
 
 import warp as wp
 
-from .polynomials import VERTEX_FACE
+from ..polynomials import VERTEX_FACE
 from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit
 
 BITS = {1: 35, 2: 71, 8: 291}

@@ -39,9 +39,9 @@ from typing import Any
 
 import warp as wp
 
+from ..polynomials import EDGE_EDGE, VERTEX_FACE
 from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
 from .polygon import BITS, coordinate, cross_component, make_polygon, sign_at_end, spread, volume
-from .polynomials import EDGE_EDGE, VERTEX_FACE
 from .wide_integers import add, integer, product, sign, subtract, widen
 
 NONE = wp.constant(wp.float64(2.0))

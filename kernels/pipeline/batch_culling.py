@@ -15,9 +15,9 @@ import functools
 
 import warp as wp
 
-from .culling import DIRECTION_ERROR
-from .polynomials import COPLANARITY_ERROR
-from .signs import UNDERFLOW
+from ..culling import DIRECTION_ERROR
+from ..polynomials import COPLANARITY_ERROR
+from ..signs import UNDERFLOW
 
 BATCH = wp.constant(64)
 """Pairs that one call culls."""

@@ -6,7 +6,7 @@ have representatives with overlapping boxes, so that one traversal over faces fi
 
 import warp as wp
 
-from .polynomials import VERTEX_FACE
+from ..polynomials import VERTEX_FACE
 
 
 @wp.func
