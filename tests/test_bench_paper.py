@@ -14,7 +14,7 @@ from warp_bsc.bench_peers import measure_peer
 from warp_bsc.bench_scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench_worst import find_worst
 from warp_bsc.cli import main
-from warp_bsc.launching import one_core
+from warp_bsc.detection.launch import one_core
 
 TINY = Effort(intervals=2, queries=3000, sample=100, peer_queries=20, adversaries=50, repeat=1)
 

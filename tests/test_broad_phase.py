@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warp_bsc as bsc
-from warp_bsc.blocks import BlockBroadPhase
-from warp_bsc.bvh import BvhBroadPhase
-from warp_bsc.narrow_phase import Count
+from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
+from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
+from warp_bsc.detection.narrow_phase import Count
 
 
 def find_pairs(broad_phase, mesh, x0, x1):

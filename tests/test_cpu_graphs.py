@@ -17,7 +17,7 @@ from test_solver import DT, SOLVERS, bullet
 
 import warp_bsc as bsc
 from warp_bsc import host_function
-from warp_bsc.host_function import run_on_host
+from warp_bsc.detection.host_function import run_on_host
 
 CPU = wp.get_device("cpu")
 

@@ -8,10 +8,10 @@ from benchmark_data import data_folder
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.blocks import BlockBroadPhase
-from warp_bsc.bvh import BvhBroadPhase
+from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
+from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
+from warp_bsc.detection.narrow_phase import Count
 from warp_bsc.kernels.signs import FREE
-from warp_bsc.narrow_phase import Count
 
 METHODS = ("float", "conservative", "exact")
 
@@ -21,7 +21,7 @@ def broad_phase(request, monkeypatch, device):
     """Both broad phases where both run, whatever the detector would choose."""
     if device.is_cuda and request.param is BlockBroadPhase:
         pytest.skip("blocks are for the CPU")
-    monkeypatch.setattr("warp_bsc.detector._broad_phase", request.param)
+    monkeypatch.setattr("warp_bsc.detection.detector._broad_phase", request.param)
     return request.param
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 
 from .bench_scenes import BenchmarkScene
-from .detector import CollisionDetector, StageCounts
-from .mesh import CollisionMesh
+from .detection.detector import CollisionDetector, StageCounts
+from .detection.mesh import CollisionMesh
 
 __all__ = [
     "DetectorBenchmark",

@@ -25,7 +25,9 @@ import warp as wp
 
 from .baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
 from .bench import median_milliseconds
-from .exact_stage import launch_exact_stage
+from .detection.exact_stage import launch_exact_stage
+from .detection.launch import launch_over, launch_over_queue
+from .detection.narrow_phase import TOLERANCE
 from .kernels.classification import classify
 from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from .kernels.motion import edge_edge_motion, vertex_face_motion
@@ -34,8 +36,6 @@ from .kernels.pipeline.queues import take_slot
 from .kernels.polynomials import coplanarity
 from .kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from .kernels.time_of_impact import impact
-from .launching import launch_over, launch_over_queue
-from .narrow_phase import TOLERANCE
 
 __all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace_stages"]
 

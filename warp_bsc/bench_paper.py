@@ -20,11 +20,11 @@ from .bench_methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measur
 from .bench_peers import PEERS, PeerMeasurement, ask_peer, measure_peer
 from .bench_scenes import BenchmarkScene
 from .bench_worst import WorstQuery, adversarial_queries, find_worst
-from .detector import CollisionDetector
+from .detection.detector import CollisionDetector
+from .detection.launch import one_core
+from .detection.mesh import CollisionMesh
+from .detection.narrow_phase import Count
 from .kernels.signs import UNSURE
-from .launching import one_core
-from .mesh import CollisionMesh
-from .narrow_phase import Count
 
 __all__ = [
     "KINDS",

@@ -19,10 +19,10 @@ from .bench import benchmark_detector, count_threads, limited_threads
 from .bench_command import add_paper_options, run_paper_benchmarks
 from .bench_queries import benchmark_copy, benchmark_queries, check_query_count
 from .bench_scenes import default_scenes, load_scene
-from .detector import CollisionDetector
-from .mesh import CollisionMesh
-from .narrow_phase import METHODS
-from .query import query_edge_edge, query_vertex_face
+from .detection.detector import CollisionDetector
+from .detection.mesh import CollisionMesh
+from .detection.narrow_phase import METHODS
+from .detection.query import query_edge_edge, query_vertex_face
 from .query_file import KINDS, find_query_files, read_query_file
 from .replay_command import add_replay_options, open_scene, run_replay
 from .report import (

@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from .detection.narrow_phase import Count
 from .history import History
 from .kernels.pipeline.pairs import vertices_of_pair
 from .kernels.pipeline.queues import is_filled
 from .kernels.signs import FREE
-from .narrow_phase import Count
 
 __all__ = [
     "ACTIVE",

@@ -101,7 +101,7 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
 
     Args:
         segment: The meshes.
-        mesh: Their :class:`~warp_bsc.mesh.CollisionMesh`.
+        mesh: Their :class:`~warp_bsc.detection.mesh.CollisionMesh`.
         collisions: What the detector found.
         x0: Positions at the start, shape [vertex_count, 3].
         x1: Positions at the end, shape [vertex_count, 3].

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .contacts import Contacts, find_contacts
-from .detector import CollisionDetector, DetectionStats
-from .mesh import CollisionMesh
+from .detection.detector import CollisionDetector, DetectionStats
+from .detection.mesh import CollisionMesh
 from .scene import Scene
 from .validation import Validation, validate
 

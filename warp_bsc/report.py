@@ -8,7 +8,7 @@ from rich.table import Table
 
 from .bench import DetectorBenchmark
 from .bench_queries import MODES, SEED, QueryBenchmark
-from .query import QueryResult
+from .detection.query import QueryResult
 from .query_file import QueryFile
 from .tables import count, make_table, say
 

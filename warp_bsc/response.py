@@ -30,7 +30,8 @@ from .constraints import (
     to_double,
     to_single,
 )
-from .detector import CollisionDetector
+from .detection.detector import CollisionDetector
+from .detection.narrow_phase import Count, roomy
 from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces
 from .history import (
     FORGOTTEN,
@@ -41,7 +42,6 @@ from .history import (
     begin_round,
     is_recording,
 )
-from .narrow_phase import Count, roomy
 from .near_pairs import NearPairs, collect_near_pairs, forget_near_pairs
 from .projection import (
     ANOTHER,
@@ -503,7 +503,7 @@ class Response:
     def _launch_over(self, kernel, queue, counts, count, inputs):
         """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU.
 
-        Unlike :func:`.launching.launch_over_queue` on one thread of the CPU, where Warp's atomic additions are none.
+        Unlike :func:`.detection.launch.launch_over_queue` on one thread of the CPU, where Warp's atomic additions are none.
         """
         entries = len(queue)
         if self.device.is_cpu:

@@ -27,6 +27,7 @@ from .constraints import (
     urgency_of,
     widened,
 )
+from .detection.narrow_phase import TOLERANCE, Count
 from .half_spaces import HalfSpaces, clearance, time_of_entry
 from .history import GRAZING, STANDS, History
 from .kernels.gradients import with_gradients
@@ -34,7 +35,6 @@ from .kernels.pipeline.queues import is_filled
 from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels.signs import FREE, HIT, UNSURE
 from .kernels.time_of_impact import Impact
-from .narrow_phase import TOLERANCE, Count
 from .near_pairs import closest_weights
 from .projection import accelerated, displaced, starts, takes_back
 

@@ -8,8 +8,8 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
+from .detection.host_function import run_on_host
 from .history import GRAZING
-from .host_function import run_on_host
 from .model_mesh import ModelMesh
 from .response import FROZEN, TRUNCATED, Response
 from .response_gradient import Recording, Undoing

@@ -41,7 +41,7 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, count
     whose swept boxes overlap, must not. These are found by a grid that has nothing in common with the detector.
 
     Args:
-        detector: The :class:`~warp_bsc.detector.CollisionDetector`.
+        detector: The :class:`~warp_bsc.detection.detector.CollisionDetector`.
         collisions: What it found.
         x0: Positions at the start, shape [vertex_count, 3].
         x1: Positions at the end, shape [vertex_count, 3].

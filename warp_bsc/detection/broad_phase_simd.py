@@ -5,9 +5,9 @@ import functools
 import numpy as np
 import warp as wp
 
-from .kernels.pipeline.blocks import pair_block
-from .kernels.pipeline.boxes import rounded
-from .launching import launch_over
+from ..kernels.pipeline.blocks import pair_block
+from ..kernels.pipeline.boxes import rounded
+from .launch import launch_over
 from .narrow_phase import UNLIMITED, Count
 
 __all__ = ["BlockBroadPhase"]
@@ -249,7 +249,7 @@ def _join(children, parents):
 class BlockBroadPhase:
     """Finds the candidate pairs of a mesh: those that share no vertex and whose swept boxes overlap.
 
-    It has the interface of :class:`warp_bsc.bvh.BvhBroadPhase`, but no queue of its own.
+    It has the interface of :class:`warp_bsc.detection.broad_phase_bvh.BvhBroadPhase`, but no queue of its own.
     """
 
     queues = ()

@@ -4,9 +4,9 @@ import functools
 
 import warp as wp
 
-from .kernels.pipeline.boxes import boxes_apart, boxes_overlap, rounded
-from .kernels.pipeline.pairs import owns_edge, owns_vertex
-from .kernels.pipeline.queues import append, is_filled, take_slots, write
+from ..kernels.pipeline.boxes import boxes_apart, boxes_overlap, rounded
+from ..kernels.pipeline.pairs import owns_edge, owns_vertex
+from ..kernels.pipeline.queues import append, is_filled, take_slots, write
 from .narrow_phase import Count, roomy
 
 __all__ = ["BvhBroadPhase"]

@@ -10,23 +10,23 @@ import functools
 import numpy as np
 import warp as wp
 
-from . import checker
-from .exact_stage import launch_exact_stage
-from .kernels.classification import classify
-from .kernels.closest import contact_at
-from .kernels.culling import (
+from .. import checker
+from ..kernels.classification import classify
+from ..kernels.closest import contact_at
+from ..kernels.culling import (
     centroid_direction,
     direction_separates,
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from .kernels.motion import edge_edge_motion, vertex_face_motion
-from .kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
-from .kernels.pipeline.queues import append, is_filled, take_slot
-from .kernels.polynomials import coplanarity
-from .kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
-from .kernels.time_of_impact import impact
-from .launching import launch_over, launch_over_queue
+from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.polynomials import coplanarity
+from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
+from ..kernels.time_of_impact import impact
+from .exact_stage import launch_exact_stage
+from .launch import launch_over, launch_over_queue
 
 __all__ = [
     "METHODS",

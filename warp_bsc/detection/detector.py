@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from . import checker
-from ._arrays import check_finite, checked_shape
-from .blocks import BlockBroadPhase
-from .bvh import BvhBroadPhase
-from .collision_arrays import CollisionArrays, put, take
+from .. import checker
+from .._arrays import check_finite, checked_shape
+from ..kernels.crossing import edge_crosses_face
+from ..kernels.signs import HIT, UNSURE
+from .broad_phase_bvh import BvhBroadPhase
+from .broad_phase_simd import BlockBroadPhase
+from .differentiable import CollisionArrays, put, take
 from .host_function import run_on_host
-from .kernels.crossing import edge_crosses_face
-from .kernels.signs import HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly, roomy
 
 __all__ = ["CollisionDetector", "Collisions", "DetectionStats", "StageCounts"]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ._arrays import check_finite, checked_shape
-from .kernels.signs import FREE, HIT, UNSURE
+from .._arrays import check_finite, checked_shape
+from ..kernels.signs import FREE, HIT, UNSURE
 from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]

@@ -4,12 +4,12 @@ import functools
 
 import warp as wp
 
-from .kernels.gradients import with_gradients
-from .kernels.motion import double
-from .kernels.pipeline.pairs import vertices_of_pair
-from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.signs import HIT, UNSURE
-from .kernels.time_of_impact import Impact
+from ..kernels.gradients import with_gradients
+from ..kernels.motion import double
+from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import HIT, UNSURE
+from ..kernels.time_of_impact import Impact
 from .narrow_phase import Count
 
 __all__ = ["CollisionArrays", "put", "take"]

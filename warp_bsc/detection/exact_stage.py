@@ -11,15 +11,15 @@ import math
 
 import warp as wp
 
-from .kernels.closest import contact_at
-from .kernels.exact.decision import NONE, TOO_WIDE, decide_in
-from .kernels.exact.polygon import BITS
-from .kernels.motion import edge_edge_motion, vertex_face_motion
-from .kernels.pipeline.pairs import vertices_of_pair
-from .kernels.pipeline.queues import take_slot
-from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .kernels.signs import FREE, HIT
-from .launching import launch_over_queue
+from ..kernels.closest import contact_at
+from ..kernels.exact.decision import NONE, TOO_WIDE, decide_in
+from ..kernels.exact.polygon import BITS
+from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.queues import take_slot
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import FREE, HIT
+from .launch import launch_over_queue
 
 __all__ = ["launch_exact_stage"]
 
