@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_bsc as bsc
 from warp_bsc import model_mesh
-from warp_bsc.model_mesh import ModelMesh
+from warp_bsc.response.model_mesh import ModelMesh
 
 BOX = newton.Mesh.create_box(1.0, 1.0, 1.0)  # with the vertices of each side for itself
 

@@ -187,7 +187,7 @@ def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
         return rollout.solver.report.rounds
 
     with_near_pairs = rounds()
-    monkeypatch.setattr("warp_bsc.response.Response._collect_near_pairs", lambda self: None)
+    monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
     assert 0 < with_near_pairs <= 3 < rounds()
 
 

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import warp_bsc as bsc
-from warp_bsc.response_gradient import Recording, Undoing
+from warp_bsc.response.adjoint import Recording, Undoing
 
 DT = 1.0 / 600.0
 STEPS = 40

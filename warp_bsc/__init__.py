@@ -31,8 +31,8 @@ _MODULES = {
     "Collisions": "detection.detector",
     "DetectionStats": "detection.detector",
     "QueryResult": "detection.query",
-    "SolverCCD": "solver",
-    "SolverReport": "solver",
+    "SolverCCD": "response.solver_ccd",
+    "SolverReport": "response.solver_ccd",
     "query_edge_edge": "detection.query",
     "query_vertex_face": "detection.query",
 }

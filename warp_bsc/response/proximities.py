@@ -2,6 +2,11 @@
 
 import warp as wp
 
+from ..detection.narrow_phase import Count
+from ..kernels.closest import closest_coordinates
+from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.queues import is_filled
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .constraints import (
     NEAR_EDGES,
     NEAR_VERTEX_FACE,
@@ -16,11 +21,6 @@ from .constraints import (
     relative,
     to_double,
 )
-from .detection.narrow_phase import Count
-from .kernels.closest import closest_coordinates
-from .kernels.pipeline.pairs import vertices_of_pair
-from .kernels.pipeline.queues import is_filled
-from .kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 __all__ = ["NearPairs", "closest_weights", "collect_near_pairs", "forget_near_pairs"]
 

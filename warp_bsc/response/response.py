@@ -3,6 +3,9 @@
 import numpy as np
 import warp as wp
 
+from ..detection.detector import CollisionDetector
+from ..detection.narrow_phase import Count, roomy
+from .adjoint_kernels import count_grazing
 from .angular_momentum import SUMS, sum_bodies, sum_torques, turn_vertices
 from .constraints import (
     ACTIVE,
@@ -30,19 +33,7 @@ from .constraints import (
     to_double,
     to_single,
 )
-from .detection.detector import CollisionDetector
-from .detection.narrow_phase import Count, roomy
-from .half_spaces import HalfSpaces, collect_penetrations, place_half_spaces
-from .history import (
-    FORGOTTEN,
-    STANDS,
-    TRUNCATED_PATHS,
-    History,
-    StepHistory,
-    begin_round,
-    is_recording,
-)
-from .near_pairs import NearPairs, collect_near_pairs, forget_near_pairs
+from .planes import HalfSpaces, collect_penetrations, place_half_spaces
 from .projection import (
     ANOTHER,
     BATCH,
@@ -55,7 +46,16 @@ from .projection import (
     move_vertices,
     start_impulses,
 )
-from .response_steps import count_grazing
+from .proximities import NearPairs, collect_near_pairs, forget_near_pairs
+from .step_record import (
+    FORGOTTEN,
+    STANDS,
+    TRUNCATED_PATHS,
+    History,
+    StepHistory,
+    begin_round,
+    is_recording,
+)
 
 __all__ = ["FROZEN", "TRUNCATED", "Response"]
 
@@ -187,7 +187,7 @@ class Response:
     Attributes:
         detector: What it detects with.
         vertices: The vertices, whose ``x0``, ``x1`` and ``velocity`` are to be filled.
-        steer: Array of int that says, by the places that :mod:`.constraints` names, what was done.
+        steer: Array of int that says, by the places that :mod:`.response.constraints` names, what was done.
         constraints: What contacts ask for, :class:`Constraints`.
         half_spaces: The infinite planes, :class:`HalfSpaces`.
         history: What the last step did, if it was to be taken down, :class:`StepHistory`.

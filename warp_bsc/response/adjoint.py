@@ -12,21 +12,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .angular_momentum import SUMS, turns
-from .constraints import PROJECTED, ROUND, STEER, TRUNCATIONS, UNDETECTED, Constraints, Progress, Vertices
-from .half_spaces import HalfSpaces
-from .history import (
-    ENTRIES,
-    FORGOTTEN,
-    ITERATIONS_DONE,
-    MARKED,
-    OF_ENTRIES,
-    OF_TRUNCATIONS,
-    TRUNCATED_PATHS,
-    History,
-)
-from .projection import BATCH, moved, spread
-from .response_steps import (
+from .adjoint_kernels import (
     CURRENT,
     CURSOR,
     FIRST,
@@ -41,6 +27,20 @@ from .response_steps import (
     truncating,
     turning,
     twisting,
+)
+from .angular_momentum import SUMS, turns
+from .constraints import PROJECTED, ROUND, STEER, TRUNCATIONS, UNDETECTED, Constraints, Progress, Vertices
+from .planes import HalfSpaces
+from .projection import BATCH, moved, spread
+from .step_record import (
+    ENTRIES,
+    FORGOTTEN,
+    ITERATIONS_DONE,
+    MARKED,
+    OF_ENTRIES,
+    OF_TRUNCATIONS,
+    TRUNCATED_PATHS,
+    History,
 )
 
 __all__ = ["Recording", "Undoing"]

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..kernels.pipeline.queues import take_slot
 from .constraints import (
     PROJECTED,
     ROUND,
@@ -14,8 +15,7 @@ from .constraints import (
     to_double,
     to_single,
 )
-from .history import end_iteration, is_recording, record_entry
-from .kernels.pipeline.queues import take_slot
+from .step_record import end_iteration, is_recording, record_entry
 
 __all__ = [
     "ANOTHER",

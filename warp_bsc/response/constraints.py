@@ -1,12 +1,12 @@
-"""Contacts as constraints on the ends of paths, collected from detections; :mod:`.projection` solves them."""
+"""Contacts as constraints on the ends of paths, collected from detections; :mod:`.response.projection` solves them."""
 
 import warp as wp
 
-from .detection.narrow_phase import Count
-from .history import History
-from .kernels.pipeline.pairs import vertices_of_pair
-from .kernels.pipeline.queues import is_filled
-from .kernels.signs import FREE
+from ..detection.narrow_phase import Count
+from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.queues import is_filled
+from ..kernels.signs import FREE
+from .step_record import History
 
 __all__ = [
     "ACTIVE",

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, ParticleFlags, ShapeFlags
 
-from .detection.mesh import CollisionMesh
+from ..detection.mesh import CollisionMesh
 
 __all__ = ["ModelMesh", "Planes", "ShapeVertices"]
 
