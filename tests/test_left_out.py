@@ -9,7 +9,7 @@ from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
 from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.cli import main
-from warp_bsc.scene import Scene
+from warp_bsc.usd.scene import Scene
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_bsc.replay import replay
-from warp_bsc.scene import Scene
+from warp_bsc.usd.scene import Scene
 
 ASSETS = Path(__file__).parents[1] / "assets"
 SCENES = {"twisting": 5000, "funnel": 5000, "dancer": 5000, "flamenco": 8960, "crashing": 14320}

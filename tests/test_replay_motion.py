@@ -22,7 +22,7 @@ from stages import (
 )
 
 from warp_bsc.cli import main
-from warp_bsc.scene import Scene
+from warp_bsc.usd.scene import Scene
 
 
 @pytest.fixture

@@ -331,7 +331,7 @@ def test_skinning_is_what_usd_bakes(stage, tmp_path):
     binding.CreateJointWeightsPrimvar(False, 2).Set([1, 0, 0.75, 0.25, 0.5, 0.5, 0, 1])
     path = save(stage)
 
-    from warp_bsc.scene import Scene  # noqa: PLC0415
+    from warp_bsc.usd.scene import Scene  # noqa: PLC0415
 
     scene = Scene(path)
     assert scene.times == [0, 1, 2, 3, 4]
@@ -535,7 +535,7 @@ def test_steps_do_not_go_over_a_change_of_topology(stage):
 
 
 def test_instances_are_where_usd_has_them(stage):
-    from warp_bsc.scene import Scene  # noqa: PLC0415
+    from warp_bsc.usd.scene import Scene  # noqa: PLC0415
 
     instancer = add_instancer(stage, "/World/Leaves", {0: [(1, 2, 3), (4, 5, 6)], 2: [(2, 2, 3), (4, 0, 6)]},
                               ["/World/Leaves/Leaf"])  # fmt: skip

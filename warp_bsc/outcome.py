@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from .replay import TOI_BINS, Interval
-from .scene import Scene
+from .usd.scene import Scene
 
 __all__ = ["CERTIFIED_FOR", "Outcome"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from .contacts import Contacts, find_contacts
 from .detection.detector import CollisionDetector, DetectionStats
 from .detection.mesh import CollisionMesh
-from .scene import Scene
+from .usd.scene import Scene
 from .validation import Validation, validate
 
 __all__ = ["Contact", "Interval", "replay"]

@@ -17,9 +17,9 @@ from .overlay import Overlay
 from .replay import replay
 from .replay_tables import print_replay
 from .report_page import ReportPage
-from .scene import FrameRange, Scene
-from .selection import PURPOSES, Selection
 from .tables import Console, say
+from .usd.scene import FrameRange, Scene
+from .usd.selection import PURPOSES, Selection
 
 __all__ = ["add_replay_options", "open_scene", "run_replay"]
 

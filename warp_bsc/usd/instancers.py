@@ -2,7 +2,7 @@
 
 from pxr import Gf, Usd, UsdGeom
 
-from .usd_stage import LeftOut, UnreadableError, reading, sample_times
+from .stage import LeftOut, UnreadableError, reading, sample_times
 
 __all__ = ["Instance", "find_instances", "is_shown", "transform_attributes", "transform_times", "visibility_times"]
 

@@ -21,7 +21,7 @@ class UnreadableError(ValueError):
     """Something in a scene that cannot be read.
 
     Attributes:
-        mesh: The :class:`~warp_bsc.usd_meshes.UsdMesh` that it is about, None if that is not read at all.
+        mesh: The :class:`~warp_bsc.usd.meshes.UsdMesh` that it is about, None if that is not read at all.
         time: The scene's time code at which it cannot be read, None if at none.
     """
 

@@ -16,14 +16,14 @@ What moves
 The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
 meshes together; at a time that is not a mesh's own sample, USD interpolates. What is not straight from one sample to
 the next, as what a transform turns or a skeleton moves, is sampled at every whole time code between as well, and a
-spline as finely as :func:`~warp_bsc.usd_stage.sample_times` says. From one time to the next each vertex is taken to
+spline as finely as :func:`~warp_bsc.usd.stage.sample_times` says. From one time to the next each vertex is taken to
 move straight, from where USD has it at the first to where USD has it when the second comes: what jumps there, from one
 value clip to the next or because it was held, ends where it was before.
 
 Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, are
 one: files have them by rounding, and OpenUSD to tell the end of a value clip from the start of the next.
 
-Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.segment.Segment` ends and the next begins.
+Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next begins.
 
 Precision
 ---------

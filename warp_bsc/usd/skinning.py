@@ -2,7 +2,7 @@
 
 from pxr import Usd, UsdSkel
 
-from .usd_stage import UnreadableError, sample_times
+from .stage import UnreadableError, sample_times
 
 __all__ = ["Skin", "find_bindings"]
 

@@ -8,8 +8,7 @@ from itertools import pairwise
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel, Vt
 
-from .triangulation import triangulate
-from .usd_instancers import (
+from .instancers import (
     Instance,
     find_instances,
     is_shown,
@@ -17,8 +16,9 @@ from .usd_instancers import (
     transform_times,
     visibility_times,
 )
-from .usd_skinning import Skin, find_bindings
-from .usd_stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
+from .skinning import Skin, find_bindings
+from .stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
+from .triangulation import triangulate
 
 __all__ = ["UsdMesh", "find_meshes"]
 
@@ -81,7 +81,7 @@ class _Place:
         path: Its path.
         name: The same, with the number of the instance if a point instancer places it.
         instance: That instance, else None.
-        binding: What it is bound to, see :func:`~warp_bsc.usd_skinning.find_bindings`, None if nothing deforms it.
+        binding: What it is bound to, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
     """
 
     def __init__(self, prim, instance: Instance | None, binding: tuple | None):
