@@ -19,7 +19,7 @@ from stages import FALLING, FLOOR, add_floor, add_mesh, falling, moved, new_stag
 
 from warp_bsc import replay_command
 from warp_bsc.cli import main
-from warp_bsc.overlay import COLORS, LIT
+from warp_bsc.replay.usd_overlay import COLORS, LIT
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warp_bsc as bsc
-from warp_bsc.validation import overlapping_boxes, validate
+from warp_bsc.replay.validation import overlapping_boxes, validate
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .hit_files import HitsCsv, HitsJson
-from .outcome import Outcome
-from .overlay import Overlay
-from .replay import replay
+from .replay.hit_files import HitsCsv, HitsJson
+from .replay.html_report import ReportPage
+from .replay.intervals import replay
+from .replay.summary import Outcome
+from .replay.usd_overlay import Overlay
 from .replay_tables import print_replay
-from .report_page import ReportPage
 from .tables import Console, say
 from .usd.scene import FrameRange, Scene
 from .usd.selection import PURPOSES, Selection

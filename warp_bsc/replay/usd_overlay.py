@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ._atomic_file import OutputFile
-from .contacts import KINDS
-from .outcome import Outcome
+from .._atomic_file import OutputFile
+from .scene_contacts import KINDS
+from .summary import Outcome
 
 __all__ = ["Overlay"]
 

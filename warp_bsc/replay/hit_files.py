@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from ._atomic_file import StreamedFile
-from .contacts import KINDS
-from .outcome import CERTIFIED_FOR, Outcome
+from .._atomic_file import StreamedFile
+from .scene_contacts import KINDS
+from .summary import CERTIFIED_FOR, Outcome
 
 __all__ = ["HitsCsv", "HitsJson"]
 

@@ -4,8 +4,8 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from .replay import TOI_BINS, Interval
-from .usd.scene import Scene
+from ..usd.scene import Scene
+from .intervals import TOI_BINS, Interval
 
 __all__ = ["CERTIFIED_FOR", "Outcome"]
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .contacts import Contacts, find_contacts
-from .detection.detector import CollisionDetector, DetectionStats
-from .detection.mesh import CollisionMesh
-from .usd.scene import Scene
+from ..detection.detector import CollisionDetector, DetectionStats
+from ..detection.mesh import CollisionMesh
+from ..usd.scene import Scene
+from .scene_contacts import Contacts, find_contacts
 from .validation import Validation, validate
 
 __all__ = ["Contact", "Interval", "replay"]

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ._atomic_file import OutputFile
-from .outcome import CERTIFIED_FOR, Outcome
+from .._atomic_file import OutputFile
+from .summary import CERTIFIED_FOR, Outcome
 
 __all__ = ["ReportPage"]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from . import checker
+from .. import checker
 
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .usd.segment import Segment
+from ..usd.segment import Segment
 
 __all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "Contacts", "find_contacts"]
 
