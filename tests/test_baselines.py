@@ -7,7 +7,7 @@ from benchmark_data import data_folder, load_queries
 from generators import GENERATORS
 
 from warp_bsc import checker
-from warp_bsc.bench_methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace_stages
+from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace_stages
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
 KINDS = ("vertex_face", "edge_edge")

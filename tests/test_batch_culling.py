@@ -6,7 +6,7 @@ import warp as wp
 from generators import GENERATORS
 
 from warp_bsc import checker
-from warp_bsc.bench_methods import Queries, QuerySet
+from warp_bsc.bench.methods import Queries, QuerySet
 from warp_bsc.kernels.culling import (
     centroid_direction,
     direction_separates,

@@ -8,11 +8,11 @@ import pytest
 import warp as wp
 
 from warp_bsc import CollisionDetector, CollisionMesh, bench_command, bench_paper, bench_peers, checker
-from warp_bsc.bench_methods import METHODS, STAGES
-from warp_bsc.bench_paper import Effort, benchmark_scene, find_places
-from warp_bsc.bench_peers import measure_peer
-from warp_bsc.bench_scenes import load_intervals, load_scene, paper_scenes
-from warp_bsc.bench_worst import find_worst
+from warp_bsc.bench.ipc_toolkit import measure_peer
+from warp_bsc.bench.methods import METHODS, STAGES
+from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
+from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
+from warp_bsc.bench.worst_case import find_worst
 from warp_bsc.cli import main
 from warp_bsc.detection.launch import one_core
 
@@ -22,8 +22,8 @@ TINY = Effort(intervals=2, queries=3000, sample=100, peer_queries=20, adversarie
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     monkeypatch.setattr(Effort, "quick", classmethod(lambda cls: TINY))
-    monkeypatch.setattr("warp_bsc.bench_worst._SUSPECTS", 2)
-    monkeypatch.setattr("warp_bsc.bench_worst._CPU_NANOSECONDS", 1e4)
+    monkeypatch.setattr("warp_bsc.bench.worst_case._SUSPECTS", 2)
+    monkeypatch.setattr("warp_bsc.bench.worst_case._CPU_NANOSECONDS", 1e4)
 
 
 def bench(capsys, *arguments):
@@ -149,7 +149,7 @@ def test_worst_query_is_one_of_those_asked():
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr("warp_bsc.bench_scenes.__file__", str(tmp_path / "warp_bsc" / "bench_scenes.py"))
+    monkeypatch.setattr("warp_bsc.bench.scenes.__file__", str(tmp_path / "warp_bsc" / "bench_scenes.py"))
     with pytest.raises(FileNotFoundError, match="come with a checkout"):
         paper_scenes()
     for arguments in ([], ["--quick"], ["funnel"]):

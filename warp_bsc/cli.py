@@ -15,10 +15,10 @@ import warp as wp
 from rich.progress import track
 
 from . import __version__
-from .bench import benchmark_detector, count_threads, limited_threads
+from .bench.detector import benchmark_detector, count_threads, limited_threads
+from .bench.queries import benchmark_copy, benchmark_queries, check_query_count
+from .bench.scenes import default_scenes, load_scene
 from .bench_command import add_paper_options, run_paper_benchmarks
-from .bench_queries import benchmark_copy, benchmark_queries, check_query_count
-from .bench_scenes import default_scenes, load_scene
 from .detection.detector import CollisionDetector
 from .detection.mesh import CollisionMesh
 from .detection.narrow_phase import METHODS

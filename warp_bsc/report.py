@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass
 from rich.console import Console
 from rich.table import Table
 
-from .bench import DetectorBenchmark
-from .bench_queries import MODES, SEED, QueryBenchmark
+from .bench.detector import DetectorBenchmark
+from .bench.queries import MODES, SEED, QueryBenchmark
 from .detection.query import QueryResult
 from .query_file import QueryFile
 from .tables import count, make_table, say

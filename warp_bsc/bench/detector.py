@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .bench_scenes import BenchmarkScene
-from .detection.detector import CollisionDetector, StageCounts
-from .detection.mesh import CollisionMesh
+from ..detection.detector import CollisionDetector, StageCounts
+from ..detection.mesh import CollisionMesh
+from .scenes import BenchmarkScene
 
 __all__ = [
     "DetectorBenchmark",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .usd.scene import Scene
+from ..usd.scene import Scene
 
 __all__ = [
     "GENERATORS",

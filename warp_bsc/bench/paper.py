@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from . import checker
-from .bench import benchmark_detector, count_threads
-from .bench_methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
-from .bench_peers import PEERS, PeerMeasurement, ask_peer, measure_peer
-from .bench_scenes import BenchmarkScene
-from .bench_worst import WorstQuery, adversarial_queries, find_worst
-from .detection.detector import CollisionDetector
-from .detection.launch import one_core
-from .detection.mesh import CollisionMesh
-from .detection.narrow_phase import Count
-from .kernels.signs import UNSURE
+from .. import checker
+from ..detection.detector import CollisionDetector
+from ..detection.launch import one_core
+from ..detection.mesh import CollisionMesh
+from ..detection.narrow_phase import Count
+from ..kernels.signs import UNSURE
+from .detector import benchmark_detector, count_threads
+from .ipc_toolkit import PEERS, PeerMeasurement, ask_peer, measure_peer
+from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
+from .scenes import BenchmarkScene
+from .worst_case import WorstQuery, adversarial_queries, find_worst
 
 __all__ = [
     "KINDS",

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .bench_methods import METHODS, MethodRun, Queries, QuerySet, measure_nanoseconds
-from .kernels.signs import UNSURE
+from ..kernels.signs import UNSURE
+from .methods import METHODS, MethodRun, Queries, QuerySet, measure_nanoseconds
 
 __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
 
@@ -46,7 +46,7 @@ def find_worst(queries, device, *, repeat) -> dict[str, WorstQuery]:
     """Finds the slowest query of each method.
 
     Args:
-        queries: The :class:`~warp_bsc.bench_methods.Queries`.
+        queries: The :class:`~warp_bsc.bench.methods.Queries`.
         device: Warp device.
         repeat: How many repetitions to take the shortest of.
 

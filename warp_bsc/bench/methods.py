@@ -7,9 +7,9 @@ question: whether the two features meet. What each does, and what not, so that t
   Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
   kernel of its own, classification, and with bounds the subdivision of what that leaves open. UNSURE is a collision.
 - ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
-- ``cubic``: :mod:`warp_bsc.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
+- ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
   knows a time, too; that time is not written.
-- ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.baselines.reduced_inside_test`. As there is
+- ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.bench.baselines.reduced_inside_test`. As there is
   no subdivision in the paper, what classification leaves open is a collision at once: weak inequalities, as it has
   them. Its culls are those of ``float``.
 
@@ -23,19 +23,19 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..detection.exact_stage import launch_exact_stage
+from ..detection.launch import launch_over, launch_over_queue
+from ..detection.narrow_phase import TOLERANCE
+from ..kernels.classification import classify
+from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from ..kernels.pipeline.queues import take_slot
+from ..kernels.polynomials import coplanarity
+from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
+from ..kernels.time_of_impact import impact
 from .baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
-from .bench import median_milliseconds
-from .detection.exact_stage import launch_exact_stage
-from .detection.launch import launch_over, launch_over_queue
-from .detection.narrow_phase import TOLERANCE
-from .kernels.classification import classify
-from .kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from .kernels.motion import edge_edge_motion, vertex_face_motion
-from .kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
-from .kernels.pipeline.queues import take_slot
-from .kernels.polynomials import coplanarity
-from .kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
-from .kernels.time_of_impact import impact
+from .detector import median_milliseconds
 
 __all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace_stages"]
 
