@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 
 FLOOR = [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)]
 FALLING = [(0.5, -0.5, 0.0), (0.9, -0.5, 0.5), (0.5, -0.9, 0.5)]

@@ -8,7 +8,7 @@ import pytest
 from warp_bsc import CollisionDetector, CollisionMesh
 from warp_bsc.bench.detector import benchmark_detector, count_threads, limited_threads
 from warp_bsc.bench.scenes import load_scene
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 
 
 def measure(capsys, *arguments):

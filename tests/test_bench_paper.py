@@ -13,7 +13,7 @@ from warp_bsc.bench.methods import METHODS, STAGES
 from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
 from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench.worst_case import find_worst
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 from warp_bsc.detection.launch import one_core
 
 TINY = Effort(intervals=2, queries=3000, sample=100, peer_queries=20, adversaries=50, repeat=1)

@@ -8,8 +8,8 @@ import pytest
 import warp_bsc as bsc
 from warp_bsc import bench_queries, checker
 from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
-from warp_bsc.cli import main
-from warp_bsc.query_file import KINDS
+from warp_bsc.cli.main import main
+from warp_bsc.cli.query_file import KINDS
 
 
 def measure(capsys, device, *arguments):

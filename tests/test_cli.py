@@ -10,7 +10,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from warp_bsc import replay_command
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 FLOOR = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]

@@ -8,7 +8,7 @@ import pytest
 from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
 from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 from warp_bsc.usd.scene import Scene
 
 

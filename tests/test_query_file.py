@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from warp_bsc.query_file import find_query_files, read_query_file
+from warp_bsc.cli.query_file import find_query_files, read_query_file
 
 ROW = "1,2,-3,4,5,1"
 

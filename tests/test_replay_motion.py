@@ -21,7 +21,7 @@ from stages import (
     save,
 )
 
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 from warp_bsc.usd.scene import Scene
 
 

@@ -18,7 +18,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from stages import FALLING, FLOOR, add_floor, add_mesh, falling, moved, new_stage, save
 
 from warp_bsc import replay_command
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 from warp_bsc.replay.usd_overlay import COLORS, LIT
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"

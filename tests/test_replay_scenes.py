@@ -20,7 +20,7 @@ from stages import (
     save,
 )
 
-from warp_bsc.cli import main
+from warp_bsc.cli.main import main
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..cli.query_file import KINDS
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.narrow_phase import TOLERANCE
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -17,7 +18,6 @@ from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
-from ..query_file import KINDS
 from .detector import median_milliseconds
 
 __all__ = [

@@ -7,12 +7,12 @@ from pathlib import Path
 import warp as wp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ._atomic_file import OutputFile
-from .bench.figure import draw_paper_benchmarks
-from .bench.ipc_toolkit import has_peers
-from .bench.paper import Effort, benchmark_scene, find_adversarial_worst, find_places
-from .bench.scenes import PAPER_SCENES, load_intervals, paper_scenes
-from .bench_report import paper_benchmarks_to_dict, print_paper_benchmarks
+from .._atomic_file import OutputFile
+from ..bench.figure import draw_paper_benchmarks
+from ..bench.ipc_toolkit import has_peers
+from ..bench.paper import Effort, benchmark_scene, find_adversarial_worst, find_places
+from ..bench.scenes import PAPER_SCENES, load_intervals, paper_scenes
+from .bench_paper_tables import paper_benchmarks_to_dict, print_paper_benchmarks
 from .tables import Console
 
 __all__ = ["add_paper_options", "run_paper_benchmarks"]

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from rich.console import Console
 from rich.table import Table
 
-from .bench.detector import DetectorBenchmark
-from .bench.queries import MODES, SEED, QueryBenchmark
-from .detection.query import QueryResult
+from ..bench.detector import DetectorBenchmark
+from ..bench.queries import MODES, SEED, QueryBenchmark
+from ..detection.query import QueryResult
 from .query_file import QueryFile
 from .tables import count, make_table, say
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .replay.hit_files import HitsCsv, HitsJson
-from .replay.html_report import ReportPage
-from .replay.intervals import replay
-from .replay.summary import Outcome
-from .replay.usd_overlay import Overlay
+from ..replay.hit_files import HitsCsv, HitsJson
+from ..replay.html_report import ReportPage
+from ..replay.intervals import replay
+from ..replay.summary import Outcome
+from ..replay.usd_overlay import Overlay
+from ..usd.scene import FrameRange, Scene
+from ..usd.selection import PURPOSES, Selection
 from .replay_tables import print_replay
 from .tables import Console, say
-from .usd.scene import FrameRange, Scene
-from .usd.selection import PURPOSES, Selection
 
 __all__ = ["add_replay_options", "open_scene", "run_replay"]
 

@@ -3,7 +3,7 @@
 from rich.console import Console
 from rich.text import Text
 
-from .replay.summary import CERTIFIED_FOR, Outcome
+from ..replay.summary import CERTIFIED_FOR, Outcome
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_replay"]

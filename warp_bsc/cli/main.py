@@ -14,18 +14,19 @@ import numpy as np
 import warp as wp
 from rich.progress import track
 
-from . import __version__
-from .bench.detector import benchmark_detector, count_threads, limited_threads
-from .bench.queries import benchmark_copy, benchmark_queries, check_query_count
-from .bench.scenes import default_scenes, load_scene
-from .bench_command import add_paper_options, run_paper_benchmarks
-from .detection.detector import CollisionDetector
-from .detection.mesh import CollisionMesh
-from .detection.narrow_phase import METHODS
-from .detection.query import query_edge_edge, query_vertex_face
+from .. import __version__
+from ..bench.detector import benchmark_detector, count_threads, limited_threads
+from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
+from ..bench.scenes import default_scenes, load_scene
+from ..detection.detector import CollisionDetector
+from ..detection.mesh import CollisionMesh
+from ..detection.narrow_phase import METHODS
+from ..detection.query import query_edge_edge, query_vertex_face
+from .bench_paper import add_paper_options, run_paper_benchmarks
 from .query_file import KINDS, find_query_files, read_query_file
-from .replay_command import add_replay_options, open_scene, run_replay
-from .report import (
+from .replay import add_replay_options, open_scene, run_replay
+from .tables import Console
+from .tables_report import (
     QueryAnswers,
     detector_benchmarks_to_dict,
     print_detector_benchmarks,
@@ -34,7 +35,6 @@ from .report import (
     queries_to_dict,
     query_benchmarks_to_dict,
 )
-from .tables import Console
 
 __all__ = ["main"]
 

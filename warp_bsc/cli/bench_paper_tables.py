@@ -5,9 +5,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .bench.ipc_toolkit import version_of_peers
-from .bench.methods import METHODS, STAGES
-from .bench.paper import SceneBenchmark, Timing
+from ..bench.ipc_toolkit import version_of_peers
+from ..bench.methods import METHODS, STAGES
+from ..bench.paper import SceneBenchmark, Timing
 from .tables import count, make_table, say
 
 __all__ = ["METHOD_NAMES", "paper_benchmarks_to_dict", "print_paper_benchmarks"]
