@@ -99,7 +99,7 @@ def impact_vertex_face(
     Returns:
         Status, time of impact, barycentric coordinates and normal, in double precision. The last three are
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.kernels.gradients` says.
+        are clamped, as :mod:`.gradients` says.
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
@@ -127,7 +127,7 @@ def impact_edge_edge(
     Returns:
         Status, time of impact, parameters along the edges and normal, in double precision. The last three are
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.kernels.gradients` says.
+        are clamped, as :mod:`.gradients` says.
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)

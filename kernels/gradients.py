@@ -4,7 +4,7 @@ A contact is a time t and two numbers x, y at which the gap between the features
 
     g(t, x, y) = w(t) - x u(t) - y v(t) = 0,
 
-with u, v, w as in :mod:`.kernels.polynomials`: x, y are (beta, gamma) of a vertex in a face, (s, -r) of two edges. Moving the
+with u, v, w as in :mod:`.polynomials`: x, y are (beta, gamma) of a vertex in a face, (s, -r) of two edges. Moving the
 points changes the contact by
 
     e dt - u dx - v dy + (dw - x du - y dv) = 0,  e = dg/dt,

@@ -40,7 +40,7 @@ class Impact:
     toi: wp.float64  # time of impact, a lower bound in [0, 1]; 2 where the status is FREE
     coordinates: wp.vec3d  # vertex-face: barycentric coordinates in the face; edge-edge: (s, r, 0) along the edges
     normal: wp.vec3d  # unit contact normal, against the motion of the vertex or first edge relative to the other
-    grazing: int  # 1 where gradients are not those of the contact but clamped, see :mod:`.kernels.gradients`
+    grazing: int  # 1 where gradients are not those of the contact but clamped, see :mod:`.gradients`
 
 
 @wp.func

@@ -1,9 +1,9 @@
 """The culls of many pairs at once, with the vector instructions of a CPU.
 
-Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the
-other culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
-polynomials are good for. The operations are those of :mod:`.kernels.culling` and :mod:`.kernels.polynomials`, in the same order, and so
-are the bounds on their errors.
+Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the other
+culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
+polynomials are good for. The operations are those of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials`,
+in the same order, and so are the bounds on their errors.
 
 Pairs are not scaled, because powers of two change nothing but overflow and underflow. A sum that overflows is culled by
 no comparison. What underflows is lost once in a component of the normal, 2^-1074 for each of at most four products,

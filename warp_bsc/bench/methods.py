@@ -7,11 +7,11 @@ question: whether the two features meet. What each does, and what not, so that t
   Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
   kernel of its own, classification, and with bounds the subdivision of what that leaves open. UNSURE is a collision.
 - ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
-- ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
-  knows a time, too; that time is not written.
-- ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.bench.baselines.reduced_inside_test`. As there is
-  no subdivision in the paper, what classification leaves open is a collision at once: weak inequalities, as it has
-  them. Its culls are those of ``float``.
+- ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
+  so it knows a time, too; that time is not written.
+- ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.bench.baselines.reduced_inside_test`. As
+  there is no subdivision in the paper, what classification leaves open is a collision at once: weak inequalities, as
+  it has them. Its culls are those of ``float``.
 
 None is asked for a time of impact, and none looks whether numbers are finite, which is done once a vertex.
 """

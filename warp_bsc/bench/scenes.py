@@ -46,7 +46,7 @@ class BenchmarkScene:
 
 def default_scenes() -> list[str]:
     """What is measured if nothing is named: the scene of a checkout, if this is one, and generated ones."""
-    scene = Path(__file__).parents[1] / "assets" / "cloth_twist.usd"
+    scene = Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
     return [*([str(scene)] if scene.exists() else []), "cloth:5000", "cloth:50000"]
 
 
@@ -83,7 +83,7 @@ def paper_scenes() -> list[str]:
     Raises:
         FileNotFoundError: If this is none, or a scene is missing.
     """
-    assets = Path(__file__).parents[1] / "assets"
+    assets = Path(__file__).parents[2] / "assets"
     paths = [assets / f"{name}.usd" for name in PAPER_SCENES]
     for path in paths:
         if not path.exists():

@@ -214,7 +214,9 @@ class _Tree:
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
     def pair(self, other, counts, pairs, *, keep_apart=False):
-        """Enqueues pairs of elements of this tree and of another or the same, see :func:`.kernels.pipeline.blocks.pair_block`.
+        """Enqueues pairs of elements of this tree and of another or the same.
+
+        See :func:`warp_bsc.kernels.pipeline.blocks.pair_block`.
 
         Args:
             other: The other tree.

@@ -1,9 +1,9 @@
 """The exact stage: wide integers decide, on the device, what floating point leaves open.
 
 Contacts that the stage before has put in a queue are decided in integers of one limb a coordinate, see
-:mod:`warp_bsc.kernels.exact.decision`. Those whose exponents are too far apart for that go to the next queue, for two limbs, and
-so on to eight, which take every query in single precision. What is too wide for that too is counted, and left to the
-host. Each width has a kernel of its own, so that the usual one stays small.
+:mod:`warp_bsc.kernels.exact.decision`. Those whose exponents are too far apart for that go to the next queue, for two
+limbs, and so on to eight, which take every query in single precision. What is too wide for that too is counted, and
+left to the host. Each width has a kernel of its own, so that the usual one stays small.
 """
 
 import functools

@@ -51,7 +51,7 @@ def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=
     suit kernels of which few threads work long; a chunk, at least so large, is what a core takes at a time.
 
     Raises:
-        RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.detection.host_function`.
+        RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
     """
     if device.is_cuda:
         inputs = [0, *inputs]

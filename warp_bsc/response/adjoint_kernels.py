@@ -1,6 +1,6 @@
 """The small steps of a response as functions that Warp differentiates: what each changes.
 
-Their adjoints are what :mod:`.response.adjoint` launches; what they do is done by the modules that they name.
+Their adjoints are what :mod:`.adjoint` launches; what they do is done by the modules that they name.
 """
 
 import warp as wp
@@ -68,7 +68,7 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.func
 def _push(vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, push: wp.array[wp.vec3]):
-    """Adds what the change of a multiplier does to its vertices, see :func:`.response.projection.spread`."""
+    """Adds what the change of a multiplier does to its vertices, see :func:`.projection.spread`."""
     for j in range(4):
         vertex = constraints.vertices[i][j]
         share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
@@ -101,7 +101,7 @@ def displacing(
     reached_change: wp.array[wp.vec3d],
     push: wp.array[wp.vec3],
 ):
-    """What an iteration on positions changes, by :func:`.response.projection.displace`."""
+    """What an iteration on positions changes, by :func:`.projection.displace`."""
     entry = entry_of(progress.history, cursor[CURRENT], wp.tid())
     if entry < 0:
         return
@@ -125,7 +125,7 @@ def accelerating(
     reached_change: wp.array[wp.vec3d],
     push: wp.array[wp.vec3],
 ):
-    """What an iteration on velocities changes, by :func:`.response.projection.accelerate`."""
+    """What an iteration on velocities changes, by :func:`.projection.accelerate`."""
     entry = entry_of(progress.history, cursor[CURRENT], wp.tid())
     if entry < 0:
         return
@@ -147,7 +147,7 @@ def starting(
     reached: wp.array[wp.vec3d],
     push: wp.array[wp.vec3],
 ):
-    """The impulses to begin with, by :func:`.response.projection.start_impulses`."""
+    """The impulses to begin with, by :func:`.projection.start_impulses`."""
     i = wp.tid()
     if i < constraints.count[0] and starts(constraints, i):
         first = constraints.displacing[i] * (constraints.urgency[i] / dt)
@@ -158,7 +158,7 @@ def starting(
 
 @wp.kernel
 def twisting(vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
-    """The torques that contacts have added in each world, by :func:`.response.angular_momentum.sum_torques`."""
+    """The torques that contacts have added in each world, by :func:`.angular_momentum.sum_torques`."""
     i = wp.tid()
     if i >= constraints.count[0] or not acts(constraints, i):
         return
@@ -173,7 +173,7 @@ def twisting(vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp
 
 @wp.kernel
 def massing(vertices: Vertices, totals: wp.array2d[wp.float64]):
-    """The moments of what has collided in each world, by :func:`.response.angular_momentum.sum_bodies`."""
+    """The moments of what has collided in each world, by :func:`.angular_momentum.sum_bodies`."""
     vertex = wp.tid()
     if turns(vertices, vertex):
         added = moments(vertices, vertex)
@@ -183,7 +183,7 @@ def massing(vertices: Vertices, totals: wp.array2d[wp.float64]):
 
 @wp.kernel
 def turning(vertices: Vertices, totals: wp.array2d[wp.float64], change: wp.array[wp.vec3]):
-    """How the turn of each world changes velocities, by :func:`.response.angular_momentum.turn_vertices`."""
+    """How the turn of each world changes velocities, by :func:`.angular_momentum.turn_vertices`."""
     vertex = wp.tid()
     world = vertices.world[vertex]
     if not turns(vertices, vertex) or totals[world, HELD] != _ZERO:
@@ -249,7 +249,7 @@ def constraining(
     separations: wp.array[wp.float64],
     urgencies: wp.array[wp.float64],
 ):
-    """What a round's constraints were made of contacts and near pairs, by :func:`.response.constraints.collect_contacts`."""
+    """What a round's constraints were made of contacts and near pairs, by :func:`.constraints.collect_contacts`."""
     mark = cursor[MARK]
     i = wp.tid()
     if mark > 0:
@@ -328,7 +328,7 @@ def truncating(
 
 @wp.kernel(enable_backward=False)
 def count_grazing(vertices: Vertices, contacts: Contacts, history: History):
-    """Counts the contacts whose gradients are clamped, see :mod:`.kernels.gradients`."""
+    """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
     i = wp.tid()
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return

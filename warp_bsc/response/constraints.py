@@ -1,4 +1,4 @@
-"""Contacts as constraints on the ends of paths, collected from detections; :mod:`.response.projection` solves them."""
+"""Contacts as constraints on the ends of paths, collected from detections; :mod:`.projection` solves them."""
 
 import warp as wp
 

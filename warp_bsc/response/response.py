@@ -187,7 +187,7 @@ class Response:
     Attributes:
         detector: What it detects with.
         vertices: The vertices, whose ``x0``, ``x1`` and ``velocity`` are to be filled.
-        steer: Array of int that says, by the places that :mod:`.response.constraints` names, what was done.
+        steer: Array of int that says, by the places that :mod:`.constraints` names, what was done.
         constraints: What contacts ask for, :class:`Constraints`.
         half_spaces: The infinite planes, :class:`HalfSpaces`.
         history: What the last step did, if it was to be taken down, :class:`StepHistory`.
@@ -503,7 +503,8 @@ class Response:
     def _launch_over(self, kernel, queue, counts, count, inputs):
         """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU.
 
-        Unlike :func:`.detection.launch.launch_over_queue` on one thread of the CPU, where Warp's atomic additions are none.
+        Unlike :func:`warp_bsc.detection.launch.launch_over_queue` on one thread of the CPU, where Warp's atomic
+        additions are none.
         """
         entries = len(queue)
         if self.device.is_cpu:

@@ -227,7 +227,7 @@ class SolverCCD(SolverBase):
     A step on a :class:`warp.Tape` carries gradients, if the model was finalized with ``requires_grad=True`` and the
     inner solver is differentiable: from positions and velocities of particles at its end to those at its start, and to
     those that the inner solver wanted. Which contacts there were is taken as given; the rest is the derivative of what
-    was computed, see :mod:`.response.adjoint`. The motion of bodies is a constant. With ``requires_grad`` all
+    was computed, see :mod:`.adjoint`. The motion of bodies is a constant. With ``requires_grad`` all
     iterations are made, so that results do not jump.
 
     Attributes:

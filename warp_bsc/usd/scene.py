@@ -23,7 +23,8 @@ value clip to the next or because it was held, ends where it was before.
 Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, are
 one: files have them by rounding, and OpenUSD to tell the end of a value clip from the start of the next.
 
-Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next begins.
+Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
+begins.
 
 Precision
 ---------
@@ -159,10 +160,8 @@ class Scene:
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-
-            usd_meshes,
-            usd_stage,
-        )
+        from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
+        from . import stage as usd_stage  # noqa: PLC0415
 
         self.path = str(path)
         self.selection = selection or Selection()
