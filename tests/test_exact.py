@@ -14,6 +14,7 @@ from test_wide_integers import to_integers
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.kernels.exact import algebraic
 from warp_bsc.kernels.exact.algebraic import remainder
 from warp_bsc.kernels.exact.polygon import BITS, coordinate, cross_component, make_polygon, spread, volume
 from warp_bsc.kernels.exact.wide_integers import integer, minor, subtract, times
@@ -335,3 +336,26 @@ def test_no_number_exceeds_its_bound(kind, limbs):
     if kind == "vertex_face":  # they are as small as can be, but for a few bits
         assert np.max(closest[0]) <= 1 and np.max(closest[1]) == 0
         assert np.max(closest[2]) <= 3 and np.max(closest[3]) <= 6
+
+
+def test_all_that_is_asked_about_roots_fits(monkeypatch):
+    """Sums of absolute values, by the device function itself: of every remainder that is taken, by powers of 2^B."""
+    outer, inner = 3.0 * 3.0**0.5, 9.0 * 3.0**0.5  # of V, by Hadamard's inequality: three determinants inside
+    monkeypatch.setattr(algebraic, "product", lambda a, b: a * b)
+    monkeypatch.setattr(algebraic, "minor", lambda a, b, c, d: a * b + c * d)
+    v, slope, bend = (outer, inner, inner, outer), (inner, 2 * inner, 3 * outer, 0.0), (inner, 3 * outer, 0.0, 0.0)
+    k_bits, end_bits = [], []
+    for p in (v, slope, bend):
+        for coefficients in (
+            (*p, 2.0, 4.0, 2.0),
+            (*p[::-1], 0.0, 4.0, 2.0),  # where the quadratic has no leading coefficient
+        ):
+            k0, k1, j = algebraic.remainder.func(*coefficients)
+            k_bits += [np.ceil(np.log2(size)) for size in (k0, k1, j) if size > 0.0]
+            if k0 > 0.0:  # else there is nothing more to ask
+                end_bits.append(np.ceil(np.log2(k0 * k0 + k1 * j)))
+                assert 4.0 * k1 + 4.0 * k0 < 2.0**11
+    assert (max(k_bits), max(end_bits)) == (10, 17)
+    for limbs, b in BITS.items():
+        assert 7 * b + max(k_bits) + 1 <= 256 * limbs
+        assert 14 * b + max(end_bits) + 1 <= 512 * limbs

@@ -16,9 +16,9 @@ from generators import mostly_hits, uniform
 
 from warp_bsc import checker
 from warp_bsc.kernels import HIT, UNSURE, roots, signs
-from warp_bsc.kernels.classification import classify
+from warp_bsc.kernels.classification import classify, classify_with
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
-from warp_bsc.kernels.polynomials import coplanarity
+from warp_bsc.kernels.polynomials import InsideTests, coplanarity
 
 ROUNDOFF = 2.0**-53
 SHAPE_BOUND, QUADRATIC_BOUND = 13.0 * ROUNDOFF, 5.0 * ROUNDOFF  # of the size of the coefficients, the least allowed
@@ -46,6 +46,24 @@ def answer(
         size = roots.largest(k[i])
         q_signs[i] = roots.quadratic_signs(q[i], q_bound[i], k[i], k_bound[i], size, count[i])
         line_signs[i] = roots.linear_signs(line[i], line_bound[i], k[i], k_bound[i], size, count[i])
+
+
+@wp.kernel(enable_backward=False)
+def classify_polynomials(
+    k: wp.array[wp.vec4d],
+    k_bound: wp.array[wp.float64],
+    q: wp.array2d[wp.vec3d],
+    q_bounds: wp.array[wp.vec4d],
+    status: wp.array[int],
+):
+    i = wp.tid()
+    tests = InsideTests()
+    tests.q0 = q[i, 0]
+    tests.q1 = q[i, 1]
+    tests.q2 = q[i, 2]
+    tests.q3 = q[i, 3]
+    tests.bounds = q_bounds[i]
+    status[i] = classify_with(k[i], k_bound[i], tests)
 
 
 @wp.kernel(enable_backward=False)
@@ -316,6 +334,39 @@ def test_answers_to_random_polynomials_are_nearly_always_certain():
     crossing = answers.count > 0
     assert (answers.q_signs[crossing] == 0).mean() < 1e-4
     assert (answers.line_signs[crossing] == 0).mean() < 1e-4
+
+
+def test_cubics_that_are_split_are_classified_at_any_scale():
+    """Three roots, the middle one often at the inflection; as certain at 2^-60, where no power of Y's size matters."""
+    rng = np.random.default_rng(7)
+    n = 20000
+    root = np.sort(rng.integers(1, 255, (3, n)), axis=0) / 256.0
+    root[1] = np.where(rng.random(n) < 0.7, (root[0] + root[2]) / 2.0, root[1])
+    k = product(product(root_at(root[0]), root_at(root[1])), root_at(root[2])) * rng.choice([-1.0, 1.0], (n, 1))
+    tests = np.empty((n, 4, 3))
+    for i in range(4):
+        near = root[rng.integers(0, 3, n), np.arange(n)]
+        crossing = product(root_at(near), root_at(rng.integers(-512, 512, n) / 256.0))
+        tests[:, i] = np.where(rng.random((n, 1)) < 0.6, crossing, rng.integers(1, 9, (n, 3)) / 8.0)
+        tests[:, i] *= rng.choice([-1.0, 1.0], (n, 1))
+    least = ROUNDOFF * 1e-140
+
+    def classified(scale):
+        status = wp.zeros(n, dtype=int)
+        k_bound, q_bounds = SHAPE_BOUND * size(scale * k) + least, QUADRATIC_BOUND * size(tests) + least
+        arrays = ((scale * k, wp.vec4d), (k_bound, wp.float64), (tests, wp.vec3d), (q_bounds, wp.vec4d))
+        inputs = [wp.array(array, dtype=dtype) for array, dtype in arrays]
+        wp.launch(classify_polynomials, n, inputs=inputs, outputs=[status])
+        return status.numpy()
+
+    expected = classified(1.0)
+    assert 0.2 < (expected != UNSURE).mean() < 0.8
+    assert np.array_equal(classified(2.0**-60), expected)
+    for exponent in (*range(-300, -240, 4), -400):
+        status = classified(2.0**exponent)
+        certain = status != UNSURE
+        assert np.array_equal(status[certain], expected[certain])
+        assert certain.sum() > 0.8 * (expected != UNSURE).sum()
 
 
 @pytest.mark.parametrize("kind", ["vertex_face", "edge_edge"])

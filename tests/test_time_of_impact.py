@@ -6,14 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from generators import GENERATORS, mostly_hits
+from generators import GENERATORS, grazing, mostly_hits, one_ulp_apart, touching, uniform
 
+import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE, impact_edge_edge, impact_vertex_face
 from warp_bsc.kernels.closest import between, closest_coordinates
 
 KINDS = ("vertex_face", "edge_edge")
 TRUTH = {"vertex_face": checker.vertex_face_toi, "edge_edge": checker.edge_edge_toi}
+AIMED = (mostly_hits, uniform, one_ulp_apart, grazing, touching)
 TOLERANCES = [2.0**-4, 2.0**-10, 2.0**-20, 2.0**-30]
 
 
@@ -260,6 +262,97 @@ def test_points_that_are_all_the_same_are_in_contact_from_the_start(kind):
     assert found.status[0] == UNSURE
     assert found.toi[0] == 0.0
     assert_valid_contact(kind, found, points, np.array([True]))
+
+
+# --- Any tolerance, any scale ---
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tolerance", [-np.inf, -1.0, 0.0, 1e-300, np.nan, 2.0**-38])
+def test_tolerances_that_are_too_small_are_the_smallest(kind, tolerance):
+    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
+    times = TRUTH[kind](points)
+    found = impacts(kind, points, tolerance)
+    expected = impacts(kind, points, 2.0**-38)
+    for name, values in vars(found).items():
+        assert np.array_equal(values, vars(expected)[name]), name
+    hits = ~np.isnan(times[:, 0])
+    assert not hits[found.status == FREE].any()
+    assert hits[found.status == HIT].all()
+    assert (found.toi[hits] <= times[hits, 1]).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("tolerance", [2.0**-2, 0.3, 0.5, 1.0, 2.0, np.inf])
+def test_features_meet_at_the_coordinates_also_where_the_tolerance_is_the_step(kind, tolerance):
+    rng = np.random.default_rng(8)
+    points = np.concatenate([generator(rng, 1000, kind, np.float64) for generator in (mostly_hits, uniform)])
+    times = TRUTH[kind](points)
+    found = impacts(kind, points, tolerance)
+    hits = ~np.isnan(times[:, 0])
+    assert hits[found.status == HIT].all()
+    assert not hits[found.status == FREE].any()
+    assert (found.toi[hits] <= times[hits, 1]).all()
+    localized = found.localized == 1
+    assert localized[hits].mean() > 0.99
+    assert (found.toi[localized] >= times[localized, 0] - tolerance).all()
+    assert_valid_contact(kind, found, points, found.status != FREE)
+    start, end = gaps(kind, points[localized], found.coordinates[localized])
+    velocity = end - start
+    time = -(start * velocity).sum(axis=1) / (velocity**2).sum(axis=1)
+    toi = found.toi[localized]
+    assert ((time > toi - 2.0**-10) & (time < np.minimum(toi + tolerance, 1.0) + 2.0**-10)).all()
+    gap = np.linalg.norm(start + time[:, None] * velocity, axis=1)
+    assert gap.max() < 5.0 * 2.0**-10
+    assert np.percentile(gap, 95) < 20.0 * 2.0**-20
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_contacts_are_the_same_in_any_unit_of_length(kind):
+    """From where all is subnormal to where differences overflow; where a coordinate is huge, but never differs, too."""
+    rng = np.random.default_rng(9)
+    passing = mostly_hits(rng, 300, kind, np.float64)
+    passing /= np.abs(passing).max(axis=(1, 2), keepdims=True)
+    points = np.concatenate([passing, uniform(rng, 300, kind, np.float64)])
+    points = np.round(points * 2.0**28) / 2.0**30
+    flat = points * np.array([0.0, 1.0, 1.0])
+    huge = np.array([2.0**1022, 0.0, 0.0])
+    expected = [impacts(kind, x) for x in (points, flat)]
+    assert (expected[0].status == HIT).sum() > 250
+    for exponent in (-1044, -1030, -1000, -930, -600, -500, -481, -480, -479, -470, 600, 990, 1000, 1023, 1025):
+        scale = np.ldexp(1.0, exponent // 2), np.ldexp(1.0, exponent - exponent // 2)
+        scaled = [x * scale[0] * scale[1] for x in (points, flat)]
+        answers = [impacts(kind, x) for x in scaled]
+        truths = list(expected)
+        if exponent < 900:
+            answers.append(impacts(kind, scaled[1] + huge))
+            truths.append(expected[1])
+        for found, truth in zip(answers, truths, strict=True):
+            for name, values in vars(found).items():
+                assert np.array_equal(values, vars(truth)[name]), (exponent, name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_exact_contacts_are_the_same_in_any_unit_of_length(kind):
+    points = np.round(mostly_hits(np.random.default_rng(10), 200, kind, np.float64) * 2.0**20) / 2.0**24
+    query = getattr(bsc, f"query_{kind}")
+    expected = query(points)
+    assert expected.hit.sum() > 190
+    for exponent in (-1040, -900, 900, 1023):
+        found = query(np.ldexp(points, exponent))
+        for name in ("hit", "toi", "coordinates", "normal"):
+            assert np.array_equal(getattr(found, name), getattr(expected, name), equal_nan=True), (exponent, name)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_points_that_are_not_finite_say_so(kind):
+    points = np.repeat(passing(kind)[0][:1], 72, axis=0)
+    points.reshape(72, 24)[np.arange(72), np.arange(72) % 24] = np.repeat([np.nan, np.inf, -np.inf], 24)
+    found = impacts(kind, points)
+    assert (found.status == UNSURE).all()
+    assert (found.toi == 0.0).all()
+    assert np.isnan(found.coordinates).all()
+    assert np.isnan(found.normal).all()
 
 
 # --- Closest points ---

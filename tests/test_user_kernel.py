@@ -6,7 +6,7 @@ import warp as wp
 from generators import GENERATORS
 
 from warp_bsc import query_edge_edge, query_vertex_face
-from warp_bsc.kernels import ccd_edge_edge, ccd_vertex_face, impact_vertex_face
+from warp_bsc.kernels import HIT, UNSURE, ccd_edge_edge, ccd_vertex_face, impact_vertex_face
 
 
 @wp.kernel
@@ -57,3 +57,21 @@ def test_times_of_impact_in_a_user_kernel_have_gradients(device):
     tape.backward(toi)
     np.testing.assert_allclose(p.grad.numpy()[0, [0, 4]], [[0.0, 0.0, 0.25]] * 2)
     np.testing.assert_allclose(p.grad.numpy()[0].sum(axis=0), 0.0, atol=1e-6)
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+def ask_fast(p: wp.array2d[wp.vec3], status: wp.array[int]):
+    i = wp.tid()
+    status[i] = ccd_vertex_face(p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7])
+
+
+def test_subnormal_numbers_count_in_single_precision_with_fast_math(device):
+    """Which takes them for zero on a GPU."""
+    points = GENERATORS["mostly_hits"](np.random.default_rng(13), 2000, "vertex_face", np.float64)
+    points = np.ldexp(points, [-130, 0, 0]).astype(np.float32)
+    status = wp.zeros(len(points), dtype=int)
+    wp.launch(ask_fast, len(points), inputs=[wp.array(points, dtype=wp.vec3), status])
+    truth = query_vertex_face(points).hit
+    assert truth.mean() > 0.9
+    assert (status.numpy() != UNSURE).mean() > 0.9
+    assert np.array_equal((status.numpy() == HIT)[status.numpy() != UNSURE], truth[status.numpy() != UNSURE])

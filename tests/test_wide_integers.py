@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from flushing import subnormals_flushed
 
 from warp_bsc.kernels.exact.wide_integers import (
     LIMBS,
@@ -15,7 +16,7 @@ from warp_bsc.kernels.exact.wide_integers import (
     sign,
     subtract,
     times,
-    top_bit,
+    top_bit_of_difference,
     widen,
 )
 
@@ -96,15 +97,39 @@ def test_operations_are_those_of_integers(limbs):
 
 def test_bits_of_doubles():
     @wp.kernel(enable_backward=False, module="unique")
-    def find_bits(x: wp.array[wp.float64], low: wp.array[int], top: wp.array[int]):
+    def find_bits(x: wp.array[wp.float64], y: wp.array[wp.float64], low: wp.array[int], top: wp.array[int]):
         i = wp.tid()
         low[i] = lowest_bit(x[i])
-        top[i] = top_bit(x[i])
+        top[i] = top_bit_of_difference(x[i], y[i])
 
-    x = np.array([1.0, -1.0, 3.0, 2.0**-1074, 3.0 * 2.0**-1074, 2.0**-1022, -(2.0**1023), 1.0 + 2.0**-52, 0.75])
-    low, top = wp.zeros(len(x) + 3, dtype=int), wp.zeros(len(x) + 3, dtype=int)
-    others = [0.0, np.inf, np.nan]
-    wp.launch(find_bits, len(x) + 3, inputs=[wp.array([*x, *others], dtype=wp.float64)], outputs=[low, top])
-    assert low.numpy()[:-2].tolist() == [0, 0, 0, -1074, -1074, -1022, 1023, -52, -2, 4096]
-    assert top.numpy()[:-2].tolist() == [1, 1, 2, -1022, -1022, -1021, 1024, 1, 0, -4096]
-    assert (top.numpy()[-2:] - low.numpy()[-2:] > 4096).all(), "what is not finite is too wide"
+    rows = [
+        # x, y, exponent of the lowest bit of x, a power of two that the difference is below
+        (1.0, 0.0, 0, 1),
+        (-1.0, -2.0, 0, 1),
+        (3.0, 0.0, 0, 2),
+        (3.0, 2.0, 0, 1),
+        (3.0, 3.0, 0, -4096),
+        (2.0**-1074, 0.0, -1074, -1021),
+        (3.0 * 2.0**-1074, -(2.0**-1074), -1074, -1021),
+        (2.0**-1022, -(2.0**-1022), -1022, -1020),
+        (2.0**-968, 2.0**-1074, -968, -967),
+        (-(2.0**1023), 0.0, 1023, 1024),
+        (1.0 + 2.0**-52, 1.0, -52, -51),
+        (0.75, 0.0, -2, 0),
+        (0.0, 0.0, 4096, -4096),
+    ]
+    rows += [(2.0**1023, -(2.0**1023), 1023, 8192), (np.inf, 0.0, None, 8192), (np.nan, 0.0, None, 8192)]
+    x, y, expected_low, expected_top = zip(*rows, strict=True)
+
+    def find(device):
+        inputs = [wp.array(numbers, dtype=wp.float64, device=device) for numbers in (x, y)]
+        low, top = (wp.zeros(len(rows), dtype=int, device=device) for _ in range(2))
+        wp.launch(find_bits, len(rows), inputs=inputs, outputs=[low, top], device=device)
+        return low.numpy(), top.numpy()
+
+    low, top = find(None)
+    assert low[:-2].tolist() == list(expected_low[:-2])
+    assert top.tolist() == list(expected_top)
+    with subnormals_flushed():
+        flushed = find("cpu")
+    assert (np.array(flushed) == [low, top]).all()

@@ -9,6 +9,7 @@ four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt
     g   = a P - p3 z q      52      < 2^6,   5B: 2 * 15.6 + 5.2 * 4
     K0                      124.8   < 2^7,   7B: 2 * 10.4 + 2 * 52, of V' as well
     K1, J                   291.2   < 2^9,   7B: 2 * 41.6 + 4 * 52; of V' 249.6
+    K1 of V' reversed       561.6   < 2^10,  7B: 2 * 31.2 + 4 * (2 * 31.2 + 4 * 15.6), where K0 and J are 0
     K0^2 - K1 J             77,900  < 2^17, 14B: 124.8^2 + 249.6^2 for V'; 51,900 for V itself
     Hessian of V            487     < 2^9,   6B: 15.6^2 + 3 * 5.2 * 15.6
     discriminant of V       1.2e6   < 2^21, 12B
@@ -17,7 +18,7 @@ four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt
 and one bit more for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
 8 L, all fits for
 
-    B <= min((512 L - 18) / 14, (256 L - 10) / 7):  35 bits in one limb, 71 in two, 291 in eight.
+    B <= min((512 L - 18) / 14, (256 L - 11) / 7):  35 bits in one limb, 71 in two, 291 in eight.
 
 Single precision never takes more than 278, its whole range.
 """
@@ -27,7 +28,7 @@ from typing import Any
 import warp as wp
 
 from ..polynomials import VERTEX_FACE
-from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit
+from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
 BITS = {1: 35, 2: 71, 8: 291}
 """Largest B by the number of limbs of a coordinate."""
@@ -129,9 +130,10 @@ def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 @wp.func
 def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
-    """Powers of two that the difference of two points is below, by axis; rounding does not take it there."""
-    d = x - y
-    return wp.vec3i(top_bit(d[0]), top_bit(d[1]), top_bit(d[2]))
+    """Powers of two that the difference of two points is below, by axis."""
+    return wp.vec3i(
+        top_bit_of_difference(x[0], y[0]), top_bit_of_difference(x[1], y[1]), top_bit_of_difference(x[2], y[2])
+    )
 
 
 @wp.func

@@ -248,12 +248,26 @@ def lowest_bit(x: wp.float64) -> int:
 
 @wp.func_native(
     snippet="""
-    union { wp::float64 value; wp::uint64 bits; } word;
-    word.value = x;
-    const int field = (int)((word.bits >> 52) & 2047);
-    return x == 0.0 ? -4096 : field == 2047 ? 8192 : field - 1022;
+    union { wp::float64 value; wp::uint64 bits; } a, b, d;
+    a.value = x;
+    b.value = y;
+    if (a.bits == b.bits)
+        return -4096;
+    d.value = x - y;
+    int field = (int)((d.bits >> 52) & 2047);
+    if (field > 53)
+        return field == 2047 ? 8192 : field - 1022;
+    // so small that it may have lost what is subnormal, where that is flushed to zero
+    const int x_field = (int)((a.bits >> 52) & 2047), y_field = (int)((b.bits >> 52) & 2047);
+    field = x_field > y_field ? x_field : y_field;
+    return field - 1021;
 """
 )
-def top_bit(x: wp.float64) -> int:
-    """An e with |x| < 2^e, the smallest one unless x is subnormal; -4096 of 0, 8192 of what is not finite."""
+def top_bit_of_difference(x: wp.float64, y: wp.float64) -> int:
+    """An e with |x - y| < 2^e for finite numbers, the smallest one unless it is tiny; 8192 where they are too large.
+
+    It is -4096 where the numbers are the same. Rounding takes no difference below 2^e to it but as far as 2^e itself,
+    which counts as below 2^(e + 1). What a difference of 2^-969 or more has lost where subnormal numbers are flushed,
+    all of the one number, is less than the lowest bit of the other.
+    """
     ...

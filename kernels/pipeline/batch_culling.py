@@ -2,13 +2,20 @@
 
 Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the other
 culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
-polynomials are good for. The operations are those of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials`,
-in the same order, and so are the bounds on their errors.
+polynomials are good for. The operations are those of :mod:`warp_bsc.kernels.culling` and
+:mod:`warp_bsc.kernels.polynomials`, in the same order, and so are the bounds on their errors.
 
-Pairs are not scaled, because powers of two change nothing but overflow and underflow. A sum that overflows is culled by
-no comparison. What underflows is lost once in a component of the normal, 2^-1074 for each of at most four products,
-before w multiplies it: for coordinates up to 1e150 that is less than the UNDERFLOW that bounds add, times the roundoff,
-and larger ones are not culled. Without a roundoff there is nothing to certify.
+Pairs are not scaled, because powers of two change nothing but overflow and underflow. Nothing overflows: vectors of
+1e70 and more are culled by boxes alone. What underflows is lost in a component of the normal, 2^-1074 for each of at
+most four products, or 2^-1022 where subnormal numbers are flushed, before w multiplies it: less than the UNDERFLOW that
+bounds add, times the roundoff, 1e-156.
+
+A processor that is told to take subnormal numbers for zero loses up to delta, the smallest number that is not, from
+each coordinate that it reads, and 2 delta from u, v, w. Of vectors below m a product of three then loses less than 6
+delta m^2, and a coefficient of Y is a mean of sums of six such. A comparison of products with a direction has three of
+each of its components, and loses less than 6 delta times the sum of their sizes. So 40 delta is added to the bounds.
+
+Without a roundoff there is nothing to certify.
 """
 
 import functools
@@ -22,7 +29,7 @@ from ..signs import UNDERFLOW
 BATCH = wp.constant(64)
 """Pairs that one call culls."""
 
-_LARGEST = 1.0e150
+_LARGEST = 1.0e70
 
 _SNIPPET = """
     typedef {scalar} Scalars __attribute__((ext_vector_type(8)));
@@ -160,13 +167,16 @@ _SNIPPET = """
         // without a roundoff all bounds are zero
         Vectors size = {{0.0, 0.0, 0.0}};
         Doubles bound = 0.0;
+        double lost = 0.0;
         int trusted = 255;
         if (roundoff > 0.0) {{
             const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
             const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
-            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow});
             size = plus(plus(u, v), w);
-            trusted = bits(most(most(size.x, size.y), size.z) < {largest});
+            lost = {lost};
+            const Doubles extent = most(most(size.x, size.y), size.z);
+            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow}) + lost * extent * extent;
+            trusted = bits(extent < {largest});
         }}
         auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
         int undecided = ((1 << filled) - 1) & ~(bits(culled) & trusted);
@@ -189,7 +199,8 @@ _SNIPPET = """
             highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
         }}
         const Vectors along = sizes(direction, direction);
-        const Doubles slack = roundoff * ({direction_error} * dot(along, size) + {underflow});
+        const Doubles slack
+            = roundoff * ({direction_error} * dot(along, size) + {underflow}) + lost * (along.x + along.y + along.z);
         culled = (lowest > slack) | (highest < -slack);
         undecided &= ~(bits(culled) & trusted);
         for (int lane = 0; lane < filled; ++lane)
@@ -206,12 +217,14 @@ def cull_batch_of(dtype, vertex_face: bool):
     It takes positions at both ends, the vertices of the elements, a queue of pairs, the first of them and how many from
     there on count, up to :data:`BATCH`, and the roundoff. It returns which of them no cull decides, as bits.
     """
+    single = dtype is wp.vec3
     snippet = _SNIPPET.format(
-        scalar="float" if dtype is wp.vec3 else "double",
+        scalar="float" if single else "double",
         coplanarity_error=float(COPLANARITY_ERROR),
         direction_error=float(DIRECTION_ERROR),
         underflow=repr(float(UNDERFLOW)),
         largest=repr(_LARGEST),
+        lost=repr(40.0 * 2.0 ** (-126 if single else -1022)),
         batch=int(BATCH),
     )
 

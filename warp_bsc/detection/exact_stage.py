@@ -14,11 +14,12 @@ import warp as wp
 from ..kernels.closest import contact_at
 from ..kernels.exact.decision import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.motion import double, edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT
+from ..kernels.time_of_impact import LEAST_DIGITS
 from .launch import launch_over_queue
 
 __all__ = ["launch_exact_stage"]
@@ -31,10 +32,6 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 def _kernel(dtype, limbs):
     """The kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)
-
-    @wp.func
-    def point(x: wp.array[dtype], vertex: int) -> wp.vec3d:
-        return wp.vec3d(wp.float64(x[vertex][0]), wp.float64(x[vertex][1]), wp.float64(x[vertex][2]))
 
     @wp.func
     def motion_of(kind: int, x0: wp.array[dtype], x1: wp.array[dtype], v: wp.vec4i):
@@ -78,14 +75,14 @@ def _kernel(dtype, limbs):
         v = vertices_of_pair(kind, elements, contacts[i])
         time = decide(
             kind,
-            point(x0, v[0]),
-            point(x0, v[1]),
-            point(x0, v[2]),
-            point(x0, v[3]),
-            point(x1, v[0]),
-            point(x1, v[1]),
-            point(x1, v[2]),
-            point(x1, v[3]),
+            double(x0[v[0]]),
+            double(x0[v[1]]),
+            double(x0[v[2]]),
+            double(x0[v[3]]),
+            double(x1[v[0]]),
+            double(x1[v[1]]),
+            double(x1[v[2]]),
+            double(x1[v[3]]),
             timed,
             digits,
         )
@@ -131,7 +128,7 @@ def launch_exact_stage(
         last_key: Key of a contact that is none.
     """
     number = VERTEX_FACE if kind == "vertex_face" else EDGE_EDGE
-    digits = max(0, math.ceil(-math.log2(tolerance)))
+    digits = max(LEAST_DIGITS, math.ceil(-math.log2(tolerance)))
     queue, left = queues
     for limbs, too_wide_for_it in zip(BITS, too_wide, strict=True):
         inputs = [x0, x1, elements, int(number), timed, digits, queue, counts, asked, too_wide_for_it, refuted]
