@@ -20,6 +20,7 @@ from .bench_command import add_paper_options, run_paper_benchmarks
 from .bench_queries import benchmark_copy, benchmark_queries, check_query_count
 from .bench_scenes import default_scenes, load_scene
 from .detector import CollisionDetector
+from .error_boundary import run_guarded
 from .mesh import CollisionMesh
 from .narrow_phase import METHODS
 from .query import query_edge_edge, query_vertex_face
@@ -35,18 +36,19 @@ from .report import (
     query_benchmarks_to_dict,
 )
 
-__all__ = ["main"]
+__all__ = ["main", "run"]
 
 _EXIT_STATUS = """\
 exit status:
   0  done, whether or not anything collides
   1  collisions found, with --fail-on-collision
-  2  wrong use or bad input; a line on standard error says what and where"""
+  2  wrong use, bad input or another error; a line on standard error says what
+     and where"""
 
 _REPLAY_EXIT_STATUS = f"""\
 {_EXIT_STATUS}
   3  --validate found an answer that is wrong
-  130  interrupted"""
+  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM"""
 
 _EXAMPLES = f"""\
 examples:
@@ -61,8 +63,9 @@ _REPLAY = """\
 Find the collisions between each two consecutive time samples of a USD scene:
 of its meshes with themselves and with each other, every vertex moving straight
 from sample to sample. Meshes that never move are obstacles; where these touch
-one another is not counted. Files appear complete or not at all; interrupted,
-they hold the intervals that are finished and say that they are partial."""
+one another is not counted. Files appear complete or not at all; after Ctrl-C,
+SIGTERM, SIGHUP or an error they hold the intervals that are finished and say
+that they are partial."""
 
 _REPLAY_EXAMPLES = f"""\
 examples:
@@ -98,7 +101,8 @@ examples:
 _BENCH_EXIT_STATUS = """\
 exit status:
   0  done
-  2  wrong use or bad input; a line on standard error says what and where"""
+  2  wrong use, bad input or another error; a line on standard error says what
+     and where"""
 
 _BENCH = """\
 Measure how long things take. Without a benchmark's name: the paper's five
@@ -182,16 +186,13 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit status, see ``warp-bsc --help``.
     """
-    try:
-        arguments = _build_parser().parse_args(_with_benchmark(sys.argv[1:] if argv is None else argv))
-        return arguments.run(arguments)
-    except (OSError, ValueError) as error:
-        message = " ".join(str(error).split())
-        print(f"warp-bsc: error: {message}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("warp-bsc: interrupted", file=sys.stderr)
-        return 130
+    return run_guarded(lambda: run(sys.argv[1:] if argv is None else argv))
+
+
+def run(argv: list[str]) -> int:
+    """Run the command line as :func:`main` does, but raise every error."""
+    arguments = _build_parser().parse_args(_with_joined_frames(_with_benchmark(argv)))
+    return arguments.run(arguments)
 
 
 def _with_benchmark(argv: list[str]) -> list[str]:
@@ -199,6 +200,14 @@ def _with_benchmark(argv: list[str]) -> list[str]:
     if argv[:1] == ["bench"] and argv[1:2] not in [[name] for name in (*_BENCHMARKS, "-h", "--help")]:
         return ["bench", "paper", *argv[1:]]
     return argv
+
+
+def _with_joined_frames(argv: list[str]) -> list[str]:
+    """The arguments with the value of --frames joined to it, lest one that begins with a minus look like an option."""
+    if "--frames" not in argv[:-1]:
+        return argv
+    place = argv.index("--frames")
+    return [*argv[:place], "=".join(argv[place : place + 2]), *_with_joined_frames(argv[place + 2 :])]
 
 
 def _build_parser() -> argparse.ArgumentParser:

@@ -36,6 +36,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from .scene_files import SceneFiles
 from .segment import Segment
 from .selection import Selection
 
@@ -96,6 +97,7 @@ class Scene:
         path: The file.
         selection: Which of its meshes are checked.
         stage: The open ``Usd.Stage``.
+        files: The files that it is read from.
         times: Time codes between which motion is straight, ascending, at least two.
         time_codes_per_second: How many time codes make a second.
         meters_per_unit: How many metres make the scene's unit of length.
@@ -130,11 +132,12 @@ class Scene:
         self.path = str(path)
         self.selection = selection or Selection()
         self.stage = usd_stage.open_stage(path)  # prims expire with their stage
+        self.files = SceneFiles(self.stage)
         self._usd_meshes, self._warnings = usd_meshes.find_meshes(self.stage, path, self.selection)
         if not self._usd_meshes:
             raise ValueError(f"{path}: no visible mesh in the scene" + (", or none is selected" * bool(selection)))
         self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
-        self.meters_per_unit = UsdGeom.GetStageMetersPerUnit(self.stage)
+        self.meters_per_unit = float(self.stage.GetMetadata("metersPerUnit"))  # some programs write it as a float
         self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
         self.names = [mesh.name for mesh in self._usd_meshes]
         self.display_names = {mesh.name: mesh.display_name for mesh in self._usd_meshes}
