@@ -1,5 +1,7 @@
 """The command line: what it prints, and the status it exits with."""
 
+import contextlib
+import io
 import json
 import os
 import subprocess
@@ -7,9 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from pxr import Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom
 
-from warp_bsc import replay_command
+from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
@@ -377,3 +379,94 @@ def test_installed_program(safe_scene, program):
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == "warp-bsc: error: gone.usd: no such file\n"
+
+
+def run_program(*arguments, **options):
+    """What the program does in a process of its own."""
+    command = [sys.executable, "-m", "warp_bsc", *arguments]
+    return subprocess.run(command, text=True, check=False, **({"capture_output": True} | options))
+
+
+def test_error_while_the_program_is_loaded(safe_scene, tmp_path):
+    (tmp_path / "rich.py").write_text("raise RuntimeError('broken\\ninstallation')")
+    done = run_program("replay", safe_scene, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert done.returncode == 2
+    assert done.stderr.startswith("warp-bsc: error: RuntimeError: broken installation (cli.py:")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_interrupted_while_the_program_is_loaded(safe_scene, tmp_path):
+    (tmp_path / "rich.py").write_text(
+        "import os, signal, sys\n"
+        "os.kill(os.getpid(), signal.SIGINT)\n"
+        f"sys.path.remove({str(tmp_path)!r})\n"
+        "del sys.modules['rich']\n"
+        "import rich\n"
+    )
+    done = run_program("replay", safe_scene, env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert (done.returncode, done.stderr) == (130, "warp-bsc: interrupted\n")
+
+
+@pytest.mark.parametrize("error", [TypeError("wrong"), RuntimeError("wrong"), Tf.ErrorException(), MemoryError()])
+def test_unforeseen_error(capsys, monkeypatch, falling_scene, error):
+    def fail_to_open(path, **options):
+        raise error
+
+    monkeypatch.setattr(replay_command, "Scene", fail_to_open)
+    line = fail(capsys, "replay", falling_scene)
+    assert f"{falling_scene}: {type(error).__name__}" in line
+    assert "(replay_command.py:" in line
+
+
+def test_output_that_cannot_encode_all(monkeypatch, scenes):
+    write_scene(scenes / "näme.usda")
+    output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    assert main(["replay", str(scenes / "näme.usda"), "--device", "cpu", "--fail-on-collision"]) == 1
+    text = output.buffer.getvalue().decode("ascii")
+    assert "3 -> 4" in text and "n\\xe4me.usda: 2 meshes" in text
+    assert output.errors == "strict"
+
+
+needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+
+
+@needs_full
+@pytest.mark.parametrize("options", [[], ["--json"], ["--csv", "/dev/stdout"]])
+def test_standard_output_that_is_full(capsys, monkeypatch, falling_scene, options):
+    full = open("/dev/full", "w")  # noqa: SIM115 (it cannot be closed without an error)
+    monkeypatch.setattr(sys, "stdout", full)
+    assert main(["replay", falling_scene, "--device", "cpu", *options]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warp-bsc: error: standard output: ") and "No space left on device" in line
+    with contextlib.suppress(OSError):
+        full.close()
+
+
+@needs_full
+def test_program_whose_standard_output_is_full(safe_scene):
+    with open("/dev/full", "w") as full:
+        done = run_program(
+            "replay", safe_scene, "--device", "cpu", capture_output=False, stdout=full, stderr=subprocess.PIPE
+        )
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+
+
+@pytest.mark.parametrize("columns", [40, 60])
+def test_replay_table_on_a_narrow_terminal(capsys, monkeypatch, falling_scene, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    lines = run(capsys, "replay", falling_scene).splitlines()
+    start = next(number for number, line in enumerate(lines) if "Interval" in line)
+    assert max(len(line.rstrip()) for line in lines[start : start + 3]) <= columns
+    row = lines[start + 2].split()
+    assert (row[:3], row[4:6]) == (["3", "→", "4"], ["3", "3.25"])  # the interval, hits and the earliest time
+    assert "…" not in lines[start + 2]
+
+
+def test_frames_that_begin_with_a_minus(capsys, scenes):
+    path = scenes / "negative.usda"
+    write_scene(path, falling_times=range(-10, -5))
+    for frames in (["--frames", "-10:-8"], ["--frames=-10:-8"]):
+        found = json.loads(run(capsys, "replay", path, *frames, "--json"))
+        assert [(interval["start"], interval["end"]) for interval in found["intervals"]] == [(-10, -9), (-9, -8)]
+    assert "--frames" in fail(capsys, "replay", path, "--frames", "--json")

@@ -5,10 +5,16 @@ import contextlib
 import csv
 import hashlib
 import json
+import os
 import re
 import resource
+import shlex
 import shutil
+import stat
+import struct
 import subprocess
+import sys
+import threading
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -17,7 +23,9 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from stages import FALLING, FLOOR, add_floor, add_mesh, falling, moved, new_stage, save
 
-from warp_bsc import replay_command
+from warp_bsc import _atomic_file
+from warp_bsc._atomic_file import OutputFile
+from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 from warp_bsc.replay.usd_overlay import COLORS, LIT
 
@@ -124,6 +132,47 @@ def test_overlay_stays_lit_while_the_collisions_last(tmp_path):
     assert lit == [True, True, True, False, False, False, True, False]
 
 
+def test_overlay_shows_nothing_between_its_samples(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    places = [(0, 0.25), (0, -0.25), (0.4, 0.25), (0.4, -0.25), (0.4, -0.3), (0, 0.25), (0, 1)]
+    add_mesh(stage, "/World/Falling", {3 * time: moved(FALLING, (x, 0, z)) for time, (x, z) in enumerate(places)})
+    found = json.loads(replay(stage)[0].read_text())
+    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    at_start = [[contact["position"] for contact in interval["contacts"]] for interval in found["intervals"]]
+    assert [len(points) > 0 for points in at_start] == [True, True, True, False, True, False]
+    extent = UsdGeom.Points(overlay.GetPrimAtPath("/Collisions/Contacts")).GetExtentAttr()
+    unlit = [pytest.approx((0.6, 0.6, 0.6))]
+    for time in (0, 1, 2.999, 3, 4.5, 5.999, 6, 7, 9, 10, 11.999, 12, 13, 14.999, 15, 16.5, 18, 20):
+        expected = at_start[int(time // 3)] if time < 18 else []
+        points, primvars = read_contacts(overlay, time)
+        np.testing.assert_array_equal(points, np.float32(expected).reshape(-1, 3))
+        assert {len(values) for values in primvars.values()} == {len(expected)}
+        low, high = np.array(extent.Get(time))
+        assert np.all(low <= points) and np.all(points <= high)
+        assert floor_colors(overlay, time, "/World/Falling") == ([pytest.approx(LIT)] if expected else unlit)
+    assert errors_of(overlay) == []
+
+
+def test_overlay_of_a_scene_whose_default_prim_is_not_there(stage, tmp_path):
+    stage.GetRootLayer().defaultPrim = "Gone"
+    replay(stage)
+    assert Usd.Stage.Open(str(tmp_path / "overlay.usda")).GetDefaultPrim().GetPath() == "/World"
+
+
+def test_meters_per_unit_stored_as_a_float(stage, tmp_path):
+    UsdGeom.SetStageMetersPerUnit(stage, float(np.float32(0.01)))
+    stage.GetRootLayer().Export(str(tmp_path / "doubles.usdc"))
+    data = (tmp_path / "doubles.usdc").read_bytes()
+    stored = struct.pack("<fHBB", 0.01, 0, 9, 0x40)  # the number, its type (9: double, 8: float), that it is inline
+    assert data.count(stored) == 1
+    (tmp_path / "floats.usdc").write_bytes(data.replace(stored, stored[:6] + b"\x08\x40"))
+    found = json.loads(replay(tmp_path / "floats.usdc")[0].read_text())
+    assert found["hits"] == 1
+    assert found["meters_per_unit"] == pytest.approx(0.01, rel=1e-6)
+    assert UsdGeom.GetStageMetersPerUnit(Usd.Stage.Open(str(tmp_path / "overlay.usda"))) == found["meters_per_unit"]
+
+
 def test_overlay_of_instances_a_package_and_another_overlay(tmp_path):
     stage = new_stage(tmp_path / "asset.usda")
     add_floor(stage)
@@ -145,17 +194,6 @@ def test_overlay_of_instances_a_package_and_another_overlay(tmp_path):
     second = Usd.Stage.Open(str(again / "o.usda"))
     assert second.GetRootLayer().subLayerPaths == ["../overlay.usda"]
     np.testing.assert_array_equal(read_contacts(second, 0)[0], read_contacts(second, 0, "/Collisions_/Contacts")[0])
-
-
-def test_overlay_must_not_replace_the_scene(stage, capsys):
-    path = save(stage)
-    for name in (path, str(Path(path).parent / "." / "scene.usda")):
-        assert main(["replay", path, "--overlay", name]) == 2
-        assert "named twice" in capsys.readouterr().err
-    base = new_stage(Path(path).parent / "shot.usda")
-    base.GetRootLayer().subLayerPaths.append("./scene.usda")
-    assert main(["replay", save(base), "--overlay", path]) == 2
-    assert "the scene is read from this file" in capsys.readouterr().err
 
 
 def test_overlay_where_the_topology_changes(tmp_path):
@@ -229,9 +267,110 @@ def test_what_is_printed_names_the_files(stage, capsys, tmp_path):
     assert "note: Motion between time samples is taken to be linear." in output
 
 
-def test_files_may_be_read_by_whom_the_umask_lets(stage):
-    for file in replay(stage):
-        assert file.stat().st_mode & 0o777 == 0o644 & 0o777 or file.stat().st_mode & 0o600 == 0o600
+# --- Places ---
+
+
+@pytest.fixture(params=["without a name", "with a name"])
+def temporary(request, monkeypatch):
+    """Both kinds of temporary file, as far as the system has the first."""
+    if request.param == "with a name":
+        monkeypatch.setattr(_atomic_file, "_give_name", lambda *_: (_ for _ in ()).throw(OSError("not here")))
+
+
+@pytest.fixture
+def umask():
+    old = os.umask(0o027)
+    yield
+    os.umask(old)
+
+
+def permissions(file):
+    return file.stat().st_mode & 0o777
+
+
+def test_permissions_are_those_of_the_file_before_or_as_the_umask_has_it(stage, tmp_path, temporary, umask):
+    assert [permissions(file) for file in replay(stage)] == [0o640] * 4
+    for file in tmp_path.iterdir():
+        file.chmod(0o604)
+    assert [permissions(file) for file in replay(stage)] == [0o604] * 4
+    assert left_behind(tmp_path) == []
+
+
+def test_links_are_followed(stage, tmp_path, temporary):
+    (tmp_path / "elsewhere").mkdir()
+    targets = [tmp_path / "elsewhere" / name for name in OUTPUTS]
+    for target in targets:
+        (tmp_path / target.name).symlink_to(target.relative_to(tmp_path))
+    targets[0].write_text("old")  # the others are not there yet
+    old = targets[0].stat().st_ino
+    with targets[0].open() as reader:
+        files = replay(stage)
+        assert reader.read() == "old"  # it was replaced, not written to
+    assert targets[0].stat().st_ino != old
+    for file, target in zip(files, targets, strict=True):
+        assert file.is_symlink() and target.is_file() and not target.is_symlink()
+    assert json.loads(targets[0].read_text())["hits"] == 1
+    assert left_behind(tmp_path) == left_behind(tmp_path / "elsewhere") == []
+
+
+def test_devices_and_pipes_are_written_to(stage, tmp_path):
+    null, pipe = tmp_path / "null", tmp_path / "pipe"
+    null.symlink_to("/dev/null")
+    os.mkfifo(pipe)
+    read = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
+    reader.start()
+    assert main(["replay", save(stage), "--device", "cpu", "--json", str(null), "--csv", str(pipe)]) == 0
+    reader.join(10)
+    assert null.is_symlink() and stat.S_ISCHR(null.stat().st_mode) and stat.S_ISFIFO(pipe.stat().st_mode)
+    assert len(read[0].splitlines()) == 2
+
+
+def test_open_files_are_written_to(stage, tmp_path):
+    log = tmp_path / "log"
+    log.write_text("before\n")
+    with log.open("a") as file:
+        path = f"/dev/fd/{file.fileno()}"
+        assert main(["replay", save(stage), "--device", "cpu", "--csv", path]) == 0
+    lines = log.read_text().splitlines()
+    assert lines[0] == "before" and lines[1].startswith("interval,") and len(lines) == 3
+
+
+def test_json_to_dev_stdout_is_printed_alone(stage, capsys):
+    assert main(["replay", save(stage), "--device", "cpu", "--json", "/dev/stdout"]) == 0
+    assert json.loads(capsys.readouterr().out)["hits"] == 1
+    assert main(["replay", save(stage), "--device", "cpu", "--json", "/dev/stdout", "--csv"]) == 2
+    assert "only one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--json", "--csv", "--overlay", "--report"])
+def test_no_output_replaces_what_the_scene_is_read_from(stage, tmp_path, capsys, option):
+    layer = save(stage)
+    prop = new_stage(tmp_path / "prop.usda")
+    add_mesh(prop, "/World/Prop", moved(FALLING, (0, 0, 9)))
+    save(prop)
+    shot = new_stage(tmp_path / "shot.usda")
+    shot.GetRootLayer().subLayerPaths.append("./scene.usda")
+    shot.DefinePrim("/World/Prop").GetReferences().AddReference("./prop.usda")
+    link, hard_link = tmp_path / "link.usda", tmp_path / "hard.usda"
+    link.symlink_to("prop.usda")
+    os.link(layer, hard_link)
+    shot = save(shot)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for file in (layer, str(tmp_path / "prop.usda"), str(link), str(hard_link)):
+        assert main(["replay", shot, "--device", "cpu", option, file]) == 2
+        assert f"{file}: the scene is read from this file" in capsys.readouterr().err
+    for file in (shot, str(tmp_path / "." / "shot.usda")):
+        assert main(["replay", shot, "--device", "cpu", option, file]) == 2
+        assert "named twice" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_two_outputs_are_two_files(stage, tmp_path, capsys):
+    (tmp_path / "link.csv").symlink_to("hits.json")
+    both = ["--json", str(tmp_path / "hits.json"), "--csv", str(tmp_path / "link.csv")]
+    assert main(["replay", save(stage), "--device", "cpu", *both]) == 2
+    assert "named twice" in capsys.readouterr().err
 
 
 # --- Interrupted, out of room, broken ---
@@ -243,9 +382,9 @@ def left_behind(folder):
 
 def check_partial(folder, count, reason):
     found = json.loads((folder / "hits.json").read_text())
-    assert len(found["intervals"]) == count
+    assert count in (None, len(found["intervals"]))
     assert found["complete"] is False and reason in found["stopped"]
-    assert (folder / "hits.csv").read_text().splitlines()[-1].startswith(f"# partial: {count} of ")
+    assert (folder / "hits.csv").read_text().splitlines()[-1].startswith(f"# partial: {count or ''}")
     overlay = Usd.Stage.Open(str(folder / "overlay.usda"))
     data = overlay.GetRootLayer().customLayerData["collisions"]
     assert data["complete"] is False and reason in data["stopped"]
@@ -275,8 +414,6 @@ def test_interrupted(stage, tmp_path, monkeypatch, capsys):
 
 
 def test_interrupted_in_the_middle_of_a_record(stage, tmp_path, monkeypatch):
-    from warp_bsc._atomic_file import OutputFile  # noqa: PLC0415
-
     write = OutputFile.write
     calls = []
 
@@ -334,7 +471,48 @@ def test_full_disk(tmp_path, capsys):
     assert len(read_contacts(overlay, kept - 1)[0]) == 1
     assert not (tmp_path / "page.html").exists()  # it has no room, and is not cut off
     assert left_behind(tmp_path) == []
-    assert "File too large" in capsys.readouterr().err
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert f"{tmp_path / 'hits.json'}: File too large" in line
+    assert f"{tmp_path / 'page.html'}: not written: " in line
+
+
+def in_small_disk(folder, size, command):
+    """Run a command with a small disk mounted at a folder, of which the files are copied to the folder afterwards."""
+    script = f"""
+        mount -t tmpfs -o size={size} tmpfs {folder}/disk || exit 77
+        {shlex.join(command)}
+        status=$?
+        cp -r {folder}/disk/. {folder}/left
+        exit $status"""
+    return subprocess.run(["unshare", "-Urm", "sh", "-c", script], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare here")
+@pytest.mark.parametrize("size", [600_000, 1_600_000])
+def test_full_disk_has_room_for_all_files(tmp_path, size):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    many = [moved(FALLING, (0.01 * number, 0, 0)) for number in range(40)]
+    points = {time: [point for part in many for point in moved(part, (0, 0, z))]
+              for time, z in ((time, 0.25 if time % 2 else -0.25) for time in range(80))}  # fmt: skip
+    add_mesh(stage, "/World/Falling", points, [3] * 40, list(range(120)))
+    for name in ("disk", "left"):
+        (tmp_path / name).mkdir()
+    files = [tmp_path / "disk" / name for name in OUTPUTS]
+    named = [
+        str(word) for pair in zip(("--json", "--csv", "--overlay", "--report"), files, strict=True) for word in pair
+    ]
+    command = [sys.executable, "-m", "warp_bsc", "replay", save(stage), "--device", "cpu", "--no-self", *named]
+    done = in_small_disk(tmp_path, size, command)
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip(f"no disk can be mounted here: {done.stderr}")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warp-bsc: error: ") and "No space left on device" in line
+    found, _ = check_partial(tmp_path / "left", None, "No space left on device")
+    assert 0 < len(found["intervals"]) < 79
+    page = Page((tmp_path / "left" / "page.html").read_text())
+    assert page.data["partial"].startswith("Partial: ") and page.data["view"]
 
 
 def test_no_room_at_the_end_is_an_error(stage, tmp_path, capsys):
@@ -346,20 +524,37 @@ def test_no_room_at_the_end_is_an_error(stage, tmp_path, capsys):
     assert "overlay.usda: not all of it is written" in capsys.readouterr().err
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
     data = overlay.GetRootLayer().customLayerData["collisions"]
-    assert (data["complete"], data["intervals"], data["stopped"]) == (False, 2, "no room for more")
+    assert (data["complete"], data["intervals"], data["stopped"]) == (False, 3, "no room for more")
 
 
-def test_what_was_there_stays_until_the_new_is_whole(stage, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_a_file_that_cannot_be_finished_takes_no_other_with_it(stage, tmp_path, monkeypatch, capsys, name):
+    commit = OutputFile.commit
+
+    def broken(self):
+        if self.path.name == name:
+            raise RuntimeError("broken")
+        commit(self)
+
+    monkeypatch.setattr(OutputFile, "commit", broken)
+    replay(stage, status=2)
+    assert f"{tmp_path / name}: not written: RuntimeError: broken" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.usda", *OUTPUTS} - {name}
+
+
+def test_what_was_there_stays_if_no_interval_is_finished(stage, tmp_path, monkeypatch, capsys):
     (tmp_path / "hits.json").write_text("old")
 
     def broken(*arguments, **options):
         assert (tmp_path / "hits.json").read_text() == "old"
-        raise RuntimeError
+        raise RuntimeError("of the first interval")
         yield
 
     monkeypatch.setattr(replay_command, "replay", broken)
-    with pytest.raises(RuntimeError):
-        replay(stage)
+    replay(stage, status=2)
+    assert capsys.readouterr().err.startswith(
+        f"warp-bsc: error: {tmp_path}/scene.usda: RuntimeError: of the first interv"
+    )
     assert (tmp_path / "hits.json").read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hits.json", "scene.usda"]
 

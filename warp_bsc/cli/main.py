@@ -1,7 +1,6 @@
 """The command line, ``warp-bsc``."""
 
 import argparse
-import functools
 import importlib.util
 import json
 import os
@@ -23,6 +22,7 @@ from ..detection.mesh import CollisionMesh
 from ..detection.narrow_phase import METHODS
 from ..detection.query import query_edge_edge, query_vertex_face
 from .bench_paper import add_paper_options, run_paper_benchmarks
+from .error_boundary import run_guarded
 from .query_file import KINDS, find_query_files, read_query_file
 from .replay import add_replay_options, open_scene, run_replay
 from .tables import Console
@@ -36,20 +36,18 @@ from .tables_report import (
     query_benchmarks_to_dict,
 )
 
-__all__ = ["main"]
-
-_BROKEN_PIPE = 141
-"""What a shell makes of the end by SIGPIPE."""
+__all__ = ["main", "run"]
 
 _CUT_SHORT = """\
-  130  interrupted
+  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM
   141  nobody reads the output, as after | head -1"""
 
 _STATUS = """\
 exit status:
   0  done, whether or not anything collides
   1  collisions found, with --fail-on-collision
-  2  wrong use or bad input; a line on standard error says what and where"""
+  2  wrong use, bad input or another error; a line on standard error says what
+     and where"""
 
 _EXIT_STATUS = f"""\
 {_STATUS}
@@ -61,7 +59,7 @@ _REPLAY_EXIT_STATUS = f"""\
   4  done, but parts of the scene could not be read and were left out; --strict
      ends with 2 instead
 {_CUT_SHORT}
-Where several hold, 130 comes before 2, then 3, 1 and 4."""
+Where several hold, the signals come before 2, then 3, 1 and 4."""
 
 _EXAMPLES = f"""\
 examples:
@@ -79,8 +77,8 @@ from sample to sample. Meshes that never move are obstacles; where these touch
 one another is not counted, nor where a mesh touches itself that only its
 transform moves. What turns is sampled at every whole time code too. What
 cannot be read is named and left out. Files appear complete or not at all;
-interrupted, they hold the intervals that are finished and say that they are
-partial."""
+after Ctrl-C, SIGTERM, SIGHUP or an error they hold the intervals that are
+finished and say that they are partial."""
 
 _REPLAY_EXAMPLES = f"""\
 examples:
@@ -116,7 +114,8 @@ examples:
 _BENCH_EXIT_STATUS = f"""\
 exit status:
   0  done
-  2  wrong use or bad input; a line on standard error says what and where
+  2  wrong use, bad input or another error; a line on standard error says what
+     and where
 {_CUT_SHORT}"""
 
 _BENCH = """\
@@ -192,26 +191,6 @@ class _Parser(argparse.ArgumentParser):
         raise ValueError(f"{message}; see {self.prog} --help")
 
 
-def _ends_with_its_output(main):
-    """Lets a program end where its output does: without a word where nobody reads on, as Unix programs do."""
-
-    @functools.wraps(main)
-    def main_and_flush(argv: list[str] | None = None) -> int:
-        try:
-            try:
-                return main(argv)
-            finally:
-                print(end="", flush=True)
-        except OSError as error:
-            with open(os.devnull, "w") as nowhere:  # for what is left, which Python would try to write at exit
-                for output in (1, 2):
-                    os.dup2(nowhere.fileno(), output)
-            return _BROKEN_PIPE if isinstance(error, BrokenPipeError) else 2
-
-    return main_and_flush
-
-
-@_ends_with_its_output
 def main(argv: list[str] | None = None) -> int:
     """Run the command line.
 
@@ -221,20 +200,13 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
         The exit status, see ``warp-bsc --help``.
     """
-    try:
-        arguments = _build_parser().parse_args(_with_benchmark(sys.argv[1:] if argv is None else argv))
-        status = arguments.run(arguments)
-        print(end="", flush=True)  # what there is no room for is an error, too
-        return status
-    except BrokenPipeError:
-        raise
-    except (OSError, ValueError) as error:
-        message = " ".join(str(error).split())
-        print(f"warp-bsc: error: {message}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("warp-bsc: interrupted", file=sys.stderr)
-        return 130
+    return run_guarded(lambda: run(sys.argv[1:] if argv is None else argv))
+
+
+def run(argv: list[str]) -> int:
+    """Run the command line as :func:`main` does, but raise every error."""
+    arguments = _build_parser().parse_args(_with_joined_frames(_with_benchmark(argv)))
+    return arguments.run(arguments)
 
 
 def _with_benchmark(argv: list[str]) -> list[str]:
@@ -242,6 +214,14 @@ def _with_benchmark(argv: list[str]) -> list[str]:
     if argv[:1] == ["bench"] and argv[1:2] not in [[name] for name in (*_BENCHMARKS, "-h", "--help")]:
         return ["bench", "paper", *argv[1:]]
     return argv
+
+
+def _with_joined_frames(argv: list[str]) -> list[str]:
+    """The arguments with the value of --frames joined to it, lest one that begins with a minus look like an option."""
+    if "--frames" not in argv[:-1]:
+        return argv
+    place = argv.index("--frames")
+    return [*argv[:place], "=".join(argv[place : place + 2]), *_with_joined_frames(argv[place + 2 :])]
 
 
 def _build_parser() -> argparse.ArgumentParser:

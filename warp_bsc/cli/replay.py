@@ -2,15 +2,14 @@
 
 import argparse
 import contextlib
+import errno
+import importlib
 import math
 import os
-import shutil
-import sys
-import tempfile
-from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from .._atomic_file import STDOUT, ReplayOutput, naming
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
@@ -18,13 +17,13 @@ from ..replay.summary import Outcome
 from ..replay.usd_overlay import Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
+from .error_boundary import describe
+from .interrupts import INTERRUPTS, Interrupted
 from .replay_tables import print_replay
 from .tables import Console, say
 
 __all__ = ["add_replay_options", "open_scene", "run_replay"]
 
-_STDOUT = "-"
-_INTERRUPTED = 130
 _COLLIDES = 1
 _DISAGREES = 3
 _LEFT_OUT = 4
@@ -87,13 +86,11 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
 
     out = command.add_argument_group("what comes out")
     out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, that shows the collisions")
-    out.add_argument("--report", metavar="FILE", help="a page with charts and the worst interval in 3D, .html")
-    out.add_argument(
-        "--json", nargs="?", const=_STDOUT, metavar="FILE", help="every collision as JSON; only that, without FILE"
-    )
-    out.add_argument(
-        "--csv", nargs="?", const=_STDOUT, metavar="FILE", help="every collision as CSV; only that, without FILE"
-    )
+    file = {"type": _output, "metavar": "FILE"}
+    out.add_argument("--report", **file, help="a page with charts and the worst interval in 3D, .html")
+    printed = {"nargs": "?", "const": STDOUT, **file}
+    out.add_argument("--json", **printed, help="every collision as JSON; only that, without FILE")
+    out.add_argument("--csv", **printed, help="every collision as CSV; only that, without FILE")
 
 
 def open_scene(arguments) -> Scene:
@@ -105,15 +102,15 @@ def open_scene(arguments) -> Scene:
     """
     # The file of these options may be left out: what follows is the scene then.
     for option in ("json", "csv"):
-        if arguments.scene is None and getattr(arguments, option) not in (None, _STDOUT):
+        if arguments.scene is None and getattr(arguments, option) not in (None, STDOUT):
             arguments.scene = getattr(arguments, option)
-            setattr(arguments, option, _STDOUT)
+            setattr(arguments, option, STDOUT)
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
-    if arguments.json == arguments.csv == _STDOUT:
-        raise ValueError("--json and --csv without FILE: only one of them can be printed")
-    files = [arguments.scene, arguments.overlay, arguments.report, arguments.json, arguments.csv]
-    places = [os.path.realpath(file) for file in files if file not in (None, _STDOUT)]
+    outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
+    if outputs.count(STDOUT) > 1:
+        raise ValueError("only one of --json, --csv and --report can be printed, the others need a FILE")
+    places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
     for place in places:
         if places.count(place) > 1:
             raise ValueError(f"{place}: named twice, as two files of a replay")
@@ -124,13 +121,25 @@ def open_scene(arguments) -> Scene:
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
     )
-    return Scene(
-        arguments.scene,
-        selection=selection,
-        frames=arguments.frames,
-        subdivide=arguments.subdivide,
-        strict=arguments.strict,
-    )
+    with INTERRUPTS.held():  # USD's modules catch what is raised while they are loaded, and are broken then
+        importlib.import_module("warp_bsc.usd.meshes")
+    INTERRUPTS.check()
+    try:
+        scene = Scene(
+            arguments.scene,
+            selection=selection,
+            frames=arguments.frames,
+            subdivide=arguments.subdivide,
+            strict=arguments.strict,
+        )
+    except (OSError, ValueError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{arguments.scene}: {describe(error)}") from error
+    for file in outputs:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file, what is written must be another")
+    return scene
 
 
 def run_replay(scene: Scene, arguments, device) -> int:
@@ -145,42 +154,47 @@ def run_replay(scene: Scene, arguments, device) -> int:
         The exit status.
 
     Raises:
-        OSError: If a file cannot be written. What was finished is on the disk.
-        ValueError: If the scene turns out to be broken. What was finished is on the disk.
+        ValueError: If the scene turns out to be broken, or a file could not be written. What was finished is on the
+            disk, as far as there is room.
     """
     settings = {"method": arguments.method, "device": str(device)}
     with contextlib.ExitStack() as stack:
-        outputs, printed = _open_outputs(stack, scene, arguments, settings)
-        intervals, stopped, error = [], "", None
-        try:
-            with contextlib.closing(_track(scene, arguments, device)) as found:
-                for interval, contacts in found:
-                    intervals.append(interval)
-                    for output in outputs:
-                        output.add(interval, contacts)
-        except KeyboardInterrupt:
-            stopped = "interrupted"
-        except (OSError, ValueError, MemoryError) as failure:
-            stopped, error = f"stopped by an error: {' '.join(str(failure).split())}", failure
-        outcome = Outcome(scene, intervals=intervals, stopped=stopped, **settings)
-        for output in outputs:
+        outputs = _open_outputs(stack, scene, arguments, settings)
+        intervals, interrupt, problems = [], None, []
+        with INTERRUPTS.held():
             try:
-                output.finish(outcome)
-            except OSError as failure:
-                error = error or OSError(f"{output.path}: not all of it is written: {failure}")
-        if error:
-            raise error
-        if printed:
-            with open(printed, encoding="utf-8") as file:
-                shutil.copyfileobj(file, sys.stdout)
-        else:
-            console = Console()
-            print_replay(console, outcome)
-            for output in outputs:
-                say(console, f"Wrote {output.path}.")
-    if stopped:
-        print("warp-bsc: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+                with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
+                    for interval, contacts in found:
+                        scene.files.check()
+                        for output in outputs:
+                            with naming(output.name):
+                                output.add(interval, contacts)
+                        intervals.append(interval)
+                        INTERRUPTS.check()
+            except KeyboardInterrupt as stopped:
+                interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
+            except Exception as error:
+                interrupt = INTERRUPTS.came  # of which a library may have made another error
+                problems += [] if interrupt else [_explain(error, scene)]
+            stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
+            outcome = Outcome(scene, intervals=intervals, stopped=stopped, **settings)
+            finished = outputs if intervals else []  # what was there before is better than nothing
+            # Nothing disturbs the files. Whoever reads the other ones may never come to the end.
+            problems += _finish([output for output in finished if not output.is_stream], outcome)
+            with INTERRUPTS.raised():
+                problems += _finish([output for output in finished if output.is_stream], outcome)
+            if problems:
+                raise ValueError("; ".join([str(interrupt)] * bool(interrupt) + problems))
+            if not interrupt:
+                INTERRUPTS.check()
+        if STDOUT not in (arguments.json, arguments.csv, arguments.report):
+            with naming("standard output"):
+                console = Console()
+                print_replay(console, outcome)
+                for output in finished:
+                    say(console, f"Wrote {output.path}.")
+    if interrupt:
+        raise interrupt
     if outcome.validation and outcome.validation["disagreements"]:
         return _DISAGREES
     if arguments.fail_on_collision and outcome.hits:
@@ -188,17 +202,50 @@ def run_replay(scene: Scene, arguments, device) -> int:
     return _LEFT_OUT if scene.left_out else 0
 
 
-def _open_outputs(stack, scene, arguments, settings):
-    """The files to write, and the path of the one to print, None if there is none."""
-    printed = None
-    paths = {"json": arguments.json, "csv": arguments.csv}
-    for option, path in paths.items():
-        if path == _STDOUT:
-            folder = stack.enter_context(tempfile.TemporaryDirectory())
-            paths[option] = printed = Path(folder) / option
+def _explain(error, scene) -> str:
+    """What stopped a replay: that the scene is another now, if it is, which may show in any way."""
+    try:
+        scene.files.check()
+    except ValueError as changed:
+        return str(changed)
+    if isinstance(error, OSError | ValueError):
+        return describe(error)
+    return f"{scene.path}: {describe(error)}"
+
+
+def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
+    """Put files in their places, without the last intervals where there is no room for all, and say what is missing.
+
+    On a full disk all of them shrink for one another's sake, but not below half: tables are worth more than a page.
+    """
+    problems, shortages = [], {}
+    shared = 5  # times an eighth is a half
+    waiting = outputs[::-1]  # the tables, which are the largest, come last
+    while waiting:
+        output = waiting[0]
+        try:
+            output.finish(outcome)
+        except Exception as error:
+            number = error.errno if isinstance(error, OSError) else None
+            sharing, smaller = [output], []
+            if number in (errno.ENOSPC, errno.EDQUOT) and shared:
+                sharing, shared = waiting, shared - 1
+            if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                smaller = [other for other in sharing if other.shrink()]
+            if smaller:
+                shortages |= {other.name: describe(error) for other in smaller}
+                continue
+            shortages.pop(output.name, None)
+            problems.append(f"{output.name}: not written: {describe(error)}")
+        waiting.pop(0)
+    return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]
+
+
+def _open_outputs(stack, scene, arguments, settings) -> list[ReplayOutput]:
+    """The files to write."""
     makers = (
-        (paths["json"], lambda path: HitsJson(path, scene=scene, **settings)),
-        (paths["csv"], HitsCsv),
+        (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
+        (arguments.csv, HitsCsv),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, ReportPage),
     )
@@ -207,7 +254,7 @@ def _open_outputs(stack, scene, arguments, settings):
         if path:
             outputs.append(make(path))
             stack.callback(outputs[-1].discard)
-    return outputs, printed
+    return outputs
 
 
 def _track(scene, arguments, device):
@@ -231,6 +278,10 @@ def _track(scene, arguments, device):
             speed = progress.tasks[task].speed
             rate = f"{speed:.1f}/s" if speed else "…/s"
             progress.update(task, advance=1, time=interval.end, rate=rate)
+
+
+def _output(text: str) -> str:
+    return STDOUT if text == "/dev/stdout" else text
 
 
 def _frames(text: str) -> FrameRange:

@@ -76,17 +76,25 @@ def print_replay(console: Console, outcome: Outcome) -> None:
 
 def _print_worst(console, listed):
     """The intervals with the most collisions first."""
-    stages = listed[0].stats.milliseconds
-    headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
-    table = make_table("Interval", *headers, caption="The worst first; times of the stages in milliseconds.")
-    for interval in listed:
-        table.add_row(
-            Text(f"{interval.start:g} → {interval.end:g}"),
-            f"{interval.pairs_tested:,}",
-            f"{interval.hits:,}",
-            f"{round(interval.earliest.time, 6):.6g}",
-            *(f"{milliseconds:,.1f}" for milliseconds in interval.stats.milliseconds.values()),
-        )
+    arrow = "->" if console.options.ascii_only else "→"
+    stages = list(listed[0].stats.milliseconds)
+    while True:
+        headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
+        caption = "The worst first" + ("; times of the stages in milliseconds." if stages else ".")
+        table = make_table("Interval", *headers, caption=caption)
+        table.columns[0].no_wrap = True
+        for interval in listed:
+            table.add_row(
+                Text(f"{interval.start:g} {arrow} {interval.end:g}"),
+                f"{interval.pairs_tested:,}",
+                f"{interval.hits:,}",
+                f"{round(interval.earliest.time, 6):.6g}",
+                *(f"{interval.stats.milliseconds[stage]:,.1f}" for stage in stages),
+            )
+        roomy = console.options.update(width=1000)
+        if not stages or console.measure(table, options=roomy).maximum <= console.width:
+            break
+        stages.pop()  # of the least interest where there is no room for all
     console.print(table)
 
 

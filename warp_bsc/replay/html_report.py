@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import OutputFile
+from .._atomic_file import ReplayOutput
 from .summary import CERTIFIED_FOR, Outcome
 
 __all__ = ["ReportPage"]
@@ -25,7 +25,7 @@ _LONGEST = 10  # rows of a table
 _MOST_LINES = 200  # of disagreements
 
 
-class ReportPage:
+class ReportPage(ReplayOutput):
     """A page with a summary, charts, and the worst interval in 3D."""
 
     def __init__(self, path):
@@ -34,8 +34,7 @@ class ReportPage:
         Raises:
             OSError: If it cannot be written.
         """
-        self.path = Path(path)
-        self._output = OutputFile(path)
+        super().__init__(path)
         self._worst = None
 
     def add(self, interval, contacts):
@@ -44,11 +43,7 @@ class ReportPage:
             self._worst = interval, contacts
 
     def finish(self, outcome: Outcome):
-        """Write the page and put it in its place.
-
-        Raises:
-            OSError: If there is no room for it.
-        """
+        """Write the page and put it in its place."""
         folder = resources.files(__package__) / "page"
         style = (folder / "page.css").read_text(encoding="utf-8")
         script = "\n".join((folder / name).read_text(encoding="utf-8") for name in ("viewer.js", "page.js"))
@@ -62,12 +57,13 @@ class ReportPage:
         }
         page = (folder / "page.html").read_text(encoding="utf-8")
         parts = page.replace("{{", "}}").split("}}")  # text, name, text, name, ...
+        self._output.truncate(0)
         self._output.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
         self._output.commit()
 
-    def discard(self):
-        """Leave nothing behind, unless the file is finished."""
-        self._output.discard()
+    def shrink(self):
+        """Forget nothing: how large the page is does not depend on the number of intervals."""
+        return False
 
 
 def _data(outcome: Outcome, worst) -> dict:
@@ -147,8 +143,7 @@ def _data(outcome: Outcome, worst) -> dict:
 def _view(interval, contacts, scene) -> dict:
     """The worst interval: triangles at its start and end, and the contacts."""
     segment = contacts.segment
-    start = segment.positions(interval.start).astype(np.float64)
-    end = segment.positions(interval.end, before=True).astype(np.float64)
+    start, end = contacts.x0.astype(np.float64), contacts.x1.astype(np.float64)
     faces = segment.faces
     title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
     lit = contacts.colliding_faces

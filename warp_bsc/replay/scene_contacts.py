@@ -24,6 +24,8 @@ class Contacts:
 
     Attributes:
         segment: The meshes.
+        x0: Positions of their vertices at the start of the interval, shape [vertex_count, 3].
+        x1: The same at its end.
         kind: Index in :data:`KINDS`, shape [n].
         elements: What the two are: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape [n, 2].
         meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
@@ -40,6 +42,8 @@ class Contacts:
     """
 
     segment: Segment = field(repr=False)
+    x0: np.ndarray = field(repr=False)
+    x1: np.ndarray = field(repr=False)
     kind: np.ndarray
     elements: np.ndarray
     meshes: np.ndarray
@@ -159,7 +163,7 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
         position,
         normal,
     )
-    return Contacts(segment, *(array[counted] for array in arrays), counted)
+    return Contacts(segment, x0, x1, *(array[counted] for array in arrays), counted)
 
 
 def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:

@@ -3,11 +3,12 @@
 import os
 import tempfile
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import OutputFile
+from .._atomic_file import ReplayOutput, without_last_eighth
 from .scene_contacts import KINDS
 from .summary import Outcome
 
@@ -36,15 +37,15 @@ _CONTACTS = {
 """Attributes of the contact points that have time samples: their types and interpolations."""
 
 
-class Overlay:
+class Overlay(ReplayOutput):
     """A layer in USD's text format whose sublayer is the scene, so that both are seen when it is opened.
 
     Contact points are one ``UsdGeom.Points``, its samples at the start of each interval being what meets in it, and
     have the primvars ``toi``, ``elementA`` and ``elementB``. Polygons that collide are coloured from the start of the
-    interval to that of the next.
+    interval to that of the next. USD interpolates between samples: each ends with another one just before the next.
 
     USD's own layers hold all that is written to them in memory. Here samples wait in a temporary file, and are sorted
-    by attribute at the end.
+    by attribute at the end, when the scene, whose file may have become unreadable, is not read again.
     """
 
     def __init__(self, path, *, scene):
@@ -56,20 +57,16 @@ class Overlay:
 
         Raises:
             OSError: If it cannot be written.
-            ValueError: If it is not such a file, or one that the scene is read from.
+            ValueError: If it is not such a file.
         """
-        self.path = Path(path)
-        if self.path.suffix not in (".usda", ".usd"):
+        if Path(path).suffix not in (".usda", ".usd"):
             raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
-        used = [layer.realPath for layer in scene.stage.GetUsedLayers()]
-        if self.path.exists() and any(name and os.path.samefile(name, path) for name in used if os.path.exists(name)):
-            raise ValueError(f"{path}: the scene is read from this file, the overlay must be another")
         self._scene = scene
-        self._output = OutputFile(path)
-        self._spool = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 (closed when discarded)
-        self._samples = {}  # by prim and attribute: time, place in the spool and length of each
-        self._times = []  # starts of the intervals that are whole
-        self._colored = {}  # by the prim's path: the last sample of its colours
+        self._samples = {}  # by prim and attribute
+        self._ends = []  # of each interval that is whole, in the spool
+        self._last_start = None  # of an interval
+        self._colored = {}  # by the prim's path: the number of polygons in the last sample, and which of them are lit
+        self._unlit = {}  # by the prim's path: the scene's colours there
         self._polygon_counts = {}  # of the meshes in the interval before
         self._uncolored = False
         self._opened = set()  # instances that must have prims of their own to be coloured
@@ -79,13 +76,12 @@ class Overlay:
         self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
         self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
+        self._metadata = _metadata(scene)
+        super().__init__(path)
+        self._spool = tempfile.TemporaryFile(buffering=0, dir=self._output.folder)  # noqa: SIM115 (closed when discarded)
 
     def add(self, interval, contacts):
-        """Take the contacts of an interval.
-
-        Raises:
-            OSError: If there is no room for them.
-        """
+        """Take the contacts of an interval."""
         prim = self._contacts_path
         size = self._width / 2
         points = contacts.position.astype(np.float32)
@@ -103,38 +99,31 @@ class Overlay:
         }.items():
             self._sample(prim, name, interval.start, texts)
         self._color(interval, contacts)
-        self._times.append(interval.start)
+        self._last_start = interval.start
+        self._ends.append(self._spool.tell())
 
     def finish(self, outcome: Outcome):
-        """Write the layer and put it in its place.
-
-        Raises:
-            OSError: If there is no room. The last intervals are left out then, and the layer is in its place all the
-                same, unless there is no room even for that.
-        """
-        shortage = None
-        count = len(self._times)
-        while True:
-            try:
-                self._write(outcome.first(count))
-                break
-            except OSError as error:
-                if count == 0:
-                    raise
-                shortage = error
-                count //= 2
-                self._output.truncate(0)
+        """Write the layer and put it in its place."""
+        del self._ends[len(outcome.intervals) :]
+        self._output.truncate(0)
+        self._write(outcome.first(len(self._ends)))
         self._output.commit()
-        if shortage:
-            raise shortage
+
+    def shrink(self):
+        """Forget the samples of the last intervals."""
+        if not self._ends:
+            return False
+        self._ends = without_last_eighth(self._ends)
+        self._spool.truncate(self._ends[-1] if self._ends else 0)
+        return True
 
     def discard(self):
         """Leave nothing behind, unless the file is finished."""
         self._spool.close()
-        self._output.discard()
+        super().discard()
 
-    def _sample(self, prim, name, time, texts, polygons=0):
-        """Let a sample of an attribute wait in the spool, with the number of a mesh's polygons if some are lit."""
+    def _sample(self, prim, name, time, texts, lit_count=0):
+        """Let a sample of an attribute wait in the spool."""
         place = self._spool.seek(0, os.SEEK_END)
         separator = ""
         for text in texts:
@@ -142,7 +131,8 @@ class Overlay:
             while rest:
                 rest = rest[self._spool.write(rest) :]
             separator = ", "
-        self._samples.setdefault((prim, name), []).append((time, place, self._spool.tell() - place, polygons))
+        sample = _Sample(time, place, self._spool.tell() - place, lit_count)
+        self._samples.setdefault((prim, name), []).append(sample)
 
     def _color(self, interval, contacts):
         """Let the colours of all meshes wait that change at the start of an interval."""
@@ -155,23 +145,20 @@ class Overlay:
             else:
                 self._uncolored = True
         for path in {*self._colored, *lit} & meshes.keys():
-            state = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
-            old = self._colored.get(path)
-            if old is None:
+            count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
+            if path not in self._colored:
                 self._open_instances(path)
-                old = _Colored(-np.inf, (self._polygon_counts.get(path, state[0]), state[1][:0]))
-            if old.state[0] == state[0] and np.array_equal(old.state[1], state[1]):
-                continue
-            # Colours are interpolated: up to the interval before they must stay what they were.
-            if self._times and old.time < self._times[-1]:
-                self._sample_colors(path, self._times[-1], old.state)
-            self._sample_colors(path, interval.start, state)
-            self._colored[path] = _Colored(interval.start, state)
+                if self._last_start is not None:
+                    self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
+            old_count, old_polygons = self._colored.get(path, (None, None))
+            if old_count != count or not np.array_equal(old_polygons, polygons):
+                self._sample_colors(path, interval.start, count, polygons)
+                self._colored[path] = count, polygons
         self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
 
-    def _sample_colors(self, path, time, state):
-        count, lit = state
-        text = _color_text(_unlit_colors(self._scene.stage, path, count, time), count, lit)
+    def _sample_colors(self, path, time, count, lit):
+        self._unlit[path] = _unlit_colors(self._scene.stage, path, time)
+        text = _color_text(self._unlit[path], count, lit)
         self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
 
     def _open_instances(self, path):
@@ -184,33 +171,28 @@ class Overlay:
 
     def _write(self, outcome):
         """Write the whole layer, of the intervals of an outcome."""
-        times = self._times[: len(outcome.intervals)]
-        end = outcome.intervals[-1].end if outcome.intervals else self._scene.times[0]
+        spool_end = self._ends[-1] if self._ends else 0
         parts = {path: [] for path in sorted(self._opened)}
         for (path, name), samples in self._samples.items():
-            kept = [sample for sample in samples if times and sample[0] <= times[-1]]
+            kept = [sample for sample in samples if sample.place < spool_end]
             if kept:
                 parts.setdefault(path, []).append((name, kept))
         writer = _Writer(self._output)
         writer.write(self._head(outcome))
-        self._write_prims(writer, "", _tree(parts), parts, (times[-1] if times else end, end))
+        end = outcome.intervals[-1].end if outcome.intervals else self._scene.times[0]
+        self._write_prims(writer, "", _tree(parts), parts, end)
         writer.flush()
 
     def _head(self, outcome) -> str:
-        """The layer's metadata: that of the scene, which sublayers do not hand on."""
-        stage, scene = self._scene.stage, self._scene
-        roots = [prim.GetName() for prim in stage.GetPseudoRoot().GetChildren()]
-        default = stage.GetDefaultPrim().GetName() if stage.HasDefaultPrim() else roots[0]
-        start, end = scene.times[0], scene.times[-1]
-        if stage.HasAuthoredTimeCodeRange():
-            start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+        """The layer's metadata."""
         doc = f"Collisions found by warp-bsc replay. {outcome.motion}"
         if self._uncolored:
             doc += " Polygons of point instancers are not coloured: their instances are one prim."
-        source = Path(os.path.relpath(Path(scene.path).resolve(), self.path.parent.resolve())).as_posix()
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.path.parent.resolve())).as_posix()
         asset = source if source.startswith("../") else f"./{source}"
         complete = "true" if outcome.is_complete else "false"
         stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
+        metadata = "\n    ".join(f"{name} = {value}" for name, value in self._metadata.items())
         return f"""#usda 1.0
 (
     customLayerData = {{
@@ -220,21 +202,15 @@ class Overlay:
             int intervals = {len(outcome.intervals)}{stopped}
         }}
     }}
-    defaultPrim = {_quote(default)}
     doc = {_quote(doc)}
-    endTimeCode = {end!r}
-    framesPerSecond = {stage.GetFramesPerSecond()!r}
-    metersPerUnit = {scene.meters_per_unit!r}
-    startTimeCode = {start!r}
+    {metadata}
     subLayers = [
         @@@{asset}@@@
     ]
-    timeCodesPerSecond = {stage.GetTimeCodesPerSecond()!r}
-    upAxis = "{scene.up_axis}"
 )
 """
 
-    def _write_prims(self, writer, path, tree, parts, last):
+    def _write_prims(self, writer, path, tree, parts, end):
         """Write the prims below a path, from a tree of their names."""
         indent = "    " * path.count("/")
         for name, children in tree.items():
@@ -246,37 +222,44 @@ class Overlay:
                 writer.write(f"{indent}    float[] widths = [{self._width:.9g}] (\n")
                 writer.write(f'{indent}        interpolation = "constant"\n{indent}    )\n')
             for attribute, samples in parts.get(below, ()):
-                self._write_attribute(writer, indent + "    ", below, attribute, samples, last)
-            self._write_prims(writer, below, children, parts, last)
+                self._write_attribute(writer, indent + "    ", below, attribute, samples, end)
+            self._write_prims(writer, below, children, parts, end)
             writer.write(f"{indent}}}\n")
 
-    def _write_attribute(self, writer, indent, path, name, samples, last):
+    def _write_attribute(self, writer, indent, path, name, samples, end):
         """Write an attribute's samples, and what it is once the last interval has ended."""
-        last_start, end = last
         if path == self._contacts_path:
             value_type, interpolation = _CONTACTS[name]
-            after = [(end, "(0, 0, 0), (0, 0, 0)" if name == "extent" else "")]
+            after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
         else:
             value_type, interpolation = "color3f[]", "uniform"
-            after = []
-            if count := samples[-1][3]:
-                if samples[-1][0] < last_start:
-                    samples = [*samples, (last_start, *samples[-1][1:])]
-                after = [(end, _color_text(_unlit_colors(self._scene.stage, path, count, end), count, []))]
+            lit_count = samples[-1].lit_count
+            after = _color_text(self._unlit[path], lit_count, []) if lit_count else None
             writer.write(f"{indent}int[] {name}:indices = None\n")  # the scene's own
         writer.write(f"{indent}{value_type} {name}")
         if interpolation:
             writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
         writer.write(".timeSamples = {\n")
-        for time, place, length, _ in samples:
-            writer.write(f"{indent}    {time!r}: [")
-            self._spool.seek(place)
-            for size in [_COPIED] * (length // _COPIED) + [length % _COPIED]:
-                writer.write_bytes(self._spool.read(size))
-            writer.write("],\n")
-        for time, value in after:
-            writer.write(f"{indent}    {time!r}: [{value}],\n")
+        following = [(sample.time, sample.length) for sample in samples[1:]]
+        following += [] if after is None else [(end, len(after))]
+        for sample, (time, length) in zip_longest(samples, following, fillvalue=(None, 0)):
+            self._write_sample(writer, indent, sample.time, sample)
+            # USD interpolates if both have values, and would see points on the way from one contact to another.
+            if sample.length and length and (before := _just_before(time)) > sample.time:
+                if interpolation == "vertex":
+                    writer.write(f"{indent}    {before!r}: [],\n")
+                else:
+                    self._write_sample(writer, indent, before, sample)
+        if after is not None:
+            writer.write(f"{indent}    {end!r}: [{after}],\n")
         writer.write(f"{indent}}}\n")
+
+    def _write_sample(self, writer, indent, time, sample):
+        writer.write(f"{indent}    {time!r}: [")
+        self._spool.seek(sample.place)
+        for size in [_COPIED] * (sample.length // _COPIED) + [sample.length % _COPIED]:
+            writer.write_bytes(self._spool.read(size))
+        writer.write("],\n")
 
 
 class _Writer:
@@ -301,15 +284,42 @@ class _Writer:
 
 
 @dataclass(frozen=True)
-class _Colored:
-    """The last sample of a mesh's colours: its time, the number of polygons and which of them are lit."""
+class _Sample:
+    """A sample that waits in the spool: its time, place and length there; the number of polygons if some are lit."""
 
     time: float
-    state: tuple[int, np.ndarray]
+    place: int
+    length: int
+    lit_count: int
 
 
-def _unlit_colors(stage, path, count, time) -> np.ndarray:
-    """The colours of a mesh's polygons in the scene, shape [count, 3] or, if they are all the same, [1, 3]."""
+def _metadata(scene) -> dict[str, str]:
+    """The scene's metadata, which sublayers do not hand on: text by name."""
+    stage = scene.stage
+    default = stage.GetDefaultPrim()
+    start, end = scene.times[0], scene.times[-1]
+    if stage.HasAuthoredTimeCodeRange():
+        start, end = (float(stage.GetMetadata(name)) for name in ("startTimeCode", "endTimeCode"))
+    root = stage.GetRootLayer().defaultPrim if default else stage.GetPseudoRoot().GetChildren()[0].GetName()
+    return {
+        "defaultPrim": _quote(root),
+        "endTimeCode": repr(end),
+        "framesPerSecond": repr(stage.GetFramesPerSecond()),
+        "metersPerUnit": repr(scene.meters_per_unit),
+        "startTimeCode": repr(start),
+        "timeCodesPerSecond": repr(stage.GetTimeCodesPerSecond()),
+        "upAxis": f'"{scene.up_axis}"',
+    }
+
+
+def _just_before(time) -> float:
+    from pxr import Usd  # noqa: PLC0415 (slow)
+
+    return time - Usd.TimeCode.SafeStep(max(1e6, abs(time)))
+
+
+def _unlit_colors(stage, path, time) -> np.ndarray:
+    """The colours of a mesh's polygons in the scene, or fewer if they are all the same, shape [n, 3]."""
     from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
     primvar = UsdGeom.Gprim(stage.GetPrimAtPath(path)).GetDisplayColorPrimvar()
@@ -317,13 +327,13 @@ def _unlit_colors(stage, path, count, time) -> np.ndarray:
     if not values:
         return np.array([_UNLIT])
     colors = np.array(values, dtype=np.float64)
-    if primvar.GetInterpolation() == UsdGeom.Tokens.uniform and len(colors) == count:
-        return colors
-    return colors.mean(axis=0, keepdims=True)
+    return colors if primvar.GetInterpolation() == UsdGeom.Tokens.uniform else colors.mean(axis=0, keepdims=True)
 
 
 def _color_text(colors, count, lit) -> str:
     """The colours of a mesh's polygons, those lit being :data:`LIT`."""
+    if len(colors) != count:
+        colors = colors.mean(axis=0, keepdims=True)
     table, numbers = np.unique(colors, axis=0, return_inverse=True)
     texts = np.array([_tuples([color]) for color in [*table, LIT]], dtype=object)
     numbers = np.broadcast_to(numbers.reshape(-1), count).copy()

@@ -47,6 +47,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from .files import SceneFiles
 from .segment import Segment
 from .selection import Selection
 
@@ -119,6 +120,7 @@ class Scene:
         path: The file.
         selection: Which of its meshes are checked.
         stage: The open ``Usd.Stage``.
+        files: The files that it is read from.
         times: Time codes between which motion is straight, ascending, at least two.
         time_codes_per_second: How many time codes make a second.
         meters_per_unit: How many metres make the scene's unit of length.
@@ -168,6 +170,7 @@ class Scene:
         self._unreadable = usd_stage.UnreadableError
         self._left_out = usd_stage.LeftOut(path, strict)
         self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
+        self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
         self._collecting = usd_stage.collecting
         with self._collecting(self._messages, path):
