@@ -109,7 +109,7 @@ def open_scene(arguments) -> Scene:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if outputs.count(STDOUT) > 1:
-        raise ValueError("only one of --json, --csv and --report can be printed, the others need a FILE")
+        raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
     places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
     for place in places:
         if places.count(place) > 1:
