@@ -16,7 +16,7 @@ import pytest
 import warp as wp
 from newton.viewer import ViewerNull
 
-FOLDER = Path(__file__).parents[1] / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.glob("example_*.py"))
 BULLET = FOLDER / "example_cloth_bullet.py"
 THROW = FOLDER / "example_diffsim_throw.py"

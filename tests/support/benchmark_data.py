@@ -14,7 +14,7 @@ import numpy as np
 
 def data_folder():
     """Returns the folder of test data, $WARP_BSC_DATA or ../shared/data from the project's root; None when missing."""
-    folder = Path(os.environ.get("WARP_BSC_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+    folder = Path(os.environ.get("WARP_BSC_DATA") or Path(__file__).resolve().parents[3] / "shared" / "data")
     return folder if folder.is_dir() else None
 
 

@@ -14,7 +14,7 @@ from pxr import Tf, Usd, UsdGeom
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 
-ASSETS = Path(__file__).resolve().parents[1] / "assets"
+ASSETS = Path(__file__).resolve().parents[2] / "assets"
 FLOOR = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
 # Corner 1 meets the floor at time 3.25, corners 2 and 0 in the same interval; all within one triangle of the floor.
 FALLING = [(0.5, -0.5, 0.5), (0.6, -0.5, 0.0), (0.6, -0.6, 0.25)]

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 from benchmark_data import data_folder
+from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -23,15 +24,6 @@ def broad_phase(request, monkeypatch, device):
         pytest.skip("blocks are for the CPU")
     monkeypatch.setattr("warp_bsc.detection.detector._broad_phase", request.param)
     return request.param
-
-
-def grid(n, dtype=np.float32):
-    """A flat sheet of n x n quads of 1 cm: positions and faces."""
-    x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
-    positions = 0.01 * np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    a, b, c, d = corner, corner + 1, corner + n + 2, corner + n + 1
-    return positions.astype(dtype), np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def all_collisions(mesh, x0, x1):
@@ -268,19 +260,6 @@ def test_vertices_that_no_face_uses_take_no_part(value, on_device, broad_phase):
         detector.find_intersections(positions(x1))
 
 
-def crumpled(seed, n=24):
-    """A folded sheet whose upper half passes through the lower one: start and end positions, and faces."""
-    positions, faces = grid(n, np.float64)
-    offset = positions[:, 0] - positions[:, 0].mean()
-    upper = offset > 0.0
-    start = positions.copy()
-    start[:, 0] = -np.abs(offset)
-    start[:, 2] = np.where(upper, 0.002 + 0.1 * offset, 0.0)
-    end = start + 0.0005 * np.random.default_rng(seed).standard_normal(start.shape)
-    end[:, 2] -= np.where(upper, 0.2 * offset, 0.0)
-    return start.astype(np.float32), end.astype(np.float32), faces
-
-
 FIELDS = [
     f"{kind}{field}" for kind in ("vertex_face", "edge_edge") for field in ("", "_toi", "_coordinates", "_normal")
 ]
@@ -404,9 +383,6 @@ def test_detectors_side_by_side_do_not_disturb_one_another():
     assert_same(b, bsc.CollisionDetector(mesh).detect(x1, x0))
 
 
-needs_gpu = pytest.mark.skipif(not wp.is_cuda_available(), reason="CUDA graphs need a GPU")
-
-
 @pytest.fixture
 def captured():
     """A captured detection: detector, its results, positions on the device, and a function that replays it."""
@@ -419,7 +395,7 @@ def captured():
     return detector, c, start, end, lambda: wp.capture_launch(capture.graph)
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_a_graph_finds_what_a_detection_finds(captured):
     detector, c, start, end, replay = captured
     on_cpu = bsc.CollisionDetector(bsc.CollisionMesh(detector.mesh.faces, detector.mesh.vertex_count, device="cpu"))
@@ -434,7 +410,7 @@ def test_a_graph_finds_what_a_detection_finds(captured):
         assert c.certified and not c.overflowed
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured):
     detector, c, _, end, replay = captured
     replay()
@@ -443,7 +419,7 @@ def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured)
     assert c.edge_edge.tolist() == expected
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_a_graph_says_that_a_queue_was_too_small(captured):
     detector, _, start, end, _ = captured
     detector._edge_edge._reserve_contacts(1)
@@ -461,7 +437,7 @@ def test_a_graph_says_that_a_queue_was_too_small(captured):
     assert c.certified and not c.overflowed
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_a_graph_says_that_a_position_is_not_finite(captured):
     _, c, _, end, replay = captured
     positions = end.numpy()
@@ -471,7 +447,7 @@ def test_a_graph_says_that_a_position_is_not_finite(captured):
     assert not c.certified
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_capturing_first_is_refused():
     x0, x1, faces = crumpled(0)
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
@@ -480,7 +456,7 @@ def test_capturing_first_is_refused():
         detector.detect(start, end)
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_two_detectors_on_two_streams(captured):
     _, c, start, end, replay = captured
     x0, _, faces = crumpled(3)

@@ -8,7 +8,7 @@ import pytest
 from warp_bsc.replay.intervals import replay
 from warp_bsc.usd.scene import Scene
 
-ASSETS = Path(__file__).parents[1] / "assets"
+ASSETS = Path(__file__).parents[2] / "assets"
 SCENES = {"twisting": 5000, "funnel": 5000, "dancer": 5000, "flamenco": 8960, "crashing": 14320}
 """Triangles of what deforms."""
 

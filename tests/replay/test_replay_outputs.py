@@ -29,7 +29,7 @@ from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 from warp_bsc.replay.usd_overlay import COLORS, LIT
 
-ASSETS = Path(__file__).resolve().parents[1] / "assets"
+ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>"
 OUTPUTS = ("hits.json", "hits.csv", "overlay.usda", "page.html")
 

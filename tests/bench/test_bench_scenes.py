@@ -97,7 +97,7 @@ def test_crash_grows_by_nothing_but_triangles():
 
 def test_default_scenes():
     of_checkout, *generated = default_scenes()
-    assert Path(of_checkout) == Path(__file__).parents[1] / "assets" / "cloth_twist.usd"
+    assert Path(of_checkout) == Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
     assert generated == ["cloth:5000", "cloth:50000"]
     for name in (of_checkout, *generated):
         scene = load_scene(name)

@@ -18,7 +18,7 @@ import warp.autograd
 from generators import GENERATORS, mostly_hits
 from hypothesis import given
 from hypothesis import strategies as st
-from test_detector import crumpled, needs_gpu
+from sheets import crumpled
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -552,7 +552,7 @@ def add_times(pairs: wp.array[wp.vec2i], toi: wp.array[wp.float64], total: wp.ar
         wp.atomic_add(total, 0, toi[i])
 
 
-@needs_gpu
+@pytest.mark.gpu
 def test_forward_and_backward_fit_in_one_graph():
     device = "cuda:0"
     x0, x1, faces = crumpled(0)
