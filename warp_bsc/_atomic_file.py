@@ -58,7 +58,8 @@ class OutputFile:
         self._place = Path(os.path.realpath(path))
         self.folder = tempfile.gettempdir() if self.is_stream else self._place.parent
         if not os.path.isdir(self.folder):
-            raise FileNotFoundError(f"{path}: there is no folder {self.folder}")
+            folder = self.folder if self.path.is_symlink() else self.path.parent
+            raise FileNotFoundError(f"{path}: there is no folder {folder}")
         with naming(path):
             self._file, self._temporary = _open_temporary(self.folder)
 
