@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc import CollisionDetector, CollisionMesh, bench_command, bench_paper, bench_peers, checker
+from warp_bsc import CollisionDetector, CollisionMesh, checker
+from warp_bsc.bench import ipc_toolkit as bench_peers
+from warp_bsc.bench import paper as bench_paper
 from warp_bsc.bench.ipc_toolkit import measure_peer
 from warp_bsc.bench.methods import METHODS, STAGES
 from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
 from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench.worst_case import find_worst
+from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
 from warp_bsc.detection.launch import one_core
 
@@ -149,7 +152,7 @@ def test_worst_query_is_one_of_those_asked():
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr("warp_bsc.bench.scenes.__file__", str(tmp_path / "warp_bsc" / "bench_scenes.py"))
+    monkeypatch.setattr("warp_bsc.bench.scenes.__file__", str(tmp_path / "warp_bsc" / "bench" / "scenes.py"))
     with pytest.raises(FileNotFoundError, match="come with a checkout"):
         paper_scenes()
     for arguments in ([], ["--quick"], ["funnel"]):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import warp_bsc as bsc
-from warp_bsc import bench_queries, checker
+from warp_bsc import checker
+from warp_bsc.bench import queries as bench_queries
 from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
 from warp_bsc.cli.query_file import KINDS

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_bsc import checker
-from warp_bsc.kernels import algebraic
+from warp_bsc.kernels.exact import algebraic
 from warp_bsc.kernels.exact.wide_integers import integer
 
 DIGITS = 30

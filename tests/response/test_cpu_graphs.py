@@ -16,7 +16,7 @@ import warp as wp
 from test_solver import DT, SOLVERS, bullet
 
 import warp_bsc as bsc
-from warp_bsc import host_function
+from warp_bsc.detection import host_function
 from warp_bsc.detection.host_function import run_on_host
 
 CPU = wp.get_device("cpu")

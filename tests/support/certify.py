@@ -1,10 +1,10 @@
 """Holds certified answers against exact arithmetic on queries that aim at trouble.
 
-``python tests/support/certify.py --count 4000`` prints the share of queries that floating point could not certify, generator
-by generator, and exits with status 1 if a certified answer or a time of impact is wrong.
+``python tests/support/certify.py --count 4000`` prints the share of queries that floating point could not certify,
+generator by generator, and exits with status 1 if a certified answer or a time of impact is wrong.
 
-``python tests/support/certify.py --method exact --count 4000`` asks exact arithmetic in every width about every query, also
-what floating point could decide, and leaves out the generators whose queries it nearly always can.
+``python tests/support/certify.py --method exact --count 4000`` asks exact arithmetic in every width about every query,
+also what floating point could decide, and leaves out the generators whose queries it nearly always can.
 """
 
 import argparse
