@@ -21,7 +21,7 @@ def find_pairs(broad_phase, mesh, x0, x1):
     x0, x1 = (wp.array(x, dtype=dtype, device=device) for x in (x0, x1))
     counts = wp.zeros((3, len(Count)), dtype=wp.int64, device=device)
     own_count = wp.zeros(1, dtype=wp.int64, device=device)
-    queues = [wp.full(200_000, wp.vec2i(-1, -1), dtype=wp.vec2i, device=device) for _ in range(3)]
+    queues = [wp.full(1_000_000, wp.vec2i(-1, -1), dtype=wp.vec2i, device=device) for _ in range(3)]
     finder = broad_phase(mesh, own_count)
     finder.grow(1_000_000)
     finder.pair_elements(x0, x1, counts[0], queues[0], counts[1], queues[1])
