@@ -11,7 +11,7 @@ import argparse
 import json
 from pathlib import Path
 
-from warp_bsc.bench_figure import draw_paper_benchmarks
+from warp_bsc.bench.figure import draw_paper_benchmarks
 
 
 def main():

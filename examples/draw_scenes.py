@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from warp_bsc.scene import Scene
+from warp_bsc.usd.scene import Scene
 
 PIXELS = 360
 """Width and height of the picture of a scene; four times as many are computed."""

@@ -12,6 +12,13 @@ THREE = wp.constant(wp.float64(3.0))
 
 
 @wp.func
+def inverse_power_of_two(x: wp.float64) -> wp.float64:
+    """The power of two that scales a number from 2^-1022 to below 2^1023 to at least 1 and below 2."""
+    exponent = (wp.cast(x, wp.uint64) >> wp.uint64(52)) & wp.uint64(2047)
+    return wp.cast((wp.uint64(2046) - exponent) << wp.uint64(52), wp.float64)
+
+
+@wp.func
 def evaluate_quadratic(q: wp.vec3d, a: wp.float64, b: wp.float64) -> wp.float64:
     """Value of a quadratic at t = a / (a + b), times (a + b)^2."""
     return (q[0] * b + TWO * q[1] * a) * b + q[2] * a * a
@@ -21,6 +28,13 @@ def evaluate_quadratic(q: wp.vec3d, a: wp.float64, b: wp.float64) -> wp.float64:
 def evaluate_cubic(k: wp.vec4d, a: wp.float64, b: wp.float64) -> wp.float64:
     """Value of a cubic at t = a / (a + b), times (a + b)^3."""
     return ((k[0] * b + THREE * k[1] * a) * b + THREE * k[2] * a * a) * b + k[3] * a * a * a
+
+
+@wp.func
+def scaled_weights(a: wp.float64, b: wp.float64):
+    """The same parameter by weights of which the larger is at least 1 and below 2, so that no power underflows."""
+    scale = inverse_power_of_two(wp.max(a, b))
+    return scale * a, scale * b
 
 
 @wp.func

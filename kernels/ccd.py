@@ -1,5 +1,6 @@
 """Continuous collision detection of one query, to be called in any Warp kernel, with or without gradients."""
 
+import math
 from typing import Any
 
 import warp as wp
@@ -13,6 +14,7 @@ from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from .time_of_impact import Impact, impact
 
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
+_NAN = wp.constant(wp.float64(math.nan))
 
 
 @wp.func
@@ -49,6 +51,8 @@ def _answer(
     result = Impact()
     if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
         result.status = UNSURE
+        result.coordinates = wp.vec3d(_NAN)
+        result.normal = wp.vec3d(_NAN)
         return result
     apart = bool(False)
     if kind == VERTEX_FACE:
@@ -94,12 +98,14 @@ def impact_vertex_face(
         a1: First vertex of the triangle at the end.
         b1: Second vertex of the triangle at the end.
         c1: Third vertex of the triangle at the end.
-        tolerance: Of the time of impact, as a share of the step.
+        tolerance: Of the time of impact, as a share of the step, from 2^-38 to 1. What is less, or NaN,
+            counts as 2^-38, what is more than 2^-10 as that.
 
     Returns:
         Status, time of impact, barycentric coordinates and normal, in double precision. The last three are
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.gradients` says.
+        are clamped, as :mod:`.gradients` says. Points that are not finite are UNSURE at time 0, with coordinates and
+        normal NaN.
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
@@ -122,12 +128,14 @@ def impact_edge_edge(
         b1: Second end of the first edge at the end.
         c1: First end of the second edge at the end.
         d1: Second end of the second edge at the end.
-        tolerance: Of the time of impact, as a share of the step.
+        tolerance: Of the time of impact, as a share of the step, from 2^-38 to 1. What is less, or NaN,
+            counts as 2^-38, what is more than 2^-10 as that.
 
     Returns:
         Status, time of impact, parameters along the edges and normal, in double precision. The last three are
         differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.gradients` says.
+        are clamped, as :mod:`.gradients` says. Points that are not finite are UNSURE at time 0, with coordinates and
+        normal NaN.
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .bernstein import split_cubic, split_quadratic
+from .bernstein import scaled_weights, split_cubic, split_quadratic
 from .closest import between, closest_coordinates
 from .culling import direction_separates
 from .polynomials import Coplanarity, InsideTests, Motion, inside_tests, largest_axis
@@ -76,7 +76,8 @@ def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
     """Status of a query whose cubic may have roots from the inside tests given.
 
     Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of
-    size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F.
+    size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F. The weights are scaled to 1 <= s < 4, so that these are
+    no less than E and F, and leave room for what underflows, as those do.
     """
     constant = verdict(constant_signs(tests))
     if constant == FREE:
@@ -92,8 +93,7 @@ def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
 
     e0 = (k[2] - k[1]) - (k[1] - k[0])
     e1 = (k[3] - k[2]) - (k[2] - k[1])
-    a = wp.abs(e0)
-    b = wp.abs(e1)
+    a, b = scaled_weights(wp.abs(e0), wp.abs(e1))
     square = (a + b) * (a + b)
     part_bound = _SPLIT * square * (a + b) * bound
     k_first, k_second = split_cubic(k, a, b)

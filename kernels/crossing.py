@@ -4,20 +4,11 @@ from typing import Any
 
 import warp as wp
 
+from .motion import double
 from .signs import FREE, HIT, ROUNDOFF, UNDERFLOW, UNSURE, certified_sign
 
 _ERROR = wp.constant(wp.float64(9.0))
-_LONGEST = wp.constant(wp.float64(1.0e100))
-
-
-@wp.func
-def _difference(x: Any, y: Any) -> wp.vec3d:
-    """The vector x - y in double precision."""
-    return wp.vec3d(
-        wp.float64(x[0]) - wp.float64(y[0]),
-        wp.float64(x[1]) - wp.float64(y[1]),
-        wp.float64(x[2]) - wp.float64(y[2]),
-    )
+_LONGEST = wp.constant(wp.float64(1.0e70))
 
 
 @wp.func
@@ -25,8 +16,9 @@ def _orientation(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d) -> int:
     """Certified sign of the determinant of three vectors, each with one rounding.
 
     Bound, with P the sum of the sizes of its six products: 3 roundings of the vectors, 2 of the products, 3 of the
-    sums, 8r P to first order. Products of three lose less to underflow than the UNDERFLOW added as long as the
-    vectors are not longer than 1e100; of longer ones no sign is certain.
+    sums, 8r P to first order. Products of three lose less to underflow than the UNDERFLOW added, also where subnormal
+    numbers are flushed, 2^-1022 in a vector, as long as these are not longer than 1e70; of longer ones no sign is
+    certain.
     """
     ax = wp.abs(x)
     ay = wp.abs(y)
@@ -48,16 +40,16 @@ def edge_crosses_face(p: Any, q: Any, a: Any, b: Any, c: Any) -> int:
     The line through p and q passes the sides of the triangle with one orientation where it meets the triangle, and
     strictly opposite ones mean that it misses. It meets it within the edge where p and q lie on opposite sides.
     """
-    ab = _difference(b, a)
-    ac = _difference(c, a)
-    side_p = _orientation(ab, ac, _difference(p, a))
-    side_q = _orientation(ab, ac, _difference(q, a))
+    ab = double(b) - double(a)
+    ac = double(c) - double(a)
+    side_p = _orientation(ab, ac, double(p) - double(a))
+    side_q = _orientation(ab, ac, double(q) - double(a))
     if side_p * side_q > 0:
         return FREE
-    pq = _difference(q, p)
-    pa = _difference(a, p)
-    pb = _difference(b, p)
-    pc = _difference(c, p)
+    pq = double(q) - double(p)
+    pa = double(a) - double(p)
+    pb = double(b) - double(p)
+    pc = double(c) - double(p)
     past_ab = _orientation(pq, pa, pb)
     past_bc = _orientation(pq, pb, pc)
     past_ca = _orientation(pq, pc, pa)

@@ -36,7 +36,8 @@ one of the two has an effect, ``grazing`` says so. It also does where the root i
 certain to come within the tolerance, whose gradients are those of a contact at the time of impact with the coordinates
 and the normal there, or where Y both rises and falls within it.
 
-Gradients of points in single precision are rounded to it, and at most 2^100.
+Gradients of points in single precision are rounded to it, and at most 2^100. Where that coordinate is 1e-280 or less,
+or 2^1023 or more, gradients would be out of range: they are zero, and ``grazing`` says so.
 """
 
 import warp as wp
@@ -45,7 +46,7 @@ from .bernstein import mix, restrict_cubic
 from .motion import all_finite, relative_motion
 from .polynomials import VERTEX_FACE, Motion, coplanarity
 from .signs import FREE
-from .time_of_impact import Impact, approximate_root, mix_vector
+from .time_of_impact import Impact, approximate_root, clamped_tolerance, mix_vector
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
@@ -121,7 +122,7 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
     at = _touch_at(motion, found.toi, x, y, found.normal, found.localized == 1)
     if at.grazing == 1:
         return at
-    last = wp.min(found.toi + tolerance, _ONE)
+    last = wp.min(found.toi + clamped_tolerance(tolerance), _ONE)
     k = restrict_cubic(coplanarity(motion).k, found.toi, last)
     if k[0] * k[3] < _ZERO:
         t = mix(found.toi, last, approximate_root(k))
@@ -177,7 +178,8 @@ def with_gradients(
         result.grazing = 1
         if all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
-            result.grazing = _touch(motion, found, tolerance).grazing
+            if motion.scale > _ZERO:
+                result.grazing = _touch(motion, found, tolerance).grazing
     return result
 
 

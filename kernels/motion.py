@@ -4,11 +4,40 @@ from typing import Any
 
 import warp as wp
 
+from .bernstein import inverse_power_of_two
 from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 
-_SMALLEST = wp.constant(wp.float64(1.0e-280))
-_LARGEST = wp.constant(wp.float64(1.0e300))
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_EIGHTH = wp.constant(wp.float64(0.125))
+_QUARTER = wp.constant(wp.float64(0.25))
+_SMALLEST = wp.constant(wp.float64(2.0**-480))
+_LARGEST = wp.constant(wp.float64(2.0**1023))
+_SMALLEST_WITH_GRADIENT = wp.constant(wp.float64(1.0e-280))
+_LIFT = wp.constant(wp.float64(2.0**600))
+_LIFTED_BIT = wp.constant(wp.float64(2.0**-474))  # the lowest bit there is, times that
 _LARGEST_GRADIENT = wp.constant(wp.float64(2.0**100))
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    double value;
+    asm("cvt.f64.f32 %0, %1;" : "=d"(value) : "f"(x));  // which fast math would flush
+    return value;
+#else
+    union { float value; unsigned bits; } word;
+    word.value = x;
+    if (word.bits & 0x7f800000u)
+        return x;
+    const double value = (double)(int)(word.bits & 0x7fffffu) * 0x1p-149;
+    return word.bits >> 31 ? -value : value;
+#endif
+"""
+)
+def _double(x: wp.float32) -> wp.float64:
+    """The same number in double precision, even where subnormal numbers are taken for zero."""
+    ...
 
 
 @wp.func
@@ -20,7 +49,7 @@ def double(x: wp.vec3d) -> wp.vec3d:
 @wp.func
 def double(x: wp.vec3) -> wp.vec3d:  # noqa: F811, an overload
     """The same point in double precision, exactly."""
-    return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
+    return wp.vec3d(_double(x[0]), _double(x[1]), _double(x[2]))
 
 
 @wp.func_grad(double)
@@ -39,9 +68,9 @@ def doubles(a: Any, b: Any, c: Any, d: Any):
 
 @wp.func
 def all_finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
-    """Whether all coordinates are finite: no sum of doubles is then anything else, but for some beyond 1e307."""
-    start = double(a0) + double(b0) + double(c0) + double(d0)
-    end = double(a1) + double(b1) + double(c1) + double(d1)
+    """Whether all coordinates are finite: the mean of eight is then finite too."""
+    start = _EIGHTH * double(a0) + _EIGHTH * double(b0) + _EIGHTH * double(c0) + _EIGHTH * double(d0)
+    end = _EIGHTH * double(a1) + _EIGHTH * double(b1) + _EIGHTH * double(c1) + _EIGHTH * double(d1)
     return wp.isfinite(start + end)
 
 
@@ -60,11 +89,14 @@ def _motion(
     v1: wp.vec3d,
     w0: wp.vec3d,
     w1: wp.vec3d,
-) -> Motion:
-    """Relative motion, scaled by a power of two, which is exact, to coordinates below 2.
+):
+    """Relative motion and its size, the motion scaled by a power of two, which is exact, to coordinates below 2.
 
-    It is zero, which nothing can certify, where scaling is impossible: all points equal, or less than 1e-280 or more
-    than 1e300 apart.
+    It is zero, which nothing can certify, where its size, its largest coordinate, is zero or out of range.
+
+    What is lost where subnormal numbers are flushed, 2^-1022 from each of two points and from their difference, is
+    less than 2^-540 after scaling: of a product of three below 2^-532, less than the UNDERFLOW that bounds add, times
+    the roundoff, 2^-518. Numbers that scaling itself makes subnormal are smaller still.
     """
     motion = Motion()
     motion.kind = kind
@@ -73,10 +105,9 @@ def _motion(
     v_size = _size(v0, v1)
     w_size = _size(w0, w1)
     size = wp.max(wp.max(u_size, wp.max(v_size, w_size)))
-    if not (size > _SMALLEST and size < _LARGEST):
-        return motion
-    exponent = (wp.cast(size, wp.uint64) >> wp.uint64(52)) & wp.uint64(2047)
-    scale = wp.cast((wp.uint64(2046) - exponent) << wp.uint64(52), wp.float64)
+    if not (size >= _SMALLEST and size < _LARGEST):
+        return motion, size
+    scale = inverse_power_of_two(size)
     motion.u0 = scale * u0
     motion.u1 = scale * u1
     motion.v0 = scale * v0
@@ -87,7 +118,82 @@ def _motion(
     motion.v_size = scale * v_size
     motion.w_size = scale * w_size
     motion.scale = scale
-    return motion
+    return motion, size
+
+
+@wp.func
+def _out_of_range(x: wp.vec3d, size: wp.float64) -> bool:
+    """Whether points like this, and a motion of that size, need :func:`_rescaled` ones."""
+    return not (size >= _SMALLEST and size < _LARGEST)
+
+
+@wp.func
+def _out_of_range(x: wp.vec3, size: wp.float64) -> bool:
+    """Never: what differs in single precision does by 2^-149 or more."""
+    return False
+
+
+@wp.func
+def _rescaled_coordinate(x: wp.float64, size: wp.float64) -> wp.float64:
+    if size > _ONE:
+        return _QUARTER * x
+    bits = wp.cast(x, wp.uint64)
+    exponent = (bits >> wp.uint64(52)) & wp.uint64(2047)
+    if exponent > wp.uint64(1023 - 400):
+        return x
+    if exponent > wp.uint64(0):
+        return wp.cast(bits + (wp.uint64(600) << wp.uint64(52)), wp.float64)
+    lifted = wp.float64(bits & ((wp.uint64(1) << wp.uint64(52)) - wp.uint64(1))) * _LIFTED_BIT
+    return wp.where(bits >> wp.uint64(63) == wp.uint64(0), lifted, -lifted)
+
+
+@wp.func
+def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
+    """A point of a motion of a size that is out of range, in the scale in which all differences are in range.
+
+    A quarter, so that differences do not overflow; or times 2^600, bit by bit, because processors may be told to take
+    subnormal numbers for zero. There all that is 2^-400 or more stays as it is: the numbers next to it are farther
+    away than the size, so that only the same number is subtracted from it.
+    """
+    return wp.vec3d(
+        _rescaled_coordinate(x[0], size), _rescaled_coordinate(x[1], size), _rescaled_coordinate(x[2], size)
+    )
+
+
+@wp.func
+def _scale_of_rescaled(scale: wp.float64, size: wp.float64) -> wp.float64:
+    """The scale of a motion of rescaled points; 0 where gradients would be out of range."""
+    return wp.where(size > _SMALLEST_WITH_GRADIENT and size < _ONE, _LIFT * scale, _ZERO)
+
+
+@wp.func
+def _vertex_face(
+    p0: wp.vec3d,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    p1: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    roundoff: wp.float64,
+):
+    return _motion(VERTEX_FACE, roundoff, b0 - a0, b1 - a1, c0 - a0, c1 - a1, p0 - a0, p1 - a1)
+
+
+@wp.func
+def _edge_edge(
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    roundoff: wp.float64,
+):
+    return _motion(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
 
 
 @wp.func
@@ -95,18 +201,23 @@ def vertex_face_motion(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, roundoff: wp.float64
 ) -> Motion:
     """Relative motion of a vertex and a triangle; of finite coordinates only."""
-    origin0 = double(a0)
-    origin1 = double(a1)
-    return _motion(
-        VERTEX_FACE,
-        roundoff,
-        double(b0) - origin0,
-        double(b1) - origin1,
-        double(c0) - origin0,
-        double(c1) - origin1,
-        double(p0) - origin0,
-        double(p1) - origin1,
-    )
+    p, a, b, c = doubles(p0, a0, b0, c0)
+    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
+    motion, size = _vertex_face(p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
+    if _out_of_range(p0, size):
+        motion, _ = _vertex_face(
+            _rescaled(p, size),
+            _rescaled(a, size),
+            _rescaled(b, size),
+            _rescaled(c, size),
+            _rescaled(to_p, size),
+            _rescaled(to_a, size),
+            _rescaled(to_b, size),
+            _rescaled(to_c, size),
+            roundoff,
+        )
+        motion.scale = _scale_of_rescaled(motion.scale, size)
+    return motion
 
 
 @wp.func
@@ -114,16 +225,23 @@ def edge_edge_motion(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
     """Relative motion of two edges; of finite coordinates only."""
-    return _motion(
-        EDGE_EDGE,
-        roundoff,
-        double(b0) - double(a0),
-        double(b1) - double(a1),
-        double(d0) - double(c0),
-        double(d1) - double(c1),
-        double(c0) - double(a0),
-        double(c1) - double(a1),
-    )
+    a, b, c, d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    motion, size = _edge_edge(a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
+    if _out_of_range(a0, size):
+        motion, _ = _edge_edge(
+            _rescaled(a, size),
+            _rescaled(b, size),
+            _rescaled(c, size),
+            _rescaled(d, size),
+            _rescaled(to_a, size),
+            _rescaled(to_b, size),
+            _rescaled(to_c, size),
+            _rescaled(to_d, size),
+            roundoff,
+        )
+        motion.scale = _scale_of_rescaled(motion.scale, size)
+    return motion
 
 
 @wp.func

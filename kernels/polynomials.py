@@ -54,7 +54,7 @@ class Motion:
     w_size: wp.vec3d
     kind: int  # VERTEX_FACE or EDGE_EDGE
     roundoff: wp.float64  # ROUNDOFF, or 0 for the signs that floating point computes
-    scale: wp.float64  # by which coordinates are scaled, a power of two; 0 where that is impossible
+    scale: wp.float64  # by which coordinates are scaled, a power of two; 0 where gradients are out of its range
 
 
 @wp.struct

@@ -52,7 +52,7 @@ def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
     discriminant d1^2 - d0 d2 is negative.
 
     Bounds: of a difference, 2E and a rounding of size 2k; of the discriminant, 4 * 2.5E d for d the largest
-    difference, 10E^2 <= 4E d, and roundings of size d^2 <= 2kd: below 24E d.
+    difference, 10E^2 <= 4E d, and roundings of size d^2 <= 2kd: below 24E d, but for underflow.
     """
     d0 = k[1] - k[0]
     d1 = k[2] - k[1]
@@ -67,7 +67,7 @@ def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
     if s1 == s0:
         return MONOTONE
     size = wp.max(wp.abs(d0), wp.max(wp.abs(d1), wp.abs(d2)))
-    if d1 * d1 - d0 * d2 < -_DISCRIMINANT * bound * size:
+    if d1 * d1 - d0 * d2 < -bound * (_DISCRIMINANT * size + UNDERFLOW):
         return MONOTONE
     return wp.where(s1 == -s0, TWO_EXTREMA, UNKNOWN)
 
@@ -85,8 +85,8 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
 
     Bounds: the cubic with the computed coefficients is within E of Y on [0, 1], so it suffices that its sign at its own
     extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of
-    A, 10E; of T, with E <= k: (10 + 8 + 10) E k + (4 * 2.2 + 2 * 4.3 + 9.5) E k and roundings: below 64E k. Of H at the
-    root of T, as in :func:`linear_signs`.
+    A, 10E; of T, with e within 4.6E and E <= k: (10 + 8 + 10) E k + (4 * 2.2 + 2 * 4.6 + 10.2) E k and roundings of
+    size 32k^2, 2.5E k: below 64E k, but for underflow. Of H at the root of T, as in :func:`linear_signs`.
     """
     end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)
     if end_signs < 0:
@@ -116,7 +116,7 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     size = largest(k)
     t0 = leading * k[0] - (d1 - d0) * d0
     t1 = leading * k[3] - (d2 - d1) * d2
-    t_bound = _TURNING * bound * size
+    t_bound = bound * (_TURNING * size + UNDERFLOW)
     s0 = certified_sign(t0, t_bound)
     s1 = certified_sign(t1, t_bound)
     at_extremum = wp.where(s0 == s1, s0, 0)

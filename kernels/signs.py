@@ -8,7 +8,8 @@ where it exceeds the bound. Bounds have the form
 valid to first order in the roundoff for every order of evaluation and with or without fused multiply-add (fusing only
 leaves a rounding out); the constants c are rounded up by enough to cover the terms of second order. Each function
 derives its own bound where it computes it. Because a query is scaled to coordinates below 2, no product overflows, and
-what underflows is far below the UNDERFLOW that bounds add.
+what underflows is far below the UNDERFLOW that bounds add: 2^-1074 a product, or 2^-1022 an operation where another
+library has told the processor to flush subnormal numbers to zero. Rounding is to nearest.
 
 With ``roundoff = 0`` all bounds are zero: the signs that floating point computes, which is the paper's BSC-float.
 """
@@ -25,8 +26,8 @@ UNSURE = wp.constant(2)
 ROUNDOFF = wp.constant(wp.float64(2.0**-53))
 """Unit roundoff of double precision, with which signs are certified."""
 UNDERFLOW = wp.constant(wp.float64(1.0e-140))
-"""What every bound adds, times the roundoff, or times a bound: far above what products lose to underflow, 2^-1074
-each."""
+"""What every bound adds, times the roundoff, or times a bound, which is at least that: 1e-296 is still far above what
+operations lose to underflow, 2^-1022 each."""
 
 
 @wp.func

@@ -18,6 +18,9 @@ from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 MAX_VISITS = wp.constant(256)
 """Intervals visited after which a query is given up."""
 
+LEAST_DIGITS = 10
+"""Binary digits that times have at least, however large the tolerance."""
+
 FINEST = wp.constant(wp.float64(2.0**-8))
 """Length of the intervals that are given up if they stay undecided, as a share of the tolerance."""
 
@@ -28,12 +31,19 @@ _PLANAR = wp.constant(wp.float64(64.0))  # such an interval in lengths
 _NEWTON_STEPS = wp.constant(12)
 _NEWTON_END = wp.constant(wp.float64(2.0**-40))
 _CUBIC_ERROR = wp.constant(wp.float64(2.0))
+_SMALLEST_TOLERANCE = wp.constant(wp.float64(2.0**-38))
+_LARGEST_TOLERANCE = wp.constant(wp.float64(2.0**-LEAST_DIGITS))
 _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 
 
 @wp.struct
 class Impact:
-    """First contact of a query. Where the status is UNSURE, there is none before ``toi``."""
+    """First contact of a query. Where the status is UNSURE, there is none before ``toi``.
+
+    Coordinates and normal are those at the contact, to rounding and the square of the tolerance; where ``localized``
+    is 0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed triangle, which have
+    no plane, is along the velocity; where that is zero too, it is (0, 0, 1).
+    """
 
     status: int
     localized: int  # 1 where contact certainly occurs within the tolerance after ``toi``
@@ -41,6 +51,16 @@ class Impact:
     coordinates: wp.vec3d  # vertex-face: barycentric coordinates in the face; edge-edge: (s, r, 0) along the edges
     normal: wp.vec3d  # unit contact normal, against the motion of the vertex or first edge relative to the other
     grazing: int  # 1 where gradients are not those of the contact but clamped, see :mod:`.gradients`
+
+
+@wp.func
+def clamped_tolerance(tolerance: wp.float64) -> wp.float64:
+    """The tolerance asked for, in the range of those that are used, [2^-38, 2^-10]; 2^-38 for what is not a number.
+
+    Times are exact down to the one. More than the other would save nothing, for the search goes straight to the root,
+    but leave contacts at which the cubic is not linear.
+    """
+    return wp.where(tolerance > _SMALLEST_TOLERANCE, wp.min(tolerance, _LARGEST_TOLERANCE), _SMALLEST_TOLERANCE)
 
 
 @wp.func
@@ -181,13 +201,13 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
         motion: The query.
         y: Its coplanarity.
         status: What classification found: a HIT need not be asked for the whole step.
-        tolerance: Of the time, as a share of the step.
+        tolerance: Of the time, as a share of the step, see :func:`clamped_tolerance`.
 
     Returns:
         Status (FREE, HIT, UNSURE), time, exact in double precision, 2 if FREE, and the end of the interval that the
         search ended at.
     """
-    length = power_of_two(tolerance)
+    length = power_of_two(clamped_tolerance(tolerance))
     shortest = FINEST * length
     start = _ZERO
     end = _ONE
@@ -236,7 +256,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             ahead = False
             passing = False
             halved = False
-            if time <= _ZERO or time >= _ONE or (probed and width <= length):
+            if not (time > _ZERO and time < _ONE) or (probed and width <= length):
                 end = start + half
                 halved = True
             elif root - _HALF * length > start:
@@ -258,7 +278,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
         motion: The query.
         y: Its coplanarity.
         status: What classification found.
-        tolerance: Of the time of impact, as a share of the step.
+        tolerance: Of the time of impact, as a share of the step, see :func:`clamped_tolerance`.
     """
     result = Impact()
     found, toi, end = first_contact(motion, y, status, tolerance)
@@ -274,7 +294,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
 
     time = toi
     if found == HIT:
-        # between the ends of so short an interval the cubic is all but linear
+        # between the ends of so short an interval the cubic is all but linear, and its signs there are opposite
         k = restrict_cubic(y.k, toi, end)
         time = mix(toi, end, k[0] / (k[0] - k[3]))
     coordinates, normal = contact_at(motion, time)

@@ -27,6 +27,14 @@ def pytest_configure(config):
         wp.config.mode = "debug"
 
 
+def pytest_collection_modifyitems(items):
+    """Skips the tests that need a GPU where there is none."""
+    if not wp.is_cuda_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="needs a GPU"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def device():
     """The device that all tests run on: ``WARP_BSC_DEVICE``, or Warp's default."""

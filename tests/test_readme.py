@@ -8,8 +8,8 @@ import pytest
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.cli import main
-from warp_bsc.scene import Scene
+from warp_bsc.cli.main import main
+from warp_bsc.usd.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()

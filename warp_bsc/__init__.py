@@ -25,16 +25,16 @@ if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
-    "CollisionArrays": "collision_arrays",
-    "CollisionDetector": "detector",
-    "CollisionMesh": "mesh",
-    "Collisions": "detector",
-    "DetectionStats": "detector",
-    "QueryResult": "query",
-    "SolverCCD": "solver",
-    "SolverReport": "solver",
-    "query_edge_edge": "query",
-    "query_vertex_face": "query",
+    "CollisionArrays": "detection.differentiable",
+    "CollisionDetector": "detection.detector",
+    "CollisionMesh": "detection.mesh",
+    "Collisions": "detection.detector",
+    "DetectionStats": "detection.detector",
+    "QueryResult": "detection.query",
+    "SolverCCD": "response.solver_ccd",
+    "SolverReport": "response.solver_ccd",
+    "query_edge_edge": "detection.query",
+    "query_vertex_face": "detection.query",
 }
 
 __all__ = [

@@ -48,7 +48,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from .arrays import checked_coordinates
+from ._arrays import checked_coordinates
 
 __all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "vertex_face", "vertex_face_toi"]
 
@@ -164,7 +164,7 @@ def _earliest(points, pairs):
 def _undecided_triangles(points, pairs):
     """Yields (query, _Triangle) for every triangle that the filter leaves to exact arithmetic, query by query."""
     for start in range(0, len(points), _BLOCK):
-        block = points[start : start + _BLOCK].astype(np.float64)
+        block = points[start : start + _BLOCK]
         queries, triangles = np.nonzero(_may_touch(block, pairs))
         corners = _corners(_integers(block[queries]), pairs)[np.arange(len(queries)), triangles]
         for query, (x, y, z) in zip(queries, np.moveaxis(corners, 2, 3).tolist(), strict=True):
@@ -177,10 +177,18 @@ def _corners(points, pairs):
     return np.moveaxis(points[:, :, pairs[..., 0]] - points[:, :, pairs[..., 1]], 1, 3)
 
 
+def _decomposed(points):
+    """Returns integers m, e with points = m 2^e, from their bits: a processor may take subnormal numbers for zero."""
+    stored = np.finfo(points.dtype).nmant
+    bits = np.ascontiguousarray(points).view(f"i{points.itemsize}").astype(np.int64)
+    field = (bits >> stored) & (2 ** (8 * points.itemsize - 1 - stored) - 1)
+    mantissa = (bits & (2**stored - 1)) | (np.minimum(field, 1) << stored)
+    return np.where(bits < 0, -mantissa, mantissa), np.maximum(field, 1) + (np.finfo(points.dtype).minexp - 1 - stored)
+
+
 def _integers(points):
     """Scales each query by a power of two that makes its coordinates integers: an object array of Python integers."""
-    mantissa, exponent = np.frexp(points)
-    mantissa = (mantissa * 2.0**53).astype(np.int64)
+    mantissa, exponent = _decomposed(points)
     zeros = np.where(mantissa == 0, 0, np.frexp((mantissa & -mantissa).astype(np.float64))[1] - 1)
     mantissa >>= zeros  # Trailing zeros go to the exponent, which keeps the integers of coarse data small.
     exponent = exponent + zeros
@@ -204,9 +212,11 @@ def _may_touch(points, pairs):
     products of four and less than 48 roundings: it is off by less than 576 (4 * 4 + 48) u < 1e-11. Both leave room
     within _MARGIN for the rounding of the sums of absolute values.
     """
-    # |points| <= 1 cannot overflow. What underflows here is off by less than 2^-1074, nothing beside a size of 2^-500.
-    largest = np.abs(points).max(axis=(1, 2), keepdims=True, initial=0.0)
-    corners = _corners(np.ldexp(points, -np.frexp(largest)[1]), pairs)
+    # |points| <= 1 cannot overflow. What underflows here is off by less than 2^-1022, nothing beside a size of 2^-500.
+    mantissa, exponent = _decomposed(points)
+    share, power = np.frexp(mantissa.astype(np.float64))
+    power = np.where(share == 0.0, -4096, power + exponent)
+    corners = _corners(np.ldexp(share, power - power.max(axis=(1, 2), keepdims=True, initial=-4096)), pairs)
     # Differences have the sign of the exact ones, or are 0.
     sides = np.sign(corners).sum(axis=(2, 3))
     may_touch = (np.abs(sides) < 6).all(axis=-1)

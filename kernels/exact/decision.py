@@ -1,0 +1,351 @@
+"""Exact decision of a query in wide integers: first contact, with every degenerate case (paper, BSC-exact).
+
+One question
+------------
+The differences of points of the two features fill a triangle with the corners p - a, p - b, p - c (vertex-face), or a
+parallelogram with the corners c - a, c - b, d - b, d - a in this order (edge-edge). The features meet when this polygon
+contains the origin. Its corners move linearly. Let
+
+    V = P . (Q x R)  for its first, second and last corner: a cubic, zero when polygon and origin are in one plane;
+    C_e = A x B  for each of its edges, from corner A to the next one B: three quadratics, by axis.
+
+Those are, up to sign, the coplanarity Y and the inside tests of :mod:`polynomials`: the areas of the triangles that the
+origin forms with the edges. At a time at which V = 0:
+
+- for any axis, if components of two C_e have strictly opposite signs, there is no contact;
+- else, if any of them is not zero, there is contact;
+- if all are zero for all axes, the polygon's normal, a sum of some C_e, is zero. It has collapsed to a segment or to a
+  point, and is the union of its edges.
+
+An edge contains the origin when C_e = 0, so that A and B are parallel, and A_i B_i <= 0 along every axis i.
+
+The times to look at
+--------------------
+If V is not identically zero, these are its roots. Those inside the step are compared with the roots of the components
+of C_e, see :mod:`algebraic`, which gives the components' signs. Where all are zero, all edges are asked for **any**
+contact with the origin during the step, each of which is contact of the features as well.
+
+If V is identically zero, the motion is planar, in a plane that may turn: the first contact is at t = 0, or with an
+edge. For were the polygon not collapsed then, and the origin strictly inside, it would have been inside before. So the
+start is looked at, and all edges are asked.
+
+An edge asks likewise. If a component of C_e is not identically zero, contact is at a root of it, at which the other two
+are zero and A_i B_i <= 0. If all are, A and B are parallel all the time, and A . B, which is positive at the start if
+there is no contact, is so until the first contact.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from ..polynomials import EDGE_EDGE, VERTEX_FACE
+from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
+from .polygon import BITS, coordinate, cross_component, make_polygon, sign_at_end, spread, volume
+from .wide_integers import add, integer, product, sign, subtract, widen
+
+NONE = wp.constant(wp.float64(2.0))
+"""Time of impact where there is no contact."""
+
+TOO_WIDE = wp.constant(wp.float64(-1.0))
+"""In place of a time of impact: the exponents of the query are too far apart for the width asked for."""
+
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
+
+
+@wp.func
+def _next(corner: int, corners: int) -> int:
+    """The corner after another one."""
+    return wp.where(corner + 1 == corners, 0, corner + 1)
+
+
+@wp.func(inline=False)
+def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
+    """Whether a polygon in a plane with the origin at an end of the step contains it: 1, 0, or -1 if collapsed."""
+    axis = int(0)
+    while axis < 3:
+        low = int(0)
+        high = int(0)
+        corner = int(0)
+        while corner < corners:
+            s = sign_at_end(polygon, corner, _next(corner, corners), axis, end)
+            low = wp.min(low, s)
+            high = wp.max(high, s)
+            corner += 1
+        if low < 0 and high > 0:
+            return 0
+        if low < 0 or high > 0:
+            return 1
+        axis += 1
+    return -1
+
+
+@wp.func(inline=False)
+def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: int) -> bool:
+    """Whether the edge between two corners contains the origin at one end of the step."""
+    axis = int(0)
+    while axis < 3:
+        if sign_at_end(polygon, first, second, axis, end) != 0:
+            return False
+        if sign(coordinate(polygon, first, end, axis)) * sign(coordinate(polygon, second, end, axis)) > 0:
+            return False
+        axis += 1
+    return True
+
+
+@wp.func(inline=False)
+def _between_at_roots(
+    polygon: wp.array[Any], first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int
+):
+    """Whether the edge contains the origin at the positive roots of a component of its cross product.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        axis: Of the component.
+        c0: Coefficients of the component in z, here and next.
+        c1: Of z.
+        c2: Of z^2.
+        roots: How many positive roots it has, with multiplicity, 1 or 2.
+
+    Returns:
+        Two Booleans, for the smaller root first; of one root, twice.
+    """
+    at_first = bool(True)
+    at_second = bool(True)
+    zero = subtract(c0, c0)
+    i = int(0)
+    while i < 3 and (at_first or at_second):
+        if i != axis:
+            p0, p1, p2 = cross_component(polygon, first, second, i)
+            s = signs_at_roots(p0, p1, p2, zero, c0, c1, c2, roots)
+            at_first = at_first and s[0] == 0
+            at_second = at_second and s[1] == 0
+        i += 1
+    i = int(0)
+    while i < 3 and (at_first or at_second):
+        a0 = widen(coordinate(polygon, first, 0, i))
+        a1 = widen(coordinate(polygon, first, 1, i))
+        b0 = widen(coordinate(polygon, second, 0, i))
+        b1 = widen(coordinate(polygon, second, 1, i))
+        a = signs_at_roots(a0, a1, zero, zero, c0, c1, c2, roots)
+        b = signs_at_roots(b0, b1, zero, zero, c0, c1, c2, roots)
+        at_first = at_first and a[0] * b[0] <= 0
+        at_second = at_second and a[1] * b[1] <= 0
+        i += 1
+    return at_first, at_second
+
+
+@wp.func(inline=False)
+def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -> wp.float64:
+    """When an edge of the polygon first contains the origin: a multiple of 2^-digits not after it, or NONE.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        digits: Binary digits of the time, at most 38.
+    """
+    if _edge_touches_at_end(polygon, first, second, 0):
+        return _0
+    result = NONE
+    if _edge_touches_at_end(polygon, first, second, 1):
+        result = _1
+    axis = int(0)
+    while axis < 3:
+        c0, c1, c2 = cross_component(polygon, first, second, axis)
+        if sign(c0) != 0 or sign(c1) != 0 or sign(c2) != 0:
+            roots = count_quadratic_roots(c0, c1, c2)
+            if roots > 0:
+                at_first, at_second = _between_at_roots(polygon, first, second, axis, c0, c1, c2, roots)
+                if at_first or at_second:
+                    # the only positive root is the third of a cubic, two are the second and the third
+                    index = wp.where(roots == 2 and at_first, 1, 2)
+                    return root_time(c0, c1, c2, subtract(c0, c0), roots, index, digits)
+            return result
+        axis += 1
+    # parallel all the time: A . B, a quadratic
+    a0 = coordinate(polygon, first, 0, 0)
+    a1 = coordinate(polygon, first, 1, 0)
+    b0 = coordinate(polygon, second, 0, 0)
+    b1 = coordinate(polygon, second, 1, 0)
+    d0 = product(a0, b0)
+    d1 = add(product(a0, b1), product(a1, b0))
+    d2 = product(a1, b1)
+    axis = int(1)
+    while axis < 3:
+        a0 = coordinate(polygon, first, 0, axis)
+        a1 = coordinate(polygon, first, 1, axis)
+        b0 = coordinate(polygon, second, 0, axis)
+        b1 = coordinate(polygon, second, 1, axis)
+        d0 = add(d0, product(a0, b0))
+        d1 = add(d1, add(product(a0, b1), product(a1, b0)))
+        d2 = add(d2, product(a1, b1))
+        axis += 1
+    roots = count_quadratic_roots(d0, d1, d2)
+    if roots > 0:
+        return root_time(d0, d1, d2, subtract(d0, d0), roots, 3 - roots, digits)
+    return result
+
+
+@wp.func(inline=False)
+def _component_signs(
+    polygon: wp.array[Any],
+    first: int,
+    second: int,
+    axis: int,
+    v0: Any,
+    v1: Any,
+    v2: Any,
+    v3: Any,
+    roots: int,
+    constant: bool,
+) -> wp.vec3i:
+    """Signs of a component of the cross product of an edge's corners at the roots of V.
+
+    Args:
+        polygon: The polygon.
+        first: Corner at which the edge starts.
+        second: Corner at which it ends.
+        axis: Of the component.
+        v0: Coefficients of V in z, here and next.
+        v1: Of z.
+        v2: Of z^2.
+        v3: Of z^3.
+        roots: How many positive roots V has, with multiplicity.
+        constant: Whether to answer for those components only that have no positive root, or only for those that do.
+
+    Returns:
+        The signs at the roots a1 <= a2 <= a3 of V, of which the last ones are positive; zeros where not asked.
+    """
+    c0, c1, c2 = cross_component(polygon, first, second, axis)
+    turns = count_quadratic_roots(c0, c1, c2)
+    if (turns == 0) != constant:
+        return wp.vec3i(0, 0, 0)
+    return signs_at_cubic_roots(c0, c1, c2, turns, v0, v1, v2, v3, roots)
+
+
+@wp.func
+def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits: int) -> wp.float64:
+    """Whether a query collides, and when first: a multiple of 2^-digits not after it, closer than that to it, or NONE.
+
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE.
+        polygon: The polygon of the query, of at most BITS.
+        timed: Whether the time is asked for; else it is any time at most 1 where the query collides.
+        digits: Binary digits of the time, at most 38.
+    """
+    corners = wp.where(kind == VERTEX_FACE, 3, 4)
+    v0, v1, v2, v3 = volume(polygon, corners - 1)
+    s0 = sign(v0)
+    s3 = sign(v3)
+    collapses = s0 == 0 and s3 == 0 and sign(v1) == 0 and sign(v2) == 0
+    toi = NONE
+    if s0 == 0:
+        touches = _touches_at_end(polygon, corners, 0)
+        if touches > 0:
+            return _0
+        collapses = collapses or touches < 0
+    if s3 == 0:
+        touches = _touches_at_end(polygon, corners, 1)
+        if touches > 0:
+            toi = _1
+            if not timed:
+                return toi
+        collapses = collapses or touches < 0
+
+    roots = count_cubic_roots(v0, v1, v2, v3)
+    is_open = wp.vec3i(wp.where(roots == 3, 1, 0), wp.where(roots > 1, 1, 0), wp.where(roots > 0, 1, 0))
+    hit = wp.vec3i(0, 0, 0)
+    axis = int(0)
+    while axis < 3 and wp.max(is_open) > 0:
+        low = wp.vec3i(0, 0, 0)
+        high = wp.vec3i(0, 0, 0)
+        # components without roots first: they cost little, and opposite signs settle all
+        step = int(0)
+        while step < 2 * corners:
+            if wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
+                corner = wp.where(step < corners, step, step - corners)
+                signs = _component_signs(
+                    polygon, corner, _next(corner, corners), axis, v0, v1, v2, v3, roots, step < corners
+                )
+                low = wp.min(low, signs)
+                high = wp.max(high, signs)
+            step += 1
+        one_sign = wp.cw_mul(is_open, high - low)  # 0: all are zero, 1: one weak sign, 2: opposite signs
+        hit += wp.vec3i(
+            wp.where(one_sign[0] == 1, 1, 0), wp.where(one_sign[1] == 1, 1, 0), wp.where(one_sign[2] == 1, 1, 0)
+        )
+        is_open = wp.vec3i(
+            wp.where(one_sign[0] == 0, is_open[0], 0),
+            wp.where(one_sign[1] == 0, is_open[1], 0),
+            wp.where(one_sign[2] == 0, is_open[2], 0),
+        )
+        axis += 1
+    if wp.max(hit) > 0:
+        if not timed:
+            return _0
+        index = wp.where(hit[0] > 0, 0, wp.where(hit[1] > 0, 1, 2))
+        toi = wp.min(toi, root_time(v0, v1, v2, v3, roots, index, digits))
+    if collapses or wp.max(is_open) > 0:
+        corner = int(0)
+        while corner < corners:
+            toi = wp.min(toi, edge_contact(polygon, corner, _next(corner, corners), digits))
+            corner += 1
+    return toi
+
+
+for _limbs in BITS:
+    _Integer = integer(_limbs)
+
+    @wp.func
+    def _decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
+        """As :func:`first_contact_exactly`; taking an array of a known type keeps it from being copied at each call."""
+        return first_contact_exactly(kind, polygon, timed, digits)
+
+
+@functools.cache
+def decide_in(limbs):
+    """The device function that decides queries in integers of so many limbs a coordinate, a key of BITS."""
+    number = integer(limbs)
+    most = BITS[limbs]
+
+    @wp.func
+    def decide(
+        kind: int,
+        a0: wp.vec3d,
+        b0: wp.vec3d,
+        c0: wp.vec3d,
+        d0: wp.vec3d,
+        a1: wp.vec3d,
+        b1: wp.vec3d,
+        c1: wp.vec3d,
+        d1: wp.vec3d,
+        timed: bool,
+        digits: int,
+    ) -> wp.float64:
+        """First contact of a query, as :func:`first_contact_exactly` has it, or TOO_WIDE.
+
+        Args:
+            kind: VERTEX_FACE or EDGE_EDGE.
+            a0: The four points in order, at the start.
+            b0: Second point.
+            c0: Third point.
+            d0: Fourth point.
+            a1: The same points at the end.
+            b1: Second point.
+            c1: Third point.
+            d1: Fourth point.
+            timed: Whether the time is asked for.
+            digits: Binary digits of the time, at most 38.
+        """
+        exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+        if bits > most:
+            return TOO_WIDE
+        polygon = wp.zeros(shape=(24,), dtype=number)
+        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        return _decide(kind, polygon, timed, digits)
+
+    return decide

@@ -1,0 +1,217 @@
+"""The polygon of a query around the origin, in wide integers, and the polynomials that its corners make.
+
+Scaling an axis changes no answer. So along each axis coordinates are integers once they are divided by their lowest
+set bit, and so are the corners: B bits, |x| < 2^B, the axis with the most of them counting. Then, in z = t / (1 - t),
+the outer coefficients of a component of C_e have two products of coordinates, below 2^(2B+1), and the middle one has
+four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt(3) 2^3B by Hadamard's inequality, thus
+2^(3B+3), and the inner ones are three of them each, below 15.6 * 2^3B. With these, in units of the power of 2^B,
+
+    g   = a P - p3 z q      52      < 2^6,   5B: 2 * 15.6 + 5.2 * 4
+    K0                      124.8   < 2^7,   7B: 2 * 10.4 + 2 * 52, of V' as well
+    K1, J                   291.2   < 2^9,   7B: 2 * 41.6 + 4 * 52; of V' 249.6
+    K1 of V' reversed       561.6   < 2^10,  7B: 2 * 31.2 + 4 * (2 * 31.2 + 4 * 15.6), where K0 and J are 0
+    K0^2 - K1 J             77,900  < 2^17, 14B: 124.8^2 + 249.6^2 for V'; 51,900 for V itself
+    Hessian of V            487     < 2^9,   6B: 15.6^2 + 3 * 5.2 * 15.6
+    discriminant of V       1.2e6   < 2^21, 12B
+    turning point minus root        < 2^11,  9B
+
+and one bit more for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
+8 L, all fits for
+
+    B <= min((512 L - 18) / 14, (256 L - 11) / 7):  35 bits in one limb, 71 in two, 291 in eight.
+
+Single precision never takes more than 278, its whole range.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from ..polynomials import VERTEX_FACE
+from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
+
+BITS = {1: 35, 2: 71, 8: 291}
+"""Largest B by the number of limbs of a coordinate."""
+
+_FROM_POINTS = """
+    // both points of the difference that each corner is; 0 to 3: the points of the query in order
+    const int first[2][4] = {{0, 0, 0, 0}, {2, 2, 3, 3}}, second[2][4] = {{1, 2, 3, 3}, {0, 1, 1, 0}};
+    const wp::vec_t<3, wp::float64> points[2][4] = {{a0, b0, c0, d0}, {a1, b1, c1, d1}};
+    constexpr int L = sizeof(*polygon.data) / 8;
+    for (int axis = 0; axis < 3; ++axis) {
+        for (int end = 0; end < 2; ++end) {
+            wp::uint64 x[4][L];
+            for (int point = 0; point < 4; ++point) {
+                union { wp::float64 value; wp::uint64 bits; } word;
+                word.value = points[end][point][axis];
+                const int field = (int)((word.bits >> 52) & 2047);
+                wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
+                if (field > 0)
+                    mantissa |= 1ull << 52;
+                int shift = (field > 0 ? field : 1) - 1075 - exponents[axis];
+                if (shift < 0) {
+                    mantissa = shift > -64 ? mantissa >> -shift : 0;
+                    shift = 0;
+                }
+                const wp::uint64 mask = 0 - (word.bits >> 63);
+                wp::uint64 carry = word.bits >> 63;
+                for (int i = 0; i < L; ++i) {
+                    const int from = 64 * i - shift;  // bit of the mantissa that is the lowest of this limb
+                    wp::uint64 limb = 0;
+                    if (from > -64 && from <= 0)
+                        limb = mantissa << -from;
+                    else if (from > 0 && from < 64)
+                        limb = mantissa >> from;
+                    x[point][i] = (limb ^ mask) + carry;
+                    carry &= x[point][i] == 0;
+                }
+            }
+            for (int corner = 0; corner < 4; ++corner) {
+                const wp::uint64 *p = x[first[edges][corner]], *q = x[second[edges][corner]];
+                wp::uint64 borrow = 0;
+                for (int i = 0; i < L; ++i) {
+                    polygon.data[(end * 4 + corner) * 3 + axis][i] = p[i] - q[i] - borrow;
+                    borrow = (p[i] < q[i]) | ((p[i] == q[i]) & borrow);
+                }
+            }
+        }
+    }
+"""
+
+for _limbs in BITS:
+    _Integer = integer(_limbs)
+
+    @wp.func_native(snippet=_FROM_POINTS)
+    def make_polygon(
+        edges: bool,
+        a0: wp.vec3d,
+        b0: wp.vec3d,
+        c0: wp.vec3d,
+        d0: wp.vec3d,
+        a1: wp.vec3d,
+        b1: wp.vec3d,
+        c1: wp.vec3d,
+        d1: wp.vec3d,
+        exponents: wp.vec3i,
+        polygon: wp.array[_Integer],
+    ):
+        """Fills the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
+
+        Args:
+            edges: Whether it is an edge-edge query; the polygon of a vertex-face query has its last corner twice.
+            a0: The four points in order, at the start.
+            b0: Second point.
+            c0: Third point.
+            d0: Fourth point.
+            a1: The same points at the end.
+            b1: Second point.
+            c1: Third point.
+            d1: Fourth point.
+            exponents: By axis, exponent of a power of two that all coordinates are multiples of.
+            polygon: Array of 24 integers to write to.
+        """
+        ...
+
+
+@wp.func
+def coordinate(polygon: wp.array[Any], corner: int, end: int, axis: int):
+    """A coordinate of a corner at the start (0) or at the end (1)."""
+    return polygon[(end * 4 + corner) * 3 + axis]
+
+
+@wp.func
+def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+    """Exponents of the lowest bits of two points, by axis."""
+    return wp.min(
+        wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2])),
+        wp.vec3i(lowest_bit(y[0]), lowest_bit(y[1]), lowest_bit(y[2])),
+    )
+
+
+@wp.func
+def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+    """Powers of two that the difference of two points is below, by axis."""
+    return wp.vec3i(
+        top_bit_of_difference(x[0], y[0]), top_bit_of_difference(x[1], y[1]), top_bit_of_difference(x[2], y[2])
+    )
+
+
+@wp.func
+def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
+    """Powers of two that the corners of the polygon are below at one time, by axis."""
+    if kind == VERTEX_FACE:
+        return wp.max(_top(a, b), wp.max(_top(a, c), _top(a, d)))
+    return wp.max(wp.max(_top(c, a), _top(c, b)), wp.max(_top(d, a), _top(d, b)))
+
+
+@wp.func
+def spread(
+    kind: int,
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+):
+    """The power of two to divide by along each axis, and the bits B of the corners after it."""
+    lowest = wp.min(wp.min(_lowest(a0, b0), _lowest(c0, d0)), wp.min(_lowest(a1, b1), _lowest(c1, d1)))
+    bits = wp.max(_widest(kind, a0, b0, c0, d0), _widest(kind, a1, b1, c1, d1)) - lowest
+    return lowest, wp.max(wp.max(bits), 0)
+
+
+@wp.func(inline=False)
+def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
+    """Coefficients in z of a component of the cross product of two corners."""
+    j = wp.where(axis == 2, 0, axis + 1)
+    k = wp.where(j == 2, 0, j + 1)
+    x0j = coordinate(polygon, first, 0, j)
+    x0k = coordinate(polygon, first, 0, k)
+    x1j = coordinate(polygon, first, 1, j)
+    x1k = coordinate(polygon, first, 1, k)
+    y0j = coordinate(polygon, second, 0, j)
+    y0k = coordinate(polygon, second, 0, k)
+    y1j = coordinate(polygon, second, 1, j)
+    y1k = coordinate(polygon, second, 1, k)
+    return (
+        minor(x0j, y0k, x0k, y0j),
+        add(minor(x0j, y1k, x0k, y1j), minor(x1j, y0k, x1k, y0j)),
+        minor(x1j, y1k, x1k, y1j),
+    )
+
+
+@wp.func(inline=False)
+def volume(polygon: wp.array[Any], last: int):
+    """Coefficients in z of the cubic V, for the number of the last corner."""
+    n0, n1, n2 = cross_component(polygon, 1, last, 0)
+    start = coordinate(polygon, 0, 0, 0)
+    end = coordinate(polygon, 0, 1, 0)
+    v0 = product(n0, start)
+    v1 = add(product(n1, start), product(n0, end))
+    v2 = add(product(n2, start), product(n1, end))
+    v3 = product(n2, end)
+    axis = int(1)
+    while axis < 3:
+        n0, n1, n2 = cross_component(polygon, 1, last, axis)
+        start = coordinate(polygon, 0, 0, axis)
+        end = coordinate(polygon, 0, 1, axis)
+        v0 = add(v0, product(n0, start))
+        v1 = add(v1, add(product(n1, start), product(n0, end)))
+        v2 = add(v2, add(product(n2, start), product(n1, end)))
+        v3 = add(v3, product(n2, end))
+        axis += 1
+    return v0, v1, v2, v3
+
+
+@wp.func
+def sign_at_end(polygon: wp.array[Any], first: int, second: int, axis: int, end: int) -> int:
+    """Sign of a component of the cross product of two corners at the start or at the end."""
+    j = wp.where(axis == 2, 0, axis + 1)
+    k = wp.where(j == 2, 0, j + 1)
+    xj = coordinate(polygon, first, end, j)
+    xk = coordinate(polygon, first, end, k)
+    yj = coordinate(polygon, second, end, j)
+    yk = coordinate(polygon, second, end, k)
+    return sign(minor(xj, yk, xk, yj))

@@ -1,0 +1,102 @@
+"""Both broad phases against all pairs compared one by one: nothing dropped, nothing twice, nothing across worlds."""
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+import warp_bsc as bsc
+from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
+from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
+from warp_bsc.detection.narrow_phase import Count
+
+
+def find_pairs(broad_phase, mesh, x0, x1):
+    """Counts and pairs of each kind, and the (edge, face) pairs at the start."""
+    device = mesh.device
+    if broad_phase is BlockBroadPhase and device.is_cuda:
+        pytest.skip("blocks are for the CPU")
+    dtype = wp.vec3 if x0.dtype == np.float32 else wp.vec3d
+    x0, x1 = (wp.array(x, dtype=dtype, device=device) for x in (x0, x1))
+    counts = wp.zeros((3, len(Count)), dtype=wp.int64, device=device)
+    own_count = wp.zeros(1, dtype=wp.int64, device=device)
+    queues = [wp.full(200_000, wp.vec2i(-1, -1), dtype=wp.vec2i, device=device) for _ in range(3)]
+    finder = broad_phase(mesh, own_count)
+    finder.grow(1_000_000)
+    finder.pair_elements(x0, x1, counts[0], queues[0], counts[1], queues[1])
+    own_count.zero_()
+    finder.pair_edges_with_faces(x0, counts[2], queues[2])
+    counts = counts.numpy()
+    found = [queue.numpy()[: count[Count.NEAR]] for queue, count in zip(queues, counts, strict=True)]
+    return counts[:2, Count.CANDIDATES].tolist(), [sorted(map(tuple, pairs.tolist())) for pairs in found]
+
+
+def all_pairs(mesh, x0, x1):
+    """The same by comparing every pair."""
+    candidates, near = [], []
+    vertices, edges, faces = mesh.vertices[:, None], mesh.edges, mesh.faces
+    world = np.zeros(mesh.vertex_count) if mesh.world is None else mesh.world
+    kinds = [(vertices, faces, mesh.vertices, x1), (edges, edges, np.arange(len(edges)), x1)]
+    for first, second, numbers, end in [*kinds, (edges, faces, np.arange(len(edges)), x0)]:
+        a = [x.astype(np.float32)[first][:, None] for x in (x0, end)]
+        b = [x.astype(np.float32)[second][None] for x in (x0, end)]
+        low, high = (bound([bound(x, axis=2) for x in a], axis=0) for bound in (np.min, np.max))
+        other_low, other_high = (bound([bound(x, axis=2) for x in b], axis=0) for bound in (np.min, np.max))
+        candidate = ((low <= other_high) & (other_low <= high)).all(axis=2)
+        candidate &= ~(first[:, None, :, None] == second[None, :, None, :]).any(axis=(2, 3))
+        candidate &= world[first[:, :1]] == world[second[:, 0]]
+        if first is second:
+            candidate = np.triu(candidate, 1)
+        below = np.all([x.max(axis=2) < y.min(axis=2) for x, y in zip(a, b, strict=True)], axis=0)
+        above = np.all([x.min(axis=2) > y.max(axis=2) for x, y in zip(a, b, strict=True)], axis=0)
+        candidates.append(int(candidate.sum()))
+        i, j = np.nonzero(candidate & ~(below | above).any(axis=2))
+        near.append(sorted(zip(numbers[i].tolist(), j.tolist(), strict=True)))
+    return candidates[:2], near
+
+
+@pytest.mark.parametrize("broad_phase", [BlockBroadPhase, BvhBroadPhase])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(
+    faces=st.integers(1, 90),
+    size=st.floats(0.05, 3.0),
+    worlds=st.integers(1, 9),
+    flat=st.booleans(),
+    seed=st.integers(0),
+)
+def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat, seed):
+    rng = np.random.default_rng(seed)
+    connectivity = rng.integers(0, 2 * faces + 3, (faces, 3))  # vertices shared, unused, and twice in a face
+    x0 = rng.uniform(-1.0, 1.0, (2 * faces + 3, 3)) * size
+    if flat:
+        x0 = np.round(x0 * 4.0) / 4.0  # boxes that touch, and boxes without volume
+    x1 = x0 + rng.uniform(-1.0, 1.0, x0.shape) * rng.choice([0.0, 0.1, 1.0])
+    world = None
+    if worlds > 1:
+        connectivity = np.concatenate([connectivity + len(x0) * i for i in range(worlds)])
+        world = np.repeat(rng.permutation(1000)[:worlds], len(x0))
+        x0, x1 = (np.tile(x, (worlds, 1)) for x in (x0, x1))
+    x0, x1 = x0.astype(dtype), x1.astype(dtype)
+    mesh = bsc.CollisionMesh(connectivity, len(x0), world=world)
+    assert find_pairs(broad_phase, mesh, x0, x1) == all_pairs(mesh, x0, x1)
+
+
+@pytest.mark.parametrize("broad_phase", [BlockBroadPhase, BvhBroadPhase])
+def test_trees_of_several_levels(broad_phase):
+    """A strip long enough for four levels of blocks, whose pairs are known by counting."""
+    n = 6000
+    columns = np.arange(n + 1)
+    x0 = np.stack(np.broadcast_arrays(columns[:, None], np.arange(2), 0.0), axis=-1).reshape(-1, 3).astype(np.float32)
+    a = 2 * columns[:-1, None] + np.array([[0, 1, 2]])
+    b = 2 * columns[:-1, None] + np.array([[1, 3, 2]])
+    mesh = bsc.CollisionMesh(np.concatenate([a, b])[np.random.default_rng(0).permutation(2 * n)], len(x0))
+    candidates, (vertex_face, edge_edge, edge_face) = find_pairs(broad_phase, mesh, x0, x0)
+    assert candidates == [len(vertex_face), len(edge_edge)]
+    # each vertex touches the boxes of the triangles of two quads, and is in three of these, the ends one of two or two
+    assert len(vertex_face) == 2 * (n + 1) * 4 - 8 - 3 * len(mesh.faces)
+    expected = all_pairs(bsc.CollisionMesh(np.concatenate([a[:50], b[:50]]), 102), x0[:102], x0[:102])[1]
+    longer = all_pairs(bsc.CollisionMesh(np.concatenate([a[:60], b[:60]]), 122), x0[:122], x0[:122])[1]
+    for found, short, long in zip([vertex_face, edge_edge, edge_face], expected, longer, strict=True):
+        assert len(found) == len(set(found))
+        assert len(found) == len(long) + (n - 60) * (len(long) - len(short)) // 10

@@ -1,0 +1,518 @@
+"""Meshes and the collision detector: all pairs by brute force, known scenes, the same answer always, bad input."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from benchmark_data import data_folder
+from sheets import crumpled, grid
+
+import warp_bsc as bsc
+from warp_bsc import checker
+from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
+from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
+from warp_bsc.detection.narrow_phase import Count
+from warp_bsc.kernels.signs import FREE
+
+METHODS = ("float", "conservative", "exact")
+
+
+@pytest.fixture(params=[BlockBroadPhase, BvhBroadPhase], ids=["blocks", "bvh"])
+def broad_phase(request, monkeypatch, device):
+    """Both broad phases where both run, whatever the detector would choose."""
+    if device.is_cuda and request.param is BlockBroadPhase:
+        pytest.skip("blocks are for the CPU")
+    monkeypatch.setattr("warp_bsc.detection.detector._broad_phase", request.param)
+    return request.param
+
+
+def all_collisions(mesh, x0, x1):
+    """Every colliding pair of a small mesh, by asking the checker about all pairs that share no vertex."""
+    vertices, faces = np.meshgrid(mesh.vertices, np.arange(len(mesh.faces)), indexing="ij")
+    pairs = np.stack([vertices.ravel(), faces.ravel()], axis=1)
+    corners = np.concatenate([pairs[:, :1], mesh.faces[pairs[:, 1]]], axis=1)
+    keep = (corners[:, :1] != corners[:, 1:]).all(axis=1)
+    vertex_face = pairs[keep][checker.vertex_face(np.concatenate([x0[corners[keep]], x1[corners[keep]]], axis=1))]
+    first, second = np.triu_indices(len(mesh.edges), 1)
+    pairs = np.stack([first, second], axis=1)
+    corners = mesh.edges[pairs].reshape(-1, 4)
+    keep = (corners[:, :2, None] != corners[:, None, 2:]).all(axis=(1, 2))
+    edge_edge = pairs[keep][checker.edge_edge(np.concatenate([x0[corners[keep]], x1[corners[keep]]], axis=1))]
+    return vertex_face, edge_edge
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("seed", range(3))
+def test_exactly_the_colliding_pairs_are_found(seed, dtype, broad_phase):
+    rng = np.random.default_rng(seed)
+    x0 = rng.integers(-2, 3, (14, 3)).astype(dtype) if seed == 0 else rng.uniform(-1, 1, (14, 3)).astype(dtype)
+    x1 = x0 + (rng.integers(-2, 3, (14, 3)) if seed == 0 else rng.uniform(-0.5, 0.5, (14, 3))).astype(dtype)
+    mesh = bsc.CollisionMesh(rng.permuted(np.tile(np.arange(14), (10, 1)), axis=1)[:, :3], 14)
+    vertex_face, edge_edge = all_collisions(mesh, x0, x1)
+    assert len(vertex_face) and len(edge_edge)
+    c = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1)
+    np.testing.assert_array_equal(c.vertex_face, vertex_face)
+    np.testing.assert_array_equal(c.edge_edge, edge_edge)
+    assert c.vertex_face.dtype == c.edge_edge.dtype == np.int32
+    conservative = bsc.CollisionDetector(mesh).detect(x0, x1)
+    assert {*map(tuple, vertex_face)} <= {*map(tuple, conservative.vertex_face)}
+    assert {*map(tuple, edge_edge)} <= {*map(tuple, conservative.edge_edge)}
+
+
+def test_times_and_counts_belong_to_the_pairs():
+    positions, faces = grid(1)
+    positions = np.concatenate([positions, [[0.004, 0.006, 0.01], [0.02, 0.02, 0.01], [0.02, 0.0, 0.01]]])
+    mesh = bsc.CollisionMesh(np.concatenate([faces, [[4, 5, 6]]]), 7)
+    end = positions.copy()
+    end[4:, 2] = -0.03
+    c = bsc.CollisionDetector(mesh, method="exact").detect(positions, end)
+    assert (4, 0) in {*map(tuple, c.vertex_face)}
+    np.testing.assert_allclose(c.vertex_face_toi, 0.25, atol=2.0**-20)
+    assert (c.vertex_face_toi <= 0.25).all()
+    assert c.earliest_toi == min(c.vertex_face_toi.min(), c.edge_edge_toi.min())
+    np.testing.assert_allclose(np.abs(c.vertex_face_normal), [[0.0, 0.0, 1.0]] * len(c.vertex_face), atol=1e-12)
+    np.testing.assert_allclose(c.vertex_face_coordinates.sum(axis=1), 1.0)
+    for counts in (c.stats.vertex_face, c.stats.edge_edge):
+        assert counts.candidates == counts.free + counts.hits + counts.unsure
+        assert counts.survivors <= counts.candidates
+    assert set(c.stats.milliseconds) == {"broad phase", "cull", "classify", "time of impact", "sort", "exact"}
+
+
+def turned(positions, angle):
+    """Positions turned in their plane."""
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    return (positions.astype(np.float64) @ turn.T).astype(positions.dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "motion",
+    [
+        lambda x: (x, x),
+        lambda x: (x, x + np.array([0.003, -0.0071, 0.0], dtype=x.dtype)),
+        lambda x: (x, x + np.array([0.0031, 0.002, 0.017], dtype=x.dtype)),
+        lambda x: (x, turned(x, 0.05)),
+        lambda x: (turned(x, 0.7), turned(x, 0.8)),
+    ],
+    ids=["at rest", "translating in its plane", "translating", "turning", "turning from an angle"],
+)
+def test_flat_cloth_does_not_hit_itself(motion, dtype):
+    positions, faces = grid(64, dtype)
+    x0, x1 = motion(positions)
+    mesh = bsc.CollisionMesh(faces, len(positions))
+    for method in METHODS:
+        c = bsc.CollisionDetector(mesh, method=method).detect(x0, x1)
+        assert len(c.vertex_face) == len(c.edge_edge) == 0
+        candidates = c.stats.vertex_face.candidates + c.stats.edge_edge.candidates
+        unsure = c.stats.vertex_face.unsure + c.stats.edge_edge.unsure
+        assert candidates > 30_000
+        assert unsure <= 0.001 * candidates
+
+
+@pytest.fixture(scope="module")
+def cloth_funnel():
+    if data_folder() is None:
+        pytest.skip("no test data beside the project")
+    first, second = (
+        trimesh.load(data_folder() / "frames" / "cloth-funnel" / f"{frame}.ply", process=False) for frame in (227, 228)
+    )
+    return np.array(first.vertices), np.array(second.vertices), np.array(first.faces)
+
+
+def test_cloth_funnel_has_the_known_collisions(cloth_funnel, broad_phase):
+    x0, x1, faces = cloth_funnel
+    c = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)), method="exact").detect(x0, x1)
+    assert x0.dtype == np.float64
+    assert (len(c.vertex_face), len(c.edge_edge), c.certified) == (27, 107, True)
+
+
+def test_answers_are_the_same_on_every_run_and_device(cloth_funnel):
+    x0, x1, faces = cloth_funnel
+    devices = ["cpu", *(device.alias for device in wp.get_cuda_devices()[:1])]
+    results = []
+    for device in [*devices, *devices]:
+        detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device))
+        results.append(detector.detect(x0, x1))
+        results.append(detector.detect(x0, x1))
+    for other in results[1:]:
+        for field in ("vertex_face", "edge_edge", "vertex_face_toi", "edge_edge_toi", "vertex_face_normal"):
+            assert getattr(other, field).tobytes() == getattr(results[0], field).tobytes()
+
+
+def test_candidates_that_do_not_fit_at_first_are_not_lost(broad_phase):
+    rng = np.random.default_rng(0)
+    x0 = rng.uniform(-1, 1, (300, 3))  # long triangles: nearly every pair of boxes overlaps
+    faces = np.arange(300).reshape(100, 3)
+    mesh = bsc.CollisionMesh(faces, 300)
+    c = bsc.CollisionDetector(mesh).detect(x0, -x0)
+    assert c.stats.vertex_face.candidates == 300 * 99
+    assert c.stats.edge_edge.candidates == 300 * 297 // 2
+
+
+def test_intersections_are_exactly_those_of_all_pairs(broad_phase):
+    rng = np.random.default_rng(4)
+    x = rng.integers(-4, 5, (18, 3)).astype(np.float32)
+    mesh = bsc.CollisionMesh(np.arange(18).reshape(6, 3), 18)
+    edges, faces = np.meshgrid(np.arange(len(mesh.edges)), np.arange(6), indexing="ij")
+    pairs = np.stack([edges.ravel(), faces.ravel()], axis=1)
+    pairs = pairs[mesh.edges[pairs[:, 0], 0] // 3 != pairs[:, 1]]
+    expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[mesh.faces[pairs[:, 1]]])]
+    assert len(expected)
+    np.testing.assert_array_equal(bsc.CollisionDetector(mesh).find_intersections(x), expected)
+
+
+def test_touching_configurations_intersect_and_flat_ones_do_not():
+    positions, faces = grid(8)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(positions)))
+    assert len(detector.find_intersections(positions)) == 0
+    folded = positions.copy()
+    folded[-1] = positions[0]
+    assert len(detector.find_intersections(folded))
+
+
+def test_degenerate_meshes_are_handled(broad_phase):
+    x = np.zeros((4, 3), dtype=np.float32)
+    for faces in (np.zeros((0, 3), dtype=int), [[0, 1, 2]], [[0, 0, 1], [2, 2, 3]]):
+        c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 4), method="exact").detect(x, x)
+        assert c.certified
+        assert len(c.edge_edge) == (1 if len(faces) == 2 else 0)
+        assert c.earliest_toi == (0.0 if len(faces) == 2 else 2.0)
+
+
+def test_huge_double_positions_keep_their_pairs(broad_phase):
+    """Positions beyond the range of float still get candidates."""
+    x0 = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 1], [0.3, 0.2, 2], [0.2, 0.3, 2]]) * 1e60
+    x1 = x0.copy()
+    x1[3:, 2] -= 3e60
+    c = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)).detect(x0, x1)
+    assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]]
+
+
+def test_bad_meshes_are_refused():
+    for faces, message in [
+        ([[0, 1, 9]], r"face 0 is \[0, 1, 9\], but the mesh has 4 vertices"),
+        ([[0, 1, -1]], "face 0"),
+        ([[0, 1]], r"shape \(n, 3\)"),
+        ([[0.0, 1.0, 2.0]], "integers"),
+        ([[0, 1, 2**32]], "face 0"),
+        (np.zeros((0, 4), int), r"shape \(n, 3\)"),
+        (np.zeros((3, 0), int), r"shape \(n, 3\)"),
+        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 faces"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            bsc.CollisionMesh(faces, 4)
+    for vertex_count in (-1, 2**31, 6.5, 6.0, np.nan, "6", None):
+        with pytest.raises(ValueError, match=f"vertex_count must be an integer .* not {vertex_count!r}"):
+            bsc.CollisionMesh([[0, 1, 2]], vertex_count)
+
+
+def test_meshes_of_any_integers_are_taken():
+    for faces in ([], np.zeros((0, 3), int), wp.zeros((0, 3), dtype=int)):
+        assert bsc.CollisionMesh(faces, np.int64(6)).faces.shape == (0, 3)
+    for faces in (np.array([[0, 1, 2]], np.uint8), wp.array([[0, 1, 2]], dtype=wp.vec3i)):
+        assert bsc.CollisionMesh(faces, np.uint8(3)).faces.tolist() == [[0, 1, 2]]
+
+
+def test_bad_positions_are_refused():
+    detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2]], 4))
+    x = np.zeros((4, 3))
+    with pytest.raises(ValueError, match="x1 must have 4 rows"):
+        detector.detect(x, np.zeros((5, 3)))
+    with pytest.raises(ValueError, match="x0 must have shape"):
+        detector.detect(np.zeros((4, 2)), x)
+    with pytest.raises(ValueError, match="float32 or float64"):
+        detector.detect(x.astype(int), x)
+    with pytest.raises(ValueError, match="same type"):
+        detector.detect(x, x.astype(np.float32))
+    bad = x.copy()
+    bad[2, 1] = np.nan
+    with pytest.raises(ValueError, match=r"x1\[2\]"):
+        detector.detect(x, bad)
+    with pytest.raises(ValueError, match=r"x\[2\]"):
+        detector.find_intersections(bad)
+    with pytest.raises(ValueError, match="method"):
+        bsc.CollisionDetector(detector.mesh, method="fast")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("on_device", [False, True])
+def test_vertices_that_no_face_uses_take_no_part(value, on_device, broad_phase):
+    """Wherever they are, if anywhere; where one that takes part is not finite, it is named, and not they."""
+    x0, x1, faces = crumpled(0)
+    expected = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0))).detect(x0, x1)
+    crossing = bsc.CollisionDetector(expected._detector.mesh).find_intersections(x0)
+    assert len(expected.vertex_face) and len(expected.edge_edge)
+    x0, x1 = (np.concatenate([[[value] * 3], x, [[0.0, value, -value]]]).astype(np.float32) for x in (x0, x1))
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces + 1, len(x0)))
+
+    def positions(x):
+        return wp.array(x, dtype=wp.vec3) if on_device else x
+
+    c = detector.detect(positions(x0), positions(x1))
+    assert c.certified
+    np.testing.assert_array_equal(c.vertex_face, expected.vertex_face + np.array([1, 0]))
+    np.testing.assert_array_equal(c.edge_edge, expected.edge_edge)
+    np.testing.assert_array_equal(detector.find_intersections(positions(x0)), crossing)
+    x1[7] = np.nan
+    with pytest.raises(ValueError, match=r"x1\[7\]"):
+        detector.detect(positions(x0), positions(x1))
+    with pytest.raises(ValueError, match=r"x\[7\]"):
+        detector.find_intersections(positions(x1))
+
+
+FIELDS = [
+    f"{kind}{field}" for kind in ("vertex_face", "edge_edge") for field in ("", "_toi", "_coordinates", "_normal")
+]
+
+
+def assert_same(collisions, others):
+    for field in FIELDS:
+        assert getattr(collisions, field).tobytes() == getattr(others, field).tobytes(), field
+
+
+def test_queues_with_room_for_one_entry_grow(broad_phase):
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    expected = bsc.CollisionDetector(mesh).detect(x0, x1)
+    assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
+    detector = bsc.CollisionDetector(mesh)
+    assert bool(detector._broad_phase.queues) == (broad_phase is BvhBroadPhase)
+    if detector._broad_phase.queues:
+        detector._broad_phase.queues = [wp.empty(1, dtype=wp.vec2i)]
+    for narrow_phase in (detector._vertex_face, detector._edge_edge):
+        narrow_phase.near = wp.empty(1, dtype=wp.vec2i)
+        narrow_phase._reserve_survivors(1)
+        narrow_phase._reserve_contacts(1)
+    c = detector.detect(x0, x1)
+    assert_same(c, expected)
+    assert c.certified and not c.overflowed
+
+
+def found_pairs(narrow_phases):
+    """What a detection that was not sorted found, as a set for each kind."""
+    found = []
+    for narrow_phase in narrow_phases:
+        count = int(narrow_phase.counts.numpy()[Count.CONTACTS])
+        real = narrow_phase.unsorted.status.numpy()[:count] != FREE
+        found.append({tuple(pair) for pair in narrow_phase.unsorted.pairs.numpy()[:count][real].tolist()})
+    return found
+
+
+def test_of_what_has_changed_all_contacts_are_found_again(broad_phase, device):
+    """Pairs of which no vertex has changed may be left out, and all that is found is right."""
+    x0, x1, faces = crumpled(1)
+    mesh = bsc.CollisionMesh(faces, len(x0), device=device)
+    detector = bsc.CollisionDetector(mesh)
+    detector.detect(x0, x1)  # makes room
+    random = np.random.default_rng(0)
+    for share in (0.0, 0.02, 0.3, 1.0):
+        moved = random.random(len(x0)) < share
+        after = x1 + (0.002 * moved[:, None] * random.standard_normal(x1.shape)).astype(np.float32)
+        start, first, second = (wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1, after))
+        everything = found_pairs(detector.find_contacts(start, second))
+        detector.find_contacts(start, first)
+        changed = wp.array(moved, dtype=int, device=device)
+        again = found_pairs(detector.find_contacts(start, second, refit=True, changed=changed))
+        candidates = sum(int(n.counts.numpy()[Count.CANDIDATES]) for n in detector.narrow_phases)
+        assert (share == 0.0) == (candidates == 0)
+        for full, part, (one, other) in zip(
+            everything, again, ((mesh.vertices[:, None], mesh.faces), (mesh.edges, mesh.edges)), strict=True
+        ):
+            concerned = {(a, b) for a, b in full if moved[one[a]].any() or moved[other[b]].any()}
+            assert concerned <= part <= full
+            assert share < 0.3 or len(part) > 10
+
+
+def test_all_overlapping_pairs_can_be_had(broad_phase, device):
+    """Those as well that an axis separates, and as many as were counted."""
+    x0, x1, faces = crumpled(2)
+    mesh = bsc.CollisionMesh(faces, len(x0), device=device)
+    detector = bsc.CollisionDetector(mesh)
+    positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
+    detector.find_contacts(*positions)
+    while detector.grow():
+        detector.find_contacts(*positions)
+    while True:
+        counts = [narrow_phase.counts.numpy().copy() for narrow_phase in detector.find_candidates()]
+        if not detector.grow():
+            break
+    for kind_counts in counts:
+        assert kind_counts[Count.NEAR] == kind_counts[Count.CANDIDATES] > 0
+
+
+def test_every_pair_a_candidate(broad_phase):
+    """2,000 triangles whose swept boxes all overlap: a tree that separates nothing must still find all pairs."""
+    x0 = np.random.default_rng(1).uniform(-1, 1, (6000, 3))
+    mesh = bsc.CollisionMesh(np.arange(6000).reshape(2000, 3), 6000)
+    c = bsc.CollisionDetector(mesh, method="float").detect(x0 - 10.0, x0 + 10.0)
+    assert c.stats.vertex_face.candidates == 6000 * 1999
+    assert c.stats.edge_edge.candidates == 6000 * 5997 // 2
+
+
+def test_results_that_someone_holds_outlive_the_next_detection():
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
+    held = [detector.detect(x0, x1), detector.detect(x0, x0), detector.detect(x0, x1)]
+    detector.find_intersections(x1)
+    assert len(held[1].edge_edge) == 0
+    assert_same(held[0], held[2])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_results_are_of_the_positions_detected_whatever_becomes_of_these(method):
+    positions, faces = grid(2, np.float64)
+    positions = np.concatenate([positions, [[0.005, 0.005, 0.01], [0.006, 0.005, 0.02], [0.005, 0.006, 0.02]]])
+    end = positions.copy()
+    end[9, 2] = 0.0  # ends on an edge and on a corner of faces: for exact arithmetic to decide
+    mesh = bsc.CollisionMesh(np.concatenate([faces, [[9, 10, 11]]]), 12)
+    detector = bsc.CollisionDetector(mesh, method=method)
+    expected = detector.detect(positions, end)
+    x0, x1 = (wp.array(x, dtype=wp.vec3d, device=mesh.device) for x in (positions, end))
+    c = detector.detect(x0, x1)
+    x1.assign(positions)
+    assert len(c.vertex_face)
+    assert_same(c, expected)
+
+
+def test_detectors_side_by_side_do_not_disturb_one_another():
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    first, second = bsc.CollisionDetector(mesh), bsc.CollisionDetector(mesh)
+    a, b = first.detect(x0, x1), second.detect(x1, x0)
+    assert_same(a, bsc.CollisionDetector(mesh).detect(x0, x1))
+    assert_same(b, bsc.CollisionDetector(mesh).detect(x1, x0))
+
+
+@pytest.fixture
+def captured():
+    """A captured detection: detector, its results, positions on the device, and a function that replays it."""
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
+    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
+    detector.detect(start, end)
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    return detector, c, start, end, lambda: wp.capture_launch(capture.graph)
+
+
+@pytest.mark.gpu
+def test_a_graph_finds_what_a_detection_finds(captured):
+    detector, c, start, end, replay = captured
+    on_cpu = bsc.CollisionDetector(bsc.CollisionMesh(detector.mesh.faces, detector.mesh.vertex_count, device="cpu"))
+    for seed in (0, 1, 2):
+        x0, x1, _ = crumpled(seed)
+        start.assign(x0)
+        end.assign(x1)
+        expected = on_cpu.detect(x0, x1)
+        for _ in range(34):
+            replay()
+            assert_same(c, expected)
+        assert c.certified and not c.overflowed
+
+
+@pytest.mark.gpu
+def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured):
+    detector, c, _, end, replay = captured
+    replay()
+    expected = c.edge_edge.tolist()
+    assert len(detector.find_intersections(end))
+    assert c.edge_edge.tolist() == expected
+
+
+@pytest.mark.gpu
+def test_a_graph_says_that_a_queue_was_too_small(captured):
+    detector, _, start, end, _ = captured
+    detector._edge_edge._reserve_contacts(1)
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    wp.capture_launch(capture.graph)
+    assert c.overflowed and not c.certified
+    assert detector.detect(start, end).certified  # grows
+    wp.capture_launch(capture.graph)  # writes to the queues that it was captured with
+    with pytest.raises(RuntimeError, match="capture again"):
+        c.certified  # noqa: B018
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        c = detector.detect(start, end)
+    wp.capture_launch(capture.graph)
+    assert c.certified and not c.overflowed
+
+
+@pytest.mark.gpu
+def test_a_graph_says_that_a_position_is_not_finite(captured):
+    _, c, _, end, replay = captured
+    positions = end.numpy()
+    positions[7, 1] = np.nan
+    end.assign(positions)
+    replay()
+    assert not c.certified
+
+
+@pytest.mark.gpu
+def test_capturing_first_is_refused():
+    x0, x1, faces = crumpled(0)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
+    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
+    with pytest.raises(RuntimeError, match="detect once"), wp.ScopedCapture(device="cuda:0"):
+        detector.detect(start, end)
+
+
+@pytest.mark.gpu
+def test_two_detectors_on_two_streams(captured):
+    _, c, start, end, replay = captured
+    x0, _, faces = crumpled(3)
+    replay()
+    expected = c.vertex_face.tolist()
+    streams = [wp.Stream("cuda:0"), wp.Stream("cuda:0")]
+    detectors = [bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")) for _ in streams]
+    results = []
+    for detector, stream, positions in zip(detectors, streams, ((start, end), (end, start)), strict=True):
+        with wp.ScopedStream(stream):
+            results.append(detector.detect(*positions))
+    assert results[0].vertex_face.tolist() == expected
+    alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")).detect(end, start)
+    assert_same(results[1], alone)
+
+
+def test_worlds_do_not_collide_with_one_another(broad_phase):
+    scenes = [crumpled(seed) for seed in range(3)]
+    faces = scenes[0][2]
+    n = len(scenes[0][0])
+    x0, x1 = (np.concatenate([scene[end] for scene in scenes]) for end in (0, 1))
+    mesh = bsc.CollisionMesh(np.concatenate([faces + n * i for i in range(3)]), 3 * n, world=np.repeat(np.arange(3), n))
+    c = bsc.CollisionDetector(mesh).detect(x0, x1)
+    for i, (start, end, _) in enumerate(scenes):
+        alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, n)).detect(start, end)
+        here = c.vertex_face[:, 0] // n == i
+        np.testing.assert_array_equal(c.vertex_face[here] - [n * i, len(faces) * i], alone.vertex_face)
+        np.testing.assert_array_equal(c.vertex_face_toi[here], alone.vertex_face_toi)
+        edges = len(mesh.edges) // 3
+        here = c.edge_edge[:, 0] // edges == i
+        np.testing.assert_array_equal(c.edge_edge[here] - edges * i, alone.edge_edge)
+
+
+def test_bad_worlds_are_refused():
+    for world, message in [
+        ([0, 0, 1], r"face 0 has vertices in worlds \[0, 0, 1\]"),
+        ([0, 0], "3 integers"),
+        ([0, -1, 0], "vertex 1 is in world -1"),
+        ([0, 0, 2**31], f"vertex 2 is in world {2**31}"),
+        (np.full(3, 2**32), f"vertex 0 is in world {2**32}"),
+        (np.full(3, 2**64 - 1, np.uint64), f"vertex 0 is in world {2**64 - 1}"),
+        (wp.full(3, 2**31, dtype=wp.int64), f"vertex 0 is in world {2**31}"),
+        ([0.0, 0.0, 0.0], "3 integers"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            bsc.CollisionMesh([[0, 1, 2]], 3, world=world)
+
+
+def test_worlds_of_any_number_are_kept_apart(broad_phase):
+    """One triangle falls through another in world 0 and in the last world that there may be, and not across."""
+    faces = np.arange(12).reshape(4, 3)
+    low, high = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[1, 1, 1], [2, 1, 2], [1, 2, 2]])
+    x0 = np.concatenate([low, high, low, high]).astype(np.float32)
+    x1 = x0.copy()
+    x1[[3, 4, 5, 9, 10, 11], 2] -= 4.0
+    for last in (1, 2**16, 2**31 - 1):
+        world = np.repeat([0, last], 6)
+        c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 12, world=wp.array(world, dtype=wp.int64))).detect(x0, x1)
+        assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0], [9, 2], [10, 2], [11, 2]]

@@ -1,0 +1,278 @@
+"""The examples: all start, keep the promise of the stage for some frames, and say how to use them."""
+
+import argparse
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import common
+import newton
+import newton.examples
+import numpy as np
+import pytest
+import warp as wp
+from newton.viewer import ViewerNull
+
+FOLDER = Path(__file__).parents[2] / "examples"
+EXAMPLES = sorted(FOLDER.glob("example_*.py"))
+BULLET = FOLDER / "example_cloth_bullet.py"
+THROW = FOLDER / "example_diffsim_throw.py"
+PAPER_SCENES = {
+    "twisting": "degrees",
+    "funnel": "from the axis",
+    "dancer": "hem",
+    "flamenco": "a hem is",
+    "crashing": "length",
+}
+"""What each of them complains of at first."""
+PRINTED = re.findall(r"^python examples/(example_\w+)\.py", (FOLDER.parent / "README.md").read_text(), re.MULTILINE)
+FRAMES = 3
+COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
+COMPARED += ["tet_indices", "tet_poses", "tet_materials"]
+
+each_paper_scene = pytest.mark.parametrize("name", PAPER_SCENES)
+each_example = pytest.mark.parametrize("path", EXAMPLES, ids=[path.stem for path in EXAMPLES])
+
+
+def load_module(path):
+    """A script, as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def load(path):
+    """The class ``Example`` of a script."""
+    return load_module(path).Example
+
+
+def run(path, frames, *options):
+    """Runs an example for some frames, as its script would."""
+    example_class = load(path)
+    args = example_class.create_parser().parse_args(["--viewer", "null", "--num-frames", str(frames), *options])
+    viewer = ViewerNull(num_frames=frames)
+    example = example_class(viewer, args)
+    while viewer.is_running():
+        example.step()
+        example.render()
+    return example
+
+
+def test_there_are_examples():
+    assert len(EXAMPLES) >= 3
+
+
+@each_example
+def test_first_frames(path):
+    report = run(path, FRAMES).solver.report
+    assert report.steps >= FRAMES
+    assert report.uncertified_steps == 0
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_printed_commands_run_without_a_window_and_without_a_browser(tmp_path, name):
+    for missing in ("pyglet", "viser"):
+        (tmp_path / f"{missing}.py").write_text("raise ImportError")
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment["PYTHONPATH"] = str(tmp_path)
+    command = [sys.executable, FOLDER / f"{name}.py", "--num-frames", "1", "--quiet"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said, *_, report = [line for line in done.stdout.splitlines() if not line.startswith(("Warp", " ", "Module"))]
+    assert said.startswith("No window (") and said.endswith(
+        ", and no viser for a browser: simulating 1 frames without."
+    )
+    assert "Simulating" in done.stderr
+    assert re.search(r"\d", report)
+
+
+def test_commands_are_printed():
+    assert len(PRINTED) >= 4
+
+
+class Browser:
+    """What :func:`common.open_viewer` needs of Newton's viewer in a browser."""
+
+    url = "http://localhost:8080"
+
+    def __init__(self, **options):
+        self.options = options
+
+
+@pytest.mark.parametrize(("option", "viewer"), [("--paused", Browser), ("--test", common.ViewerProgress)])
+def test_browser_where_there_is_no_window(monkeypatch, capsys, option, viewer):
+    """Only from this machine, and not for what nobody looks at, as a browser has no end."""
+    monkeypatch.setitem(sys.modules, "pyglet", None)
+    monkeypatch.setattr(common, "ViewerViser", Browser)
+    monkeypatch.setattr(sys, "argv", ["example", option])
+    opened, args = common.open_viewer(newton.examples.create_parser())
+    assert isinstance(opened, viewer)
+    assert getattr(args, option[2:]) is True
+    if viewer is Browser:
+        assert opened.options == {"host": "localhost", "paused": True, "verbose": False}
+        assert "open http://localhost:8080 in a browser" in capsys.readouterr().out
+
+
+def test_viewers_that_are_asked_for_are_not_replaced(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyglet", None)
+    monkeypatch.setattr(sys, "argv", ["example", "--viewer", "gl"])
+    with pytest.raises(Exception, match="pyglet"):
+        common.open_viewer(newton.examples.create_parser())
+    monkeypatch.setattr(sys, "argv", ["example", "--viewer", "null"])
+    opened, _ = common.open_viewer(newton.examples.create_parser())
+    assert type(opened) is ViewerNull
+
+
+def test_interrupted_browser_ends_in_the_report(monkeypatch, capsys):
+    def interrupt(example, args):
+        raise KeyboardInterrupt
+
+    class Example:
+        create_parser = staticmethod(argparse.ArgumentParser)
+
+        def __init__(self, viewer, args):
+            pass
+
+        def print_report(self):
+            print("all is well")
+
+    monkeypatch.setattr(newton.examples, "run", interrupt)
+    monkeypatch.setattr(common, "ViewerViser", Browser)
+    monkeypatch.setattr(common, "open_viewer", lambda parser: (Browser(), None))
+    common.main(Example)
+    assert capsys.readouterr().out == "all is well\n"
+    monkeypatch.setattr(common, "open_viewer", lambda parser: (None, None))
+    with pytest.raises(KeyboardInterrupt):
+        common.main(Example)
+
+
+@each_example
+def test_help(path, capsys):
+    with pytest.raises(SystemExit, match=r"^0$"):
+        load(path).create_parser().parse_args(["--help"])
+    assert "--no-ccd" in capsys.readouterr().out
+
+
+def test_bullet_is_stopped(capsys):
+    example = run(BULLET, 60, "--speed", "10")
+    assert example.solver.report.steps >= 240
+    example.test_final()
+    example.print_report()
+    assert "0 particles of the patch are behind the sheet" in capsys.readouterr().out
+
+
+def test_throw_is_learnt_through_the_stage():
+    first, *_, last = run(THROW, 6).loss_history
+    assert (last < 0.5 * first).all()
+
+
+def test_throw_is_not_learnt_without_stage():
+    example = run(THROW, 3, "--no-ccd")
+    example.test_final()
+    assert np.min(example.loss_history) > 0.999999
+
+
+def test_bullet_passes_without_stage():
+    example = run(BULLET, 10, "--no-ccd")
+    with pytest.raises(AssertionError, match="441 particles of the patch passed"):
+        example.test_final()
+
+
+def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch, capsys):
+    program = load_module(FOLDER / "speed_limit.py")
+    monkeypatch.setattr(sys, "argv", ["speed_limit.py", "--device", str(wp.get_device())])
+    program.main()
+    rows = re.findall(r"│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│", capsys.readouterr().out)
+    assert [tuple(map(float, row)) for row in rows] == [(v, 0.89, v, v) for v in (1.0, 10.0, 60.0)]
+    assert pytest.approx(0.8925) == program.LIMIT
+
+
+def path_of(name):
+    return FOLDER / f"example_{name}.py"
+
+
+@each_paper_scene
+@pytest.mark.parametrize("triangles", [2000, 20000])
+def test_resolution(name, triangles):
+    example = run(path_of(name), 0, "--triangles", str(triangles))
+    assert example.model.tri_count == pytest.approx(triangles, rel=0.25)
+
+
+def test_too_coarse():
+    with pytest.raises(ValueError, match="--triangles must be at least 1000, not 10"):
+        run(path_of("twisting"), 0, "--triangles", "10")
+
+
+@each_paper_scene
+def test_scene_has_to_become_what_it_is_called(name):
+    with pytest.raises(AssertionError, match=PAPER_SCENES[name]):
+        run(path_of(name), 1, "--triangles", "2000").test_final()
+
+
+def test_frame_that_a_graph_has_no_room_for_is_taken_back(monkeypatch):
+    expected, example = (run(path_of("dancer"), 2, "--triangles", "1000") for _ in range(2))
+    counts = iter([0, 3, 3])  # not certified: before, after, at the end
+
+    def spoil(graph):
+        example.state_0.particle_q.zero_()
+        example.solver.time.zero_()
+
+    monkeypatch.setattr(wp, "capture_launch", spoil)
+    monkeypatch.setattr(example, "count_uncertified", lambda: next(counts))
+    example.graph = "a graph"
+    expected.step()
+    example.step()
+    assert (expected.positions() == example.positions()).all()
+    assert example.taken_back == 3
+    with pytest.raises(AssertionError, match="hem"):  # only
+        example.test_final()
+
+
+def test_funnel_is_passed(capsys):
+    example = run(path_of("funnel"), 46, "--triangles", "1000")
+    example.test_final()
+    example.print_report()
+    assert "0 not certified" in capsys.readouterr().out
+
+
+def test_funnel_without_stage():
+    with pytest.raises(AssertionError, match="of the particles are in the funnel"):
+        run(path_of("funnel"), 46, "--triangles", "1000", "--no-ccd").test_final()
+
+
+def test_dancer_without_stage():
+    with pytest.raises(AssertionError, match="edges of what deforms cross faces of it"):
+        run(path_of("dancer"), 40, "--triangles", "1000", "--no-ccd").test_final()
+
+
+def test_car_is_crushed():
+    run(path_of("crashing"), 38, "--triangles", "1500").test_final()
+
+
+def test_car_is_as_if_added_one_tetrahedron_at_a_time():
+    crashing = load_module(path_of("crashing"))
+    vertices, tets = crashing.shell((4, 3, 2), crashing.body_at)
+    added, expected = newton.ModelBuilder(), newton.ModelBuilder()
+    for _ in range(2):
+        crashing.add_shell(added, vertices, tets)
+        expected.add_soft_mesh(
+            pos=wp.vec3(),
+            rot=wp.quat_identity(),
+            scale=1.0,
+            vel=wp.vec3(-crashing.SPEED, 0.0, 0.0),
+            vertices=vertices,
+            indices=tets.reshape(-1),
+            density=crashing.DENSITY,
+            k_mu=crashing.STIFFNESS,
+            k_lambda=crashing.STIFFNESS,
+            k_damp=crashing.DAMPING,
+            add_surface_mesh_edges=False,
+        )
+    models = [builder.finalize() for builder in (added, expected)]
+    for name in COMPARED:
+        values = [getattr(model, name).numpy() for model in models]
+        np.testing.assert_allclose(*values, rtol=1e-4, atol=1e-5, err_msg=name)

@@ -1,0 +1,105 @@
+"""Culls of eight pairs at once: what they leave is what the scalar culls leave, and what they cull is free."""
+
+import numpy as np
+import pytest
+import warp as wp
+from generators import GENERATORS
+
+from warp_bsc import checker
+from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.kernels.culling import (
+    centroid_direction,
+    direction_separates,
+    edge_edge_boxes_apart,
+    vertex_face_boxes_apart,
+)
+from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
+from warp_bsc.kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from warp_bsc.kernels.polynomials import coplanarity
+from warp_bsc.kernels.signs import ROUNDOFF, certified_sign_cubic
+
+KINDS = ("vertex_face", "edge_edge")
+_KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
+
+
+def kernels_of(kind, dtype):
+    """Kernels that write 1 for what the culls leave: one query a thread, and eight."""
+    vertex_face = kind == "vertex_face"
+    motion_of = vertex_face_motion if vertex_face else edge_edge_motion
+    boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
+    cull_batch = cull_batch_of(dtype, vertex_face)
+
+    @wp.kernel(**_KERNEL)
+    def cull(x0: wp.array[dtype], x1: wp.array[dtype], roundoff: wp.float64, left: wp.array[int]):
+        i = wp.tid()
+        j = 4 * i
+        if boxes_apart(x0[j], x0[j + 1], x0[j + 2], x0[j + 3], x1[j], x1[j + 1], x1[j + 2], x1[j + 3]):
+            return
+        motion = motion_of(x0[j], x0[j + 1], x0[j + 2], x0[j + 3], x1[j], x1[j + 1], x1[j + 2], x1[j + 3], roundoff)
+        y = coplanarity(motion)
+        if certified_sign_cubic(y.k, y.bound) == 0 and not direction_separates(motion, centroid_direction(motion)):
+            left[i] = 1
+
+    @wp.kernel(**_KERNEL)
+    def cull_batches(
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        roundoff: wp.float64,
+        left: wp.array[int],
+    ):
+        i = BATCH * wp.tid()
+        bits = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), roundoff)
+        while bits != wp.uint64(0):
+            left[i + lowest_bit(bits)] = 1
+            bits = bits & (bits - wp.uint64(1))
+
+    return cull, cull_batches
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_culls_are_those_of_one_query(kind, dtype):
+    """Bit by bit, but for numbers so small that scaling them matters."""
+    rng = np.random.default_rng(6)
+    number = 203  # no multiple of eight
+    points = {name: generator(rng, number, kind, dtype) for name, generator in GENERATORS.items()}
+    scaled = np.concatenate([points[name] for name in points if name not in ("subnormal_and_huge", "almost_coplanar")])
+    extreme = np.concatenate([points["subnormal_and_huge"], points["almost_coplanar"]])
+    for roundoff in (0.0, float(ROUNDOFF)):
+        alone, together = cull(kind, scaled, roundoff)
+        assert np.array_equal(alone, together)
+        assert 0.2 < together.mean() < 0.95
+    for points in (scaled, extreme):
+        _, left = cull(kind, points, float(ROUNDOFF))
+        culled = np.flatnonzero(~left)[:: 1 if points is scaled else 4]
+        assert len(culled) > 10
+        assert not getattr(checker, kind)(points[culled]).any()
+
+
+def cull(kind, points, roundoff):
+    """What the culls leave, one by one and eight at once."""
+    queries = QuerySet(Queries.of_points(kind, points), "cpu")
+    alone, together = (wp.zeros(queries.count + BATCH, dtype=int, device="cpu") for _ in range(2))
+    one, eight = kernels_of(kind, queries.dtype)
+    x0, x1, elements, pairs = queries.arrays
+    wp.launch(one, queries.count, inputs=[x0, x1, roundoff], outputs=[alone], device="cpu")
+    inputs = [x0, x1, elements, pairs, roundoff]
+    wp.launch(eight, -(-queries.count // BATCH), inputs=inputs, outputs=[together], device="cpu")
+    assert not together.numpy()[queries.count :].any()
+    return alone.numpy()[: queries.count] == 1, together.numpy()[: queries.count] == 1
+
+
+def test_numbers_too_large_to_trust_are_left():
+    """Where products could lose what matters to underflow, or overflow, nothing is culled but by boxes."""
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-1.0, 1.0, (4000, 8, 3))
+    points[:, 4] = -points[:, 0] * rng.uniform(0.2, 5.0, (4000, 3))  # passes the triangle, along each axis
+    points *= np.where(np.arange(8) % 4 == 0, 1e60, 1e-60)[None, :, None]
+    _, together = cull("vertex_face", points, float(ROUNDOFF))
+    assert 0 < (~together).sum() < 1000
+    assert not checker.vertex_face(points[~together]).any()
+    points *= np.where(np.arange(8) % 4 == 0, 1e40, 1.0)[None, :, None]
+    _, together = cull("vertex_face", points, float(ROUNDOFF))
+    assert together.all()

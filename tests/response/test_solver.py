@@ -1,0 +1,427 @@
+"""The collision stage: what it returns is free of collisions, by exact detection of what is stored, and little else."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_bsc as bsc
+
+DT = 1.0 / 240.0
+STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
+
+
+def semi_implicit(model):
+    """The explicit solver, without its own contacts between particles, which are far too stiff here."""
+    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
+    return newton.solvers.SolverSemiImplicit(model)
+
+
+SOLVERS = {
+    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
+    "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
+    "semi_implicit": semi_implicit,
+}
+SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
+
+
+def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
+    """A square patch of cloth, centred, in the xy plane."""
+    corner = np.subtract(at, (0.5 * n * cell, 0.5 * n * cell, 0.0))
+    sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], fixed)
+    builder.add_cloth_grid(
+        pos=wp.vec3(*corner),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(*velocity),
+        dim_x=n,
+        dim_y=n,
+        cell_x=cell,
+        cell_y=cell,
+        mass=0.001,
+        **sides,
+        **STIFF,
+        **options,
+    )
+
+
+def bullet(speed, *, device, worlds=1):
+    """A patch shot at a sheet that is held at its border."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(world, 16, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    add_patch(world, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -speed))
+    builder = world
+    if worlds > 1:
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+class Rollout:
+    """Steps a solver, and asks exact detection about the motion of each step as it is stored."""
+
+    def __init__(self, model, solver):
+        self.model, self.solver = model, solver
+        self.states = model.state(), model.state()
+        self.control = model.control()
+        world = model.particle_world.numpy()
+        mesh = bsc.CollisionMesh(
+            model.tri_indices.numpy().reshape(-1, 3),
+            model.particle_count,
+            device=model.device,
+            world=world if model.world_count > 1 else None,
+        )
+        self.detector = bsc.CollisionDetector(mesh, method="exact")
+        self.collisions = 0
+
+    def step(self, dt=DT, contacts=None):
+        start, end = self.states
+        before = start.particle_q.numpy().copy()  # the inner solver may overwrite it
+        start.clear_forces()
+        self.solver.step(start, end, self.control, contacts, dt)
+        c = self.detector.detect(before, end.particle_q.numpy())
+        self.collisions += len(c.vertex_face) + len(c.edge_edge)
+        self.states = end, start
+
+    @property
+    def positions(self):
+        return self.states[0].particle_q.numpy()
+
+    @property
+    def velocities(self):
+        return self.states[0].particle_qd.numpy()
+
+    def momenta(self):
+        mass = self.model.particle_mass.numpy()[:, None].astype(float)
+        p = mass * self.velocities
+        return p.sum(axis=0), np.cross(self.positions.astype(float), p).sum(axis=0)
+
+
+@pytest.mark.parametrize("inner", SOLVERS)
+@pytest.mark.parametrize("speed", [10.0, 60.0])
+def test_nothing_passes_through(inner, speed, device):
+    model = bullet(speed, device=device)
+    through = Rollout(model, SOLVERS[inner](model))
+    stopped = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model)))
+    substeps = SUBSTEPS[inner]
+    steps = substeps * (12 if speed < 50.0 else 6)
+    for _ in range(steps):
+        through.step(DT / substeps)
+        stopped.step(DT / substeps)
+        assert stopped.solver.report.certified
+    assert through.collisions > 0
+    assert stopped.collisions == 0
+    assert len(stopped.detector.find_intersections(stopped.positions)) == 0
+    report = stopped.solver.report
+    assert (report.steps, report.uncertified_steps) == (steps, 0)
+
+
+def test_style3d_is_an_inner_solver_too(device):
+    """It wants cloth of its own kind, and contacts."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    newton.solvers.SolverStyle3D.register_custom_attributes(builder)
+    stiff = {"tri_aniso_ke": wp.vec3(1e2, 1e2, 1e1), "edge_aniso_ke": wp.vec3(2e-5, 1e-5, 5e-6)}
+    for n, cell, height, speed in ((12, 0.05, 0.0, 0.0), (6, 0.03, 0.05, -10.0)):
+        newton.solvers.style3d.add_cloth_grid(
+            builder,
+            pos=wp.vec3(-0.5 * n * cell, -0.5 * n * cell, height),
+            rot=wp.quat_identity(),
+            vel=wp.vec3(0.0, 0.0, speed),
+            dim_x=n,
+            dim_y=n,
+            cell_x=cell,
+            cell_y=cell,
+            mass=0.3 * cell**2,
+            particle_radius=0.002,
+            **dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], speed == 0.0),
+            **stiff,
+        )
+    model = builder.finalize(device=device)
+    contacts = newton.CollisionPipeline(model).contacts()
+    collisions = []
+    for ccd in (False, True):
+        solver = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
+        rollout = Rollout(model, bsc.SolverCCD(solver) if ccd else solver)
+        for _ in range(8):
+            rollout.step(contacts=contacts)
+        collisions.append(rollout.collisions)
+    assert collisions[0] > 0 and collisions[1] == 0
+    assert rollout.solver.report.uncertified_steps == rollout.solver.report.truncated_steps == 0
+
+
+@pytest.mark.parametrize("inner", SOLVERS)
+def test_without_collisions_nothing_changes(inner, device):
+    model = bullet(-10.0, device=device)
+    solver = SOLVERS[inner](model)
+    step, wanted = solver.step, []
+
+    def recorded_step(state_in, state_out, *arguments, **options):
+        step(state_in, state_out, *arguments, **options)
+        wanted[:] = [state_out.particle_q.numpy().copy(), state_out.particle_qd.numpy().copy()]
+
+    solver.step = recorded_step
+    staged = Rollout(model, bsc.SolverCCD(solver))
+    for _ in range(3):
+        staged.step()
+        report = staged.solver.report
+        assert (report.hits, report.rounds, report.truncated, report.frozen, report.certified) == (0, 0, 0, 0, True)
+        assert staged.positions.tobytes() == wanted[0].tobytes()
+        assert staged.velocities.tobytes() == wanted[1].tobytes()
+
+
+def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
+    """Six patches in a pile fall on a box, all at one speed: only the lowest has a contact at first."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
+    for layer in range(6):
+        at = (0.004 * layer, 0.003 * layer, 0.0005 * (layer + 1))
+        add_patch(builder, 4, 0.028, at, velocity=(0.0, 0.0, -0.8))
+    model = builder.finalize(device=device)
+
+    def rounds():
+        rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
+        rollout.step()
+        assert rollout.collisions == 0 and rollout.solver.report.certified and rollout.solver.report.truncated == 0
+        heights = rollout.positions[:, 2].reshape(6, -1)
+        assert (np.diff(heights.mean(axis=1), prepend=0.0) > 0.0).all()
+        return rollout.solver.report.rounds
+
+    with_near_pairs = rounds()
+    monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
+    assert 0 < with_near_pairs <= 3 < rounds()
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("sideways", [0.0, 1.0])
+def test_momenta_of_free_bodies_are_conserved(friction, sideways, device):
+    """Two patches that meet off centre, and turn from then on."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.05, (0.0, 0.0, 0.0), velocity=(sideways, 0.0, 3.0))
+    add_patch(builder, 8, 0.05, (0.13, 0.11, 0.05), velocity=(0.0, -0.5 * sideways, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=friction))
+    linear, angular = rollout.momenta()
+    met = 0
+    for _ in range(8):
+        rollout.step()
+        met += rollout.solver.report.hits
+    assert met > 100
+    assert rollout.solver.report.truncated_steps == 0
+    new_linear, new_angular = rollout.momenta()
+    assert np.linalg.norm(new_linear - linear) < 1e-5 * np.linalg.norm(linear)
+    assert np.linalg.norm(new_angular - angular) < 1e-5 * np.linalg.norm(angular)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+def test_friction_on_a_ramp(friction, device):
+    """A patch on a ramp of triangles slides as a rigid body would, or stays."""
+    angle, time = np.radians(20.0), 0.5
+    tilt = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), float(angle))
+    up, down = np.array([np.sin(angle), 0.0, np.cos(angle)]), np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    builder = newton.ModelBuilder()
+    ramp = newton.Mesh.create_box(2.0, 1.0, 0.1, compute_normals=False, compute_uvs=False)
+    material = newton.ModelBuilder.ShapeConfig(mu=friction)
+    builder.add_shape_mesh(-1, mesh=ramp, xform=wp.transform(wp.vec3(), tilt), cfg=material)
+    cloth = {"dim_x": 6, "dim_y": 6, "cell_x": 0.03, "cell_y": 0.03, "mass": 0.001}
+    builder.add_cloth_grid(pos=wp.vec3(*(0.101 * up - down)), rot=tilt, vel=wp.vec3(), **cloth, **STIFF)
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=friction))
+    start = rollout.positions.mean(axis=0)
+    for _ in range(round(time / DT)):
+        rollout.step()
+    slid = (rollout.positions.mean(axis=0) - start) @ down
+    expected = 0.5 * 9.81 * max(0.0, np.sin(angle) - friction * np.cos(angle)) * time**2
+    assert abs(slid - expected) < 0.05 * expected + 1e-3
+    assert rollout.solver.report.uncertified_steps == 0
+
+
+def test_kinematic_and_inactive_particles_are_never_moved(device):
+    model = bullet(60.0, device=device)
+    flags = model.particle_flags.numpy()
+    flags[20:40] &= ~int(newton.ParticleFlags.ACTIVE)
+    model.particle_flags.assign(flags)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model)))
+    still = (model.particle_inv_mass.numpy() == 0.0) | ((flags & int(newton.ParticleFlags.ACTIVE)) == 0)
+    start = rollout.positions.copy()
+    for _ in range(5):
+        rollout.step()
+    assert still.sum() > 60
+    assert rollout.positions[still].tobytes() == start[still].tobytes()
+    assert rollout.collisions == 0
+
+
+def test_worlds_are_like_one_alone(device):
+    alone = bullet(60.0, device=device)
+    many = bullet(60.0, device=device, worlds=3)
+    one, all_worlds = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), restitution=0.3)) for model in (alone, many))
+    hits = 0
+    for _ in range(5):
+        one.step()
+        all_worlds.step()
+        hits += one.solver.report.hits
+    assert all_worlds.collisions == 0 and hits > 100
+    for world in all_worlds.positions.reshape(3, -1, 3):
+        assert world.tobytes() == one.positions.tobytes()
+
+
+@pytest.mark.parametrize("shape", ["plane", "box", "mesh"])
+def test_rigid_shapes_are_not_passed(shape, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    if shape == "plane":
+        builder.add_ground_plane()
+    elif shape == "box":
+        builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.1), wp.quat_identity()), hx=1.0, hy=1.0, hz=0.1)
+    else:
+        box = newton.Mesh.create_box(1.0, 1.0, 0.1, compute_normals=False, compute_uvs=False)
+        builder.add_shape_mesh(-1, mesh=box, xform=wp.transform((0.0, 0.0, -0.1), wp.quat_identity()))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.1), velocity=(1.0, 0.0, -60.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model)))
+    for _ in range(5):
+        rollout.step()
+        assert rollout.solver.report.certified
+        assert rollout.positions[:, 2].min() > 0.0
+    assert rollout.positions[:, 2].max() < 0.1
+    assert np.abs(rollout.velocities[:, 2]).max() < 10.0
+
+
+def test_what_crosses_at_the_start_is_named(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.0))
+    builder.add_cloth_grid(
+        pos=wp.vec3(0.013, -0.05, -0.051),
+        rot=wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 1.5),
+        vel=wp.vec3(),
+        dim_x=2,
+        dim_y=2,
+        cell_x=0.05,
+        cell_y=0.05,
+        mass=0.001,
+        **STIFF,
+    )
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model))
+    rollout = Rollout(model, solver)
+    expected = rollout.detector.find_intersections(rollout.positions)
+    rollout.step()
+    assert len(expected) > 0
+    np.testing.assert_array_equal(solver.report.intersections, expected)
+
+
+def test_the_inner_solver_is_asked_for_the_rest(device):
+    model = bullet(10.0, device=device)
+    inner = SOLVERS["vbd"](model)
+    solver = bsc.SolverCCD(inner)
+    assert isinstance(solver, newton.solvers.SolverBase)
+    assert solver.iterations == 5
+    assert solver.model is model and solver.device == model.device
+    assert solver.collision_frequency == inner.collision_frequency
+    assert solver.supported_observables == inner.supported_observables
+    solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+    solver.reset(model.state())
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        _ = solver.no_such_thing
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"separation": 0.0}, "separation"),
+        ({"separation": np.nan}, "separation"),
+        ({"friction": -1.0}, "friction"),
+        ({"friction": 1e39}, "friction"),
+        ({"friction": np.nan}, "friction"),
+        ({"restitution": np.nan}, "restitution"),
+        ({"restitution": 1.5}, "restitution"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(options, message, device):
+    model = bullet(10.0, device=device)
+    with pytest.raises(ValueError, match=message):
+        bsc.SolverCCD(SOLVERS["xpbd"](model), **options)
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_friction_of_shapes_out_of_range_is_refused(plane, device):
+    builder = newton.ModelBuilder()
+    slippery = newton.ModelBuilder.ShapeConfig(mu=-1.0)
+    for collides in (False, True):
+        slippery.has_particle_collision = collides
+        if plane:
+            builder.add_ground_plane(cfg=slippery)
+        else:
+            builder.add_shape_sphere(-1, radius=0.1, cfg=slippery)
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.2))
+    with pytest.raises(ValueError, match=r"shape 1 .* has friction -1\.0"):
+        bsc.SolverCCD(newton.solvers.SolverXPBD(builder.finalize(device=device)))
+
+
+def test_a_frame_in_a_graph_is_the_frame_without(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
+    for _ in range(8):
+        plain.step()
+        captured.step()  # queues grow
+    for rollout in (plain, captured):
+        rollout.states = model.state(), model.state()
+
+    def frame(rollout):
+        for start, end in (rollout.states, rollout.states[::-1]):
+            start.clear_forces()
+            rollout.solver.step(start, end, rollout.control, None, DT)
+
+    with wp.ScopedCapture(device) as capture:
+        frame(captured)
+    for _ in range(4):
+        frame(plain)
+        wp.capture_launch(capture.graph)
+        assert captured.solver.report.certified
+        assert plain.positions.tobytes() == captured.positions.tobytes()
+        assert plain.velocities.tobytes() == captured.velocities.tobytes()
+    assert captured.solver.report.uncertified_steps == 0
+
+
+def test_positions_that_are_not_finite_leave_everything_standing(device):
+    model = bullet(10.0, device=device)
+
+    class Diverging(newton.solvers.SolverXPBD):
+        def step(self, state_in, state_out, *arguments, **options):
+            super().step(state_in, state_out, *arguments, **options)
+            q = state_out.particle_q.numpy()
+            q[-1] = np.nan
+            state_out.particle_q.assign(q)
+
+    solver = bsc.SolverCCD(Diverging(model))
+    start, end = model.state(), model.state()
+    solver.step(start, end, model.control(), None, DT)
+    assert not solver.report.certified and solver.report.undetected and solver.report.uncertified_steps == 1
+    np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
+    assert (end.particle_qd.numpy() == 0.0).all()
+
+
+def test_a_graph_without_room_stands_still_and_says_so(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
+    response = rollout.solver._response
+    response.detector._vertex_face._reserve_contacts(1)
+    response.detector.capacities.assign(response.detector._room())
+    start, end = rollout.states
+    with wp.ScopedCapture(device) as capture:
+        rollout.solver.step(start, end, rollout.control, None, DT)
+    for _ in range(8):
+        wp.capture_launch(capture.graph)
+        wp.copy(start.particle_q, end.particle_q)
+        wp.copy(start.particle_qd, end.particle_qd)
+        if rollout.solver.report.undetected:
+            break
+    report = rollout.solver.report
+    assert report.undetected and not report.certified
+    np.testing.assert_array_equal(end.particle_q.numpy(), response.vertices.x0.numpy())

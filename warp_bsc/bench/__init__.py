@@ -1,0 +1,1 @@
+"""Measurements, and the baselines that they compare with. Nothing is printed here."""

@@ -1,0 +1,358 @@
+"""Benchmark of elementary queries: how many a second are answered where queries and answers stay on the device."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..cli.query_file import KINDS
+from ..detection.launch import launch_over, launch_over_queue
+from ..detection.narrow_phase import TOLERANCE
+from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
+from ..kernels.classification import classify
+from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from ..kernels.exact.decision import NONE, decide_in
+from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.pipeline.queues import take_slot
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
+from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
+from ..kernels.time_of_impact import impact
+from .detector import median_milliseconds
+
+__all__ = [
+    "MODES",
+    "SEED",
+    "QueryBenchmark",
+    "benchmark_copy",
+    "benchmark_queries",
+    "check_query_count",
+    "generate_queries",
+    "generate_touching_queries",
+]
+
+MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
+"""What is measured, with the bytes of a query and its answer: the status only, one thread a query; with time of impact,
+coordinates and normal; the status only, a second kernel deciding what the culls of a first one leave; and the status
+only, by exact integers alone, of one limb a coordinate, of as many queries that floating point leaves open."""
+
+SEED = 0
+"""Of the random numbers."""
+
+_MOST_QUERIES = 2**26
+_COPIED_BYTES = 2**28  # more than caches hold
+_MISSES = dict(zip(KINDS, (1.32, 2.33), strict=True))
+"""By how much, at most along each axis, features that fly at each other fail to change places: such that the culls
+leave a third of the queries."""
+
+_KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
+"""Without fused operations every device computes the same bits."""
+
+
+@dataclass(frozen=True)
+class QueryBenchmark:
+    """What the queries of one kind were answered, and how long it took.
+
+    Attributes:
+        kind: "vertex-face" or "edge-edge".
+        status: The answers, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
+        survivors: How many queries the culls leave.
+        milliseconds: Median time to answer all queries, by mode [ms].
+    """
+
+    kind: str
+    status: np.ndarray
+    survivors: int
+    milliseconds: dict[str, float]
+
+    @property
+    def survivor_share(self) -> float:
+        """Which part of the queries the culls leave."""
+        return self.survivors / len(self.status)
+
+    @property
+    def free(self) -> int:
+        """Number of queries certified to be free."""
+        return int((self.status == FREE).sum())
+
+    @property
+    def hits(self) -> int:
+        """Number of queries certified to collide."""
+        return int((self.status == HIT).sum())
+
+    @property
+    def unsure(self) -> int:
+        """Number of queries that floating point could not certify either way."""
+        return int((self.status == UNSURE).sum())
+
+    @property
+    def queries_per_second(self) -> dict[str, float]:
+        """Queries answered per second, by mode [1/s]."""
+        return {mode: 1e3 * len(self.status) / took for mode, took in self.milliseconds.items()}
+
+    @property
+    def bytes_per_second(self) -> dict[str, float]:
+        """Bytes of queries and answers that are moved at least, by mode [1/s]."""
+        return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
+
+
+@wp.kernel(**_KERNEL)
+def _generate_queries(first: int, seed: int, miss: float, first_points: int, points: wp.array2d[wp.vec3]):
+    """Two features of unit size that fly at each other from a random distance, and deform a little on the way."""
+    i = first + wp.tid()
+    random = wp.rand_init(seed, i)
+    apart = 2.0 * wp.sample_unit_cube(random)
+    relative = 2.0 * miss * wp.sample_unit_cube(random) - 2.0 * apart
+    for j in range(4):
+        point = wp.sample_unit_cube(random)
+        motion = 0.25 * wp.sample_unit_cube(random)
+        if j >= first_points:
+            point = point + apart
+            motion = motion + relative
+        points[i, j] = point
+        points[i, 4 + j] = point + motion
+
+
+@wp.func
+def _rounded(x: wp.vec3) -> wp.vec3:
+    """The nearest multiples of 2^-8."""
+    return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
+
+
+@wp.kernel(**_KERNEL)
+def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
+    """Moves the first point of each query so that it is on an edge, from point ``other`` to the next, at half time.
+
+    After rounding all numbers are small multiples of 2^-11, so that this is exact.
+    """
+    i = first + wp.tid()
+    for j in range(8):
+        points[i, j] = _rounded(points[i, j])
+    start = 3.0 * points[i, other] + points[i, other + 1]
+    end = 3.0 * points[i, other + 4] + points[i, other + 5]
+    gap = 0.5 * (points[i, 0] + points[i, 4]) - 0.125 * (start + end)
+    points[i, 0] = points[i, 0] - gap
+    points[i, 4] = points[i, 4] - gap
+
+
+@functools.cache
+def _kernels(kind):
+    """The kernels for one kind of query, each in a module of its own."""
+    vertex_face = kind == "vertex-face"
+    number = VERTEX_FACE if vertex_face else EDGE_EDGE
+    ccd = ccd_vertex_face if vertex_face else ccd_edge_edge
+    first_impact = impact_vertex_face if vertex_face else impact_edge_edge
+    boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
+    motion_of = vertex_face_motion if vertex_face else edge_edge_motion
+
+    @wp.func
+    def read(p: wp.array2d[wp.vec3], i: int):
+        return p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7]
+
+    @wp.kernel(**_KERNEL)
+    def find_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+        i = first + wp.tid()
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        status[i] = wp.int8(ccd(a0, b0, c0, d0, a1, b1, c1, d1))
+
+    @wp.kernel(**_KERNEL)
+    def find_impact(
+        first: int,
+        points: wp.array2d[wp.vec3],
+        tolerance: wp.float64,
+        status: wp.array[wp.int8],
+        toi: wp.array[wp.float64],
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+    ):
+        i = first + wp.tid()
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        result = first_impact(a0, b0, c0, d0, a1, b1, c1, d1, tolerance)
+        status[i] = wp.int8(result.status)
+        toi[i] = result.toi
+        coordinates[i] = result.coordinates
+        normal[i] = result.normal
+
+    @wp.kernel(**_KERNEL)
+    def cull(
+        first: int,
+        points: wp.array2d[wp.vec3],
+        status: wp.array[wp.int8],
+        survivors: wp.array[int],
+        counts: wp.array[wp.int64],
+    ):
+        i = first + wp.tid()
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        status[i] = wp.int8(FREE)
+        # the points are known to be finite
+        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+            return
+        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
+        y = coplanarity(motion)
+        if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        if direction_separates(motion, centroid_direction(motion)):
+            return
+        survivors[wp.int32(take_slot(counts, 0))] = i
+
+    @wp.kernel(**_KERNEL)
+    def classify_survivors(
+        first: int,
+        points: wp.array2d[wp.vec3],
+        tolerance: wp.float64,
+        survivors: wp.array[int],
+        counts: wp.array[wp.int64],
+        status: wp.array[wp.int8],
+    ):
+        slot = first + wp.tid()
+        if wp.int64(slot) >= counts[0]:
+            return
+        i = survivors[slot]
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
+        y = coplanarity(motion)
+        answer = classify(motion, y)
+        if answer == UNSURE:
+            result = impact(motion, y, answer, tolerance)
+            answer = result.status
+        status[i] = wp.int8(answer)
+
+    decide = decide_in(1)
+
+    @wp.func
+    def double(x: wp.vec3) -> wp.vec3d:
+        return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
+
+    @wp.kernel(**_KERNEL)
+    def find_exact_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+        i = first + wp.tid()
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
+        time = decide(
+            number,
+            double(a0),
+            double(b0),
+            double(c0),
+            double(d0),
+            double(a1),
+            double(b1),
+            double(c1),
+            double(d1),
+            False,
+            0,
+        )
+        status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
+
+    return find_status, find_impact, cull, classify_survivors, find_exact_status
+
+
+def check_query_count(count):
+    """Raises ValueError if there are too few or too many queries."""
+    if not 1 <= count <= _MOST_QUERIES:
+        raise ValueError(f"the number of queries must be in [1, {_MOST_QUERIES}], not {count}")
+
+
+def generate_queries(kind, count, *, device=None) -> wp.array:
+    """Random queries, the same on every device, the first of many being those of few.
+
+    Args:
+        kind: "vertex-face" or "edge-edge".
+        count: How many.
+        device: Warp device; default: Warp's default.
+
+    Returns:
+        Positions, rows as those of :func:`query_vertex_face` or :func:`query_edge_edge`, array of vec3, shape
+        [count, 8].
+    """
+    device = wp.get_device(device)
+    points = wp.empty((count, 8), dtype=wp.vec3, device=device)
+    inputs = [SEED, _MISSES[kind], 1 if kind == "vertex-face" else 2]
+    launch_over(_generate_queries, count, inputs=inputs, outputs=[points], device=device)
+    return points
+
+
+def generate_touching_queries(kind, count, *, device=None) -> wp.array:
+    """Queries that touch an edge, or a vertex that edge, at half time: floating point leaves nearly all open.
+
+    Arguments and result as of :func:`generate_queries`, of which they are made.
+    """
+    points = generate_queries(kind, count, device=device)
+    other = 1 if kind == "vertex-face" else 2
+    launch_over(_make_touch, count, inputs=[other], outputs=[points], device=points.device)
+    return points
+
+
+def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBenchmark:
+    """Measures how long random queries take, in each mode: replays of a CUDA graph, launches on the CPU.
+
+    A first run of each mode is not timed.
+
+    Args:
+        kind: "vertex-face" or "edge-edge".
+        count: How many queries; default: 2^24 on a GPU, 2^18 on the CPU.
+        device: Warp device; default: Warp's default.
+        repeat: How many repetitions the medians are of.
+
+    Returns:
+        QueryBenchmark: The measurements.
+
+    Raises:
+        ValueError: If there are too few or too many queries.
+        RuntimeError: If two modes find different answers, or exact arithmetic none where features touch.
+    """
+    device = wp.get_device(device)
+    if count is None:
+        count = 2**24 if device.is_cuda else 2**18
+    check_query_count(count)
+    find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
+    points = generate_queries(kind, count, device=device)
+    touching = generate_touching_queries(kind, count, device=device)
+    # of no value that an answer has
+    status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
+    toi = wp.empty(count, dtype=wp.float64, device=device)
+    coordinates, normal = (wp.empty(count, dtype=wp.vec3d, device=device) for _ in range(2))
+    survivors = wp.empty(count, dtype=int, device=device)
+    counts = wp.zeros(1, dtype=wp.int64, device=device)
+
+    def run_status():
+        launch_over(find_status, count, inputs=[points], outputs=[status["status"]], device=device)
+
+    def run_impact():
+        outputs = [status["impact"], toi, coordinates, normal]
+        launch_over(find_impact, count, inputs=[points, TOLERANCE], outputs=outputs, device=device)
+
+    def run_queued():
+        counts.zero_()
+        outputs = [status["queued"], survivors, counts]
+        launch_over(cull, count, inputs=[points], outputs=outputs, device=device)
+        inputs = [points, TOLERANCE, survivors, counts]
+        launch_over_queue(classify_survivors, survivors, counts, 0, inputs=inputs, outputs=[status["queued"]])
+
+    def run_exact():
+        outputs = [status["exact"]]
+        launch_over(find_exact_status, count, inputs=[touching], outputs=outputs, device=device, block_dim=64)
+
+    runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
+    milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
+    answers = {mode: array.numpy() for mode, array in status.items()}
+    missed = int((answers["exact"] != HIT).sum())
+    if missed:
+        raise RuntimeError(f"{missed} of {count} touching {kind} queries were found to be free")
+    for mode in runs.keys() - {"exact"}:
+        different = int((answers[mode] != answers["status"]).sum())
+        if different:
+            raise RuntimeError(f"{different} of {count} {kind} queries were answered differently by mode {mode}")
+    return QueryBenchmark(kind, answers["status"].copy(), int(counts.numpy()[0]), milliseconds)
+
+
+def benchmark_copy(*, device=None, repeat=20) -> float:
+    """Measures how fast a device copies large arrays: bytes read and bytes written per second [1/s].
+
+    Args:
+        device: Warp device; default: Warp's default.
+        repeat: How many repetitions to take the median of.
+    """
+    device = wp.get_device(device)
+    source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)
+    target = wp.empty_like(source)
+    milliseconds = median_milliseconds(lambda: wp.copy(target, source), device, repeat)
+    return 2e3 * _COPIED_BYTES / milliseconds

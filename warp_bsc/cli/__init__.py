@@ -1,0 +1,1 @@
+"""The command line: options, tables and exit statuses. Rich is imported only here."""

@@ -1,0 +1,235 @@
+"""Shows what the paper's benchmarks found: tables for people, plain data for programs."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+
+from ..bench.ipc_toolkit import version_of_peers
+from ..bench.methods import METHODS, STAGES
+from ..bench.paper import SceneBenchmark, Timing
+from .tables import count, make_table, say
+
+__all__ = ["METHOD_NAMES", "paper_benchmarks_to_dict", "print_paper_benchmarks"]
+
+METHOD_NAMES = {
+    "float": "float",
+    "conservative": "conserv.",
+    "exact": "exact",
+    "cubic": "cubic",
+    "reduced": "reduced",
+}
+"""What tables and figures call the methods."""
+
+_STAGE_HEADERS = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
+
+
+def print_paper_benchmarks(console: Console, benchmarks: list[SceneBenchmark], adversarial) -> None:
+    """Print what was measured, scene by scene.
+
+    Args:
+        console: Where to.
+        benchmarks: The measurements of each scene.
+        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
+    """
+    rows = [(_short(found.name), found) for found in benchmarks]
+    _print_queries(console, rows)
+    _print_stages(console, rows)
+    for number in range(len(benchmarks[0].timings)):
+        _print_times(console, [(name, found.timings[number]) for name, found in rows])
+    _print_worst(console, rows, adversarial)
+    _print_errors(console, rows)
+    _print_frames(console, rows)
+    if any(found.peers for found in benchmarks):
+        _print_peers(console, rows)
+    say(console, "float, conservative, exact: this project's methods; all that is not certified free is a collision.")
+    say(console, "cubic: a floating-point cubic solver as in Provot 1997, Bridson et al. 2002 and El Topo.")
+    say(console, "reduced: float with the paper's own inside tests (3.5 there), without subdivision, as it has none.")
+
+
+def _short(name):
+    """Name of a scene without its folder and ending."""
+    return ",".join(Path(path).stem if "/" in path or path.endswith(".usd") else path for path in name.split(","))
+
+
+def _print_queries(console, rows):
+    table = make_table(
+        "Scene",
+        "Triangles",
+        "Intervals",
+        "Candidates",
+        "Queries",
+        "Collisions",
+        "Unsure",
+        caption="Candidates: pairs whose swept boxes overlap. Queries: a random part of them, all below.",
+    )
+    for name, found in rows:
+        numbers = [found.triangles, len(found.intervals), found.candidates, sum(found.queries.values())]
+        table.add_row(name, *(f"{number:,}" for number in [*numbers, found.collisions, found.unsure]))
+    console.print(table)
+    console.print()
+
+
+def _print_stages(console, rows):
+    table = make_table("Decided by", *_STAGE_HEADERS, caption="Shares of the queries; by method exact.")
+    for name, found in rows:
+        total = sum(found.stages.values())
+        table.add_row(name, *(f"{found.stages[stage] / total:.2%}" for stage in STAGES))
+    console.print(table)
+    console.print()
+
+
+def _print_times(console, rows: list[tuple[str, Timing]]):
+    place = rows[0][1].place
+    table = make_table(f"ns a query, {place.name}", *METHOD_NAMES.values(), "cubic /\nfloat", "reduced\n/ float")
+    for name, timing in rows:
+        took = timing.nanoseconds
+        ratios = (f"{took[method] / took['float']:.2f}" for method in ("cubic", "reduced"))
+        table.add_row(name, *(f"{took[method]:,.2f}" for method in METHODS), *ratios)
+    console.print(table)
+    console.print()
+
+
+def _few_digits(number):
+    """A number without fractions, or with two digits where it is small: times on a GPU are of many queries at once."""
+    return f"{number:,.0f}" if number >= 10.0 else f"{number:.2g}"
+
+
+def _print_worst(console, rows, adversarial):
+    for place, worst_of_trouble in adversarial:
+        found = [(name, timing.worst) for name, scene in rows for timing in scene.timings if timing.place == place]
+        found.append(("adversarial", worst_of_trouble))
+        table = make_table(
+            f"Slowest query, ns, {place.name}",
+            *METHOD_NAMES.values(),
+            "cubic /\nfloat",
+            caption="Each method's own slowest. In the paper: float 105, exact 876, El Topo's cubic solver 953.",
+        )
+        for name, worst in found:
+            took = {method: query.nanoseconds[method] for method, query in worst.items()}
+            ratio = f"{took['cubic'] / took['float']:.2f}"
+            table.add_row(name, *(_few_digits(took[method]) for method in METHODS), ratio)
+        console.print(table)
+        console.print()
+        table = make_table("Slowest of all", "Kind", "Number", *METHOD_NAMES.values())
+        for method in METHODS:
+            name, query = max(
+                ((name, worst[method]) for name, worst in found),
+                key=lambda named, method=method: named[1].nanoseconds[method],
+            )
+            took = (_few_digits(query.nanoseconds[other]) for other in METHODS)
+            table.add_row(f"{method}: {name}", query.kind.replace("_", "-"), str(query.index), *took)
+        console.print(table)
+        console.print()
+
+
+def _print_errors(console, rows):
+    table = make_table(
+        "Wrong answers",
+        "Checked",
+        *METHOD_NAMES.values(),
+        caption="False positives + false negatives, of all that any method calls a collision and a random sample.",
+    )
+    for name, found in rows:
+        wrong = (f"{e.false_positives:,} + {e.false_negatives:,}" for e in (found.errors[m] for m in METHODS))
+        table.add_row(name, f"{found.checked:,}", *wrong)
+    console.print(table)
+    for name, found in rows:
+        if found.disagreeing:
+            say(console, f"{name}: {count(found.disagreeing, 'answer')} depended on the device.")
+    console.print()
+
+
+def _print_frames(console, rows):
+    stages = list(rows[0][1].stage_milliseconds)
+    place = rows[0][1].timings[-1].place
+    headers = ["\n".join(stage.rsplit(" ", 1)) for stage in stages]
+    table = make_table(f"ms a frame, {place.name}", *headers, "All", caption="The detector, by method exact.")
+    for name, found in rows:
+        numbers = [*(found.stage_milliseconds[stage] for stage in stages), found.frame_milliseconds]
+        table.add_row(name, *(f"{number:,.2f}" for number in numbers))
+    console.print(table)
+    console.print()
+
+
+def _print_peers(console, rows):
+    table = make_table(
+        f"IPC Toolkit {version_of_peers()}, 1 core",
+        "ns a\nquery",
+        "Call,\nns",
+        "Checked",
+        "False\npos.",
+        "False\nneg.",
+        caption="Asked one by one from Python: what a call takes for features far apart is taken off.",
+    )
+    for name, found in rows:
+        for peer, took in found.peers.items():
+            numbers = (took.nanoseconds, took.call_nanoseconds)
+            counts = (took.checked, took.false_positives, took.false_negatives)
+            table.add_row(f"{name}, {peer}", *(f"{number:,.0f}" for number in numbers), *(f"{n:,}" for n in counts))
+    console.print(table)
+    console.print()
+
+
+def paper_benchmarks_to_dict(benchmarks: list[SceneBenchmark], adversarial, *, quick: bool) -> dict:
+    """Every measurement, to be written as JSON.
+
+    Args:
+        benchmarks: The measurements of each scene.
+        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
+        quick: Whether only a first look was taken.
+    """
+    return {
+        "benchmark": "paper",
+        "quick": quick,
+        "methods": list(METHODS),
+        "ipc_toolkit": version_of_peers() if any(found.peers for found in benchmarks) else None,
+        "scenes": [_scene_to_dict(found) for found in benchmarks],
+        "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
+    }
+
+
+def _scene_to_dict(found):
+    return {
+        "scene": found.name,
+        "name": _short(found.name),
+        "triangles": found.triangles,
+        "precision": found.precision,
+        "intervals": found.intervals,
+        "candidates": found.candidates,
+        "queries": found.queries,
+        "collisions": found.collisions,
+        "unsure": found.unsure,
+        "checked": found.checked,
+        "sample": found.sample,
+        "errors": {method: asdict(errors) for method, errors in found.errors.items()},
+        "disagreeing": found.disagreeing,
+        "decided_by": found.stages,
+        "timings": [_timing_to_dict(timing) for timing in found.timings],
+        "stage_milliseconds": found.stage_milliseconds,
+        "frame_milliseconds": found.frame_milliseconds,
+        "peers": {peer: asdict(took) for peer, took in found.peers.items()},
+    }
+
+
+def _timing_to_dict(timing):
+    return {
+        "place": timing.place.name,
+        "device": str(timing.place.device),
+        "device_name": timing.place.device.name,
+        "cores": timing.place.cores,
+        "nanoseconds": timing.nanoseconds,
+        "worst": _worst_to_dict(timing.worst),
+    }
+
+
+def _worst_to_dict(worst):
+    return {
+        method: {
+            "kind": query.kind,
+            "number": query.index,
+            "points": query.points.tolist(),
+            "nanoseconds": query.nanoseconds,
+        }
+        for method, query in worst.items()
+    }

@@ -1,0 +1,321 @@
+"""The broad phase of a CPU: a tree of blocks of eight boxes, which vector instructions compare at once."""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from ..kernels.pipeline.blocks import pair_block
+from ..kernels.pipeline.boxes import rounded
+from .launch import launch_over
+from .narrow_phase import UNLIMITED, Count
+
+__all__ = ["BlockBroadPhase"]
+
+_CODE_BITS = 10
+_CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_NEAR = wp.constant(int(Count.NEAR))
+_LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
+
+_KERNEL = {"enable_backward": False, "module": "unique"}
+
+
+@functools.cache
+def _kernels(dtype):
+    """The kernels that read positions, for one type of them."""
+
+    @wp.kernel(**_KERNEL)
+    def encode(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        corners: wp.array2d[int],
+        worlds: wp.array[int],
+        low: wp.vec3d,
+        scale: wp.vec3d,
+        codes: wp.array[wp.int64],
+        order: wp.array[int],
+    ):
+        """Where an element, taken for its first corner, lies along a Morton curve; one world behind the other."""
+        i = first + wp.tid()
+        vertex = corners[i, 0]
+        code = wp.int64(worlds[i])
+        cells = wp.vec3i()
+        for axis in range(3):
+            x = wp.float64(0.5) * (wp.float64(x0[vertex][axis]) + wp.float64(x1[vertex][axis]))
+            cells[axis] = wp.int32(wp.clamp((x - low[axis]) * scale[axis], wp.float64(0.0), _LARGEST_CELL))
+        for bit in range(_CODE_BITS):
+            for axis in range(3):
+                code = (code << wp.int64(1)) | wp.int64((cells[axis] >> (_CODE_BITS - 1 - bit)) & 1)
+        codes[i] = code
+        order[i] = i
+
+    @wp.kernel(**_KERNEL)
+    def fill_blocks(
+        first: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        corners: wp.array2d[int],
+        numbers: wp.array[int],
+        worlds: wp.array[int],
+        order: wp.array[int],
+        changed: wp.array[int],
+        boxes: wp.array3d[wp.float32],
+        elements: wp.array2d[int],
+        nodes: wp.array3d[wp.float32],
+        node_worlds: wp.array3d[int],
+    ):
+        block = first + wp.tid()
+        count = wp.min(8, corners.shape[0] - 8 * block)
+        low = wp.vec3(wp.inf)
+        high = wp.vec3(-wp.inf)
+        changed_lanes = int(0)
+        for lane in range(count):
+            i = order[8 * block + lane]
+            low0 = wp.vec3(wp.inf)
+            high0 = wp.vec3(-wp.inf)
+            low1 = wp.vec3(wp.inf)
+            high1 = wp.vec3(-wp.inf)
+            elements[block, lane] = numbers[i]
+            elements[block, 32 + lane] = worlds[i]
+            for corner in range(corners.shape[1]):
+                vertex = corners[i, corner]
+                elements[block, 8 + 8 * corner + lane] = vertex
+                if not changed or changed[vertex] != 0:
+                    changed_lanes = changed_lanes | (1 << lane)
+                start = rounded(x0[vertex])
+                end = rounded(x1[vertex])
+                low0 = wp.min(low0, start)
+                high0 = wp.max(high0, start)
+                low1 = wp.min(low1, end)
+                high1 = wp.max(high1, end)
+            for axis in range(3):
+                boxes[block, 4 * axis, lane] = low0[axis]
+                boxes[block, 4 * axis + 1, lane] = high0[axis]
+                boxes[block, 4 * axis + 2, lane] = low1[axis]
+                boxes[block, 4 * axis + 3, lane] = high1[axis]
+            low = wp.min(low, wp.min(low0, low1))
+            high = wp.max(high, wp.max(high0, high1))
+        elements[block, 40] = changed_lanes
+        for axis in range(3):
+            nodes[block / 8, 2 * axis, block % 8] = low[axis]
+            nodes[block / 8, 2 * axis + 1, block % 8] = high[axis]
+        node_worlds[block / 8, 0, block % 8] = elements[block, 32]
+        node_worlds[block / 8, 1, block % 8] = elements[block, 32 + count - 1]
+
+    return encode, fill_blocks
+
+
+@wp.kernel(**_KERNEL)
+def _pair_blocks(
+    first: int,
+    boxes: wp.array[wp.float32],
+    elements: wp.array[int],
+    corners: int,
+    other_boxes: wp.array[wp.float32],
+    other_elements: wp.array[int],
+    other_corners: int,
+    other_nodes: wp.array[wp.float32],
+    other_node_worlds: wp.array[int],
+    level_starts: wp.array[int],
+    symmetric: int,
+    keep_apart: int,
+    counts: wp.array[wp.int64],
+    pairs: wp.array[wp.vec2i],
+):
+    pair_block(
+        first + wp.tid(),
+        boxes,
+        elements,
+        corners,
+        other_boxes,
+        other_elements,
+        other_corners,
+        other_nodes,
+        other_node_worlds,
+        level_starts,
+        symmetric,
+        keep_apart,
+        counts,
+        _CANDIDATES,
+        _NEAR,
+        pairs,
+    )
+
+
+class _Tree:
+    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.pipeline.blocks`."""
+
+    def __init__(self, corners, numbers, world):
+        """Makes an empty tree.
+
+        Args:
+            corners: Vertex indices of the elements, int32, shape [n, 1 to 3].
+            numbers: What the elements are called in pairs, int32, shape [n].
+            world: World of each vertex, int32, or None: all in one.
+        """
+        n = len(corners)
+        blocks = -(-n // 8)
+        starts = [0]
+        width = blocks
+        while True:
+            width = -(-width // 8)
+            starts.append(starts[-1] + width)
+            if width <= 1:
+                break
+        worlds = np.zeros(n, np.int32) if world is None else world[corners[:, 0]]
+        device = "cpu"
+        self._corners = wp.array(corners, dtype=int, device=device)
+        self._numbers = wp.array(numbers, dtype=int, device=device)
+        self._worlds = wp.array(worlds, dtype=int, device=device)
+        self._level_starts = wp.array(starts, dtype=int, device=device)
+        self._codes = wp.empty(2 * n, dtype=wp.int64, device=device)
+        self._order = wp.empty(2 * n, dtype=int, device=device)
+        # empty boxes, which overlap nothing, where there are less than eight; worlds of no element
+        empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
+        self._boxes = wp.array(np.tile(empty, (blocks, 6, 8)), dtype=wp.float32, device=device)
+        self._elements = wp.full((blocks, 41), -1, dtype=int, device=device)
+        self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
+        self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
+
+    def sort(self, x0, x1, low, scale):
+        """Sorts the elements of a motion along a Morton curve.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            low: Lowest coordinates of all, shape [3].
+            scale: Cells of the sorting grid per unit of length, for each axis, shape [3].
+        """
+        encode, _ = _kernels(x0.dtype)
+        n, device = len(self._corners), self._corners.device
+        inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
+        launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
+        wp.utils.radix_sort_pairs(self._codes, self._order, n)
+
+    def fit(self, x0, x1, changed=None):
+        """Boxes the elements of a motion, in the order that they are in.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            changed: Which vertices have changed, array of int, None for all.
+        """
+        _, fill_blocks = _kernels(x0.dtype)
+        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed]
+        outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
+        device = self._corners.device
+        launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
+        nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
+        for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
+            _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
+            _join(nodes[start:end, 1::2].max(axis=2), nodes[end:above, 1::2])
+            _join(worlds[start:end, :1, 0], worlds[end:above, :1])
+            _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
+
+    def pair(self, other, counts, pairs, *, keep_apart=False):
+        """Enqueues pairs of elements of this tree and of another or the same.
+
+        See :func:`warp_bsc.kernels.pipeline.blocks.pair_block`.
+
+        Args:
+            other: The other tree.
+            counts: By :class:`Count`, array of int64.
+            pairs: Queue of the pairs that come near, array of vec2i.
+            keep_apart: Whether to enqueue those as well that an axis separates.
+        """
+        inputs = [
+            self._boxes.flatten(),
+            self._elements.flatten(),
+            self._corners.shape[1],
+            other._boxes.flatten(),
+            other._elements.flatten(),
+            other._corners.shape[1],
+            other._nodes.flatten(),
+            other._node_worlds.flatten(),
+            other._level_starts,
+            other is self,
+            keep_apart,
+            counts,
+        ]
+        launch_over(_pair_blocks, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
+
+
+def _join(children, parents):
+    """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
+    for lane in range(8):
+        lanes = children[lane::8]
+        parents[: len(lanes), :, lane] = lanes
+
+
+class BlockBroadPhase:
+    """Finds the candidate pairs of a mesh: those that share no vertex and whose swept boxes overlap.
+
+    It has the interface of :class:`warp_bsc.detection.broad_phase_bvh.BvhBroadPhase`, but no queue of its own.
+    """
+
+    queues = ()
+    capacity = UNLIMITED
+
+    def __init__(self, mesh, count):
+        """Makes room for trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
+        self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
+        self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world)
+        self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
+        self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world)
+
+    def grow(self, count):
+        """Nothing, as there is nothing that could."""
+
+    def pair_elements(
+        self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False, changed=None
+    ):
+        """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            vertex_face_counts: By :class:`Count`, array of int64.
+            vertex_face: Queue for (vertex, face), array of vec2i.
+            edge_edge_counts: By :class:`Count`, array of int64.
+            edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
+            refit: Whether to keep the order of the run before, which is as right, but slows down what follows if much
+                has moved.
+            changed: Nonzero for each vertex that pairs are wanted of, array of int; None for all pairs.
+        """
+        self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge)
+
+    def pair_overlapping_elements(self, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
+        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_apart=True)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_apart=True)
+
+    def pair_edges_with_faces(self, x, counts, pairs):
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
+
+        Args:
+            x: Positions, Warp array of vec3 or vec3d.
+            counts: By :class:`Count`, array of int64.
+            pairs: Queue for (edge, face), array of vec2i.
+        """
+        self._build([self._edges, self._faces], x, x, False)
+        self._edges.pair(self._faces, counts, pairs)
+
+    def _build(self, trees, x0, x1, refit, changed=None):
+        """Builds trees for a motion, sorted on one grid around all that is used of it, or refits them."""
+        if not refit:
+            _sort(trees, x0, x1, self._used)
+        for tree in trees:
+            tree.fit(x0, x1, changed)
+
+
+def _sort(trees, x0, x1, used):
+    ends = x0.numpy()[used], x1.numpy()[used]
+    low = np.array([min(x[:, axis].min(initial=np.inf) for x in ends) for axis in range(3)])
+    high = np.array([max(x[:, axis].max(initial=-np.inf) for x in ends) for axis in range(3)])
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        scale = np.nan_to_num((1 << _CODE_BITS) / (high - low), posinf=0.0)
+    for tree in trees:
+        tree.sort(x0, x1, low, scale)

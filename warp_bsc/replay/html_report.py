@@ -1,0 +1,210 @@
+"""A page that shows what a replay found, in one file that needs no network.
+
+The page's parts are in the folder ``page``. What comes from the scene's file goes into the page as JSON, in which no
+markup can begin, and the page's script sets it as text. Its content security policy lets nothing else run: no other
+script, no handler in an attribute, no address.
+"""
+
+import base64
+import hashlib
+import html
+import json
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from .._atomic_file import ReplayOutput
+from .summary import CERTIFIED_FOR, Outcome
+
+__all__ = ["ReportPage"]
+
+_MOST_FACES = 150_000  # in the view in 3D
+_MOST_CONTACTS = 20_000
+_LONGEST = 10  # rows of a table
+_MOST_LINES = 200  # of disagreements
+
+
+class ReportPage(ReplayOutput):
+    """A page with a summary, charts, and the worst interval in 3D."""
+
+    def __init__(self, path):
+        """Opens the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        super().__init__(path)
+        self._worst = None
+
+    def add(self, interval, contacts):
+        """Keep the contacts of an interval if there are more than in any before, or none before."""
+        if self._worst is None or len(contacts) > len(self._worst[1]):
+            self._worst = interval, contacts
+
+    def finish(self, outcome: Outcome):
+        """Write the page and put it in its place."""
+        folder = resources.files(__package__) / "page"
+        style = (folder / "page.css").read_text(encoding="utf-8")
+        script = "\n".join((folder / name).read_text(encoding="utf-8") for name in ("viewer.js", "page.js"))
+        fields = {
+            "title": html.escape(_title(outcome)),
+            "style_hash": _policy_hash(style),
+            "script_hash": _policy_hash(script),
+            "style": style,
+            "script": script,
+            "data": _inert(_data(outcome, self._worst)),
+        }
+        page = (folder / "page.html").read_text(encoding="utf-8")
+        parts = page.replace("{{", "}}").split("}}")  # text, name, text, name, ...
+        self._output.truncate(0)
+        self._output.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
+        self._output.commit()
+
+    def shrink(self):
+        """Forget nothing: how large the page is does not depend on the number of intervals."""
+        return False
+
+
+def _data(outcome: Outcome, worst) -> dict:
+    """What the page's script shows."""
+    scene = outcome.scene
+    displayed = scene.display_names
+    tiles = [
+        (f"{outcome.hits:,}", "colliding pairs"),
+        (f"{len(outcome.colliding):,} of {len(outcome.intervals):,}", "intervals with collisions"),
+    ]
+    if outcome.colliding:
+        tiles.append((f"{outcome.colliding[0].earliest.time:.6g}", "time code of the first"))
+    tiles += [
+        (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
+        (f"{scene.face_count:,}", "triangles"),
+        ("yes" if outcome.certified else "no", f"certified for {CERTIFIED_FOR}"),
+    ]
+    data = {
+        "title": _title(outcome),
+        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {outcome.method} on "
+        f"{outcome.device}",
+        "partial": "",
+        "tiles": tiles,
+        "intervals": [
+            (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
+            for interval in outcome.intervals
+        ],
+        "toi": outcome.toi_counts,
+        "stages": list(outcome.milliseconds.items()),
+        "pairs": [
+            {
+                "text": first if first == second else f"{first} with {second}",
+                "under": "with itself" if first == second else "",
+                "hits": hits,
+            }
+            for (first, second), hits in outcome.mesh_pairs[:_LONGEST]
+        ],
+        "more_pairs": max(0, len(outcome.mesh_pairs) - _LONGEST),
+        "worst": [
+            {
+                "start": interval.start,
+                "end": interval.end,
+                "hits": interval.hits,
+                "time": interval.earliest.time,
+                "what": _describe(interval.earliest),
+            }
+            for interval in outcome.worst[:_LONGEST]
+        ],
+        "facts": [
+            ("File", scene.path),
+            *scene.comments,
+            ("Up axis", scene.up_axis),
+            ("Metres per unit", f"{scene.meters_per_unit:g}"),
+            ("Time codes per second", f"{scene.time_codes_per_second:g}"),
+            ("Vertices", f"{scene.vertex_count:,}"),
+            *((f"Mesh {name}", displayed[name] or "no display name") for name in scene.names[:_LONGEST]),
+        ],
+        "notes": [outcome.motion, *scene.warnings],
+        "validation": None,
+        "view": _view(*worst, scene) if worst and worst[1].segment.meshes else None,
+    }
+    if not outcome.is_complete:
+        data["partial"] = (
+            f"Partial: {len(outcome.intervals)} of {outcome.interval_count} intervals were checked; {outcome.stopped}."
+        )
+    if found := outcome.validation:
+        wrong = len(found["disagreements"])
+        text = (
+            f"{found['hits']:,} collisions and {found['others']:,} other pairs were asked again of the exact checker: "
+            f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
+            f"{found['certified']:,} of all {found['answers']:,} answers."
+        )
+        data["validation"] = {"text": text, "disagreements": found["disagreements"][:_MOST_LINES]}
+    return data
+
+
+def _view(interval, contacts, scene) -> dict:
+    """The worst interval: triangles at its start and end, and the contacts."""
+    segment = contacts.segment
+    start, end = contacts.x0.astype(np.float64), contacts.x1.astype(np.float64)
+    faces = segment.faces
+    title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
+    lit = contacts.colliding_faces
+    shown = np.arange(len(faces))
+    rows = np.arange(len(contacts))
+    if len(faces) > _MOST_FACES:
+        # Those around one contact in the middle of all.
+        places = contacts.position if len(contacts) else start[faces[:, 0]]
+        middle = places[np.argmin(np.abs(places - np.median(places, axis=0)).max(axis=1))]
+        distance = np.abs(start[faces].mean(axis=1) - middle).max(axis=1)
+        shown = np.sort(np.argpartition(distance, _MOST_FACES)[:_MOST_FACES])
+        rows = np.flatnonzero(np.abs(contacts.position - middle).max(axis=1) <= distance[shown].max())
+        title += f"; the {_MOST_FACES:,} of {len(faces):,} triangles around one place are shown"
+    lit = np.intersect1d(lit, shown)
+    vertices, corners = np.unique(faces[shown], return_inverse=True)
+    number = np.full(len(faces), -1)
+    number[shown] = np.arange(len(shown))
+    corners = corners.reshape(-1, 3)
+    if len(rows) > _MOST_CONTACTS:
+        rows = rows[np.linspace(0, len(rows) - 1, _MOST_CONTACTS).astype(int)]
+        title += f"; {_MOST_CONTACTS:,} contacts are shown"
+    center = (start[vertices].min(axis=0) + start[vertices].max(axis=0)) / 2
+    mesh_of_vertex, _ = segment.locate_vertices(vertices)
+    return {
+        "title": title,
+        "from": interval.start,
+        "to": interval.end,
+        "at": round(float(np.median(contacts.toi)), 3) if len(contacts) else 0.0,
+        "up_axis": scene.up_axis,
+        "meshes": [{"name": mesh.name, "moves": mesh.moves} for mesh in segment.meshes],
+        "start": _packed(start[vertices] - center, np.float32),
+        "end": _packed(end[vertices] - center, np.float32),
+        "mesh_of_vertex": _packed(mesh_of_vertex, np.uint32),
+        "faces": _packed(corners, np.uint32),
+        "lit": _packed(corners[number[lit]], np.uint32),
+        "contacts": _packed(contacts.position[rows] - center, np.float32),
+        "kinds": _packed(contacts.kind[rows], np.uint32),
+        "toi": _packed(contacts.toi[rows], np.float32),
+    }
+
+
+def _describe(contact):
+    (first, second), (first_element, second_element) = contact.meshes, contact.elements
+    return f"{first}, {first_element}, with {'its' if first == second else second + ','} {second_element}"
+
+
+def _title(outcome):
+    return f"Collisions in {Path(outcome.scene.path).name}"
+
+
+def _packed(values, dtype) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+def _inert(data) -> str:
+    """JSON in which no tag and no comment can begin or end."""
+    text = json.dumps(data, allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
+
+
+def _policy_hash(text) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

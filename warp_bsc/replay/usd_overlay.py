@@ -1,0 +1,377 @@
+"""A USD layer over the scene, which shows its collisions in usdview and any other program that reads USD."""
+
+import os
+import tempfile
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from .._atomic_file import ReplayOutput, without_last_eighth
+from .scene_contacts import KINDS
+from .summary import Outcome
+
+__all__ = ["Overlay"]
+
+COLORS = {"vertex-face": (0.9, 0.1, 0.1), "edge-edge": (1.0, 0.55, 0.0)}
+"""Of the contact points, by their kind."""
+
+LIT = (0.95, 0.25, 0.2)
+"""Colour of the polygons that collide."""
+
+_UNLIT = (0.6, 0.6, 0.6)  # of a mesh without a colour
+_DISPLAY_COLOR = "primvars:displayColor"
+_POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
+
+_COPIED = 1 << 20  # bytes that are copied at once
+
+_CONTACTS = {
+    "extent": ("float3[]", None),
+    "points": ("point3f[]", None),
+    "primvars:displayColor": ("color3f[]", "vertex"),
+    "primvars:toi": ("float[]", "vertex"),
+    "primvars:elementA": ("string[]", "vertex"),
+    "primvars:elementB": ("string[]", "vertex"),
+}
+"""Attributes of the contact points that have time samples: their types and interpolations."""
+
+
+class Overlay(ReplayOutput):
+    """A layer in USD's text format whose sublayer is the scene, so that both are seen when it is opened.
+
+    Contact points are one ``UsdGeom.Points``, its samples at the start of each interval being what meets in it, and
+    have the primvars ``toi``, ``elementA`` and ``elementB``. Polygons that collide are coloured from the start of the
+    interval to that of the next. USD interpolates between samples: each ends with another one just before the next.
+
+    USD's own layers hold all that is written to them in memory. Here samples wait in a temporary file, and are sorted
+    by attribute at the end, when the scene, whose file may have become unreadable, is not read again.
+    """
+
+    def __init__(self, path, *, scene):
+        """Opens the file.
+
+        Args:
+            path: Its place, a ``.usda`` or ``.usd`` file.
+            scene: The scene.
+
+        Raises:
+            OSError: If it cannot be written.
+            ValueError: If it is not such a file.
+        """
+        if Path(path).suffix not in (".usda", ".usd"):
+            raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
+        self._scene = scene
+        self._samples = {}  # by prim and attribute
+        self._ends = []  # of each interval that is whole, in the spool
+        self._last_start = None  # of an interval
+        self._colored = {}  # by the prim's path: the number of polygons in the last sample, and which of them are lit
+        self._unlit = {}  # by the prim's path: the scene's colours there
+        self._polygon_counts = {}  # of the meshes in the interval before
+        self._uncolored = False
+        self._opened = set()  # instances that must have prims of their own to be coloured
+        self._root_path = "/Collisions"
+        while scene.stage.GetPrimAtPath(self._root_path):
+            self._root_path += "_"
+        self._contacts_path = f"{self._root_path}/Contacts"
+        low, high = _bounds(scene)
+        self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
+        self._metadata = _metadata(scene)
+        super().__init__(path)
+        self._spool = tempfile.TemporaryFile(buffering=0, dir=self._output.folder)  # noqa: SIM115 (closed when discarded)
+
+    def add(self, interval, contacts):
+        """Take the contacts of an interval."""
+        prim = self._contacts_path
+        size = self._width / 2
+        points = contacts.position.astype(np.float32)
+        corners = [points.min(axis=0) - size, points.max(axis=0) + size] if len(points) else np.zeros((2, 3))
+        colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind]
+        toi = contacts.toi.astype(np.float32)
+        chunks = contacts.chunks()
+        for name, texts in {
+            "extent": [_tuples(corners)],
+            "points": (_tuples(points[rows]) for rows in chunks),
+            "primvars:displayColor": (_tuples(colors[rows]) for rows in chunks),
+            "primvars:toi": (", ".join(f"{value:.9g}" for value in toi[rows].tolist()) for rows in chunks),
+            "primvars:elementA": (_element_texts(contacts, rows, 0) for rows in chunks),
+            "primvars:elementB": (_element_texts(contacts, rows, 1) for rows in chunks),
+        }.items():
+            self._sample(prim, name, interval.start, texts)
+        self._color(interval, contacts)
+        self._last_start = interval.start
+        self._ends.append(self._spool.tell())
+
+    def finish(self, outcome: Outcome):
+        """Write the layer and put it in its place."""
+        del self._ends[len(outcome.intervals) :]
+        self._output.truncate(0)
+        self._write(outcome.first(len(self._ends)))
+        self._output.commit()
+
+    def shrink(self):
+        """Forget the samples of the last intervals."""
+        if not self._ends:
+            return False
+        self._ends = without_last_eighth(self._ends)
+        self._spool.truncate(self._ends[-1] if self._ends else 0)
+        return True
+
+    def discard(self):
+        """Leave nothing behind, unless the file is finished."""
+        self._spool.close()
+        super().discard()
+
+    def _sample(self, prim, name, time, texts, lit_count=0):
+        """Let a sample of an attribute wait in the spool."""
+        place = self._spool.seek(0, os.SEEK_END)
+        separator = ""
+        for text in texts:
+            rest = memoryview((separator + text).encode())
+            while rest:
+                rest = rest[self._spool.write(rest) :]
+            separator = ", "
+        sample = _Sample(time, place, self._spool.tell() - place, lit_count)
+        self._samples.setdefault((prim, name), []).append(sample)
+
+    def _color(self, interval, contacts):
+        """Let the colours of all meshes wait that change at the start of an interval."""
+        meshes = {mesh.path: mesh for mesh in contacts.segment.meshes if mesh.path == mesh.name}
+        lit = {}
+        for number, polygons in contacts.colliding_polygons().items():
+            mesh = contacts.segment.meshes[number]
+            if mesh.path in meshes:
+                lit[mesh.path] = polygons
+            else:
+                self._uncolored = True
+        for path in {*self._colored, *lit} & meshes.keys():
+            count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
+            if path not in self._colored:
+                self._open_instances(path)
+                if self._last_start is not None:
+                    self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
+            old_count, old_polygons = self._colored.get(path, (None, None))
+            if old_count != count or not np.array_equal(old_polygons, polygons):
+                self._sample_colors(path, interval.start, count, polygons)
+                self._colored[path] = count, polygons
+        self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
+
+    def _sample_colors(self, path, time, count, lit):
+        self._unlit[path] = _unlit_colors(self._scene.stage, path, time)
+        text = _color_text(self._unlit[path], count, lit)
+        self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
+
+    def _open_instances(self, path):
+        """Note the instances that a prim is in: below these, only their prototype has colours."""
+        prim = self._scene.stage.GetPrimAtPath(path)
+        while prim.IsInstanceProxy():
+            prim = prim.GetParent()
+            if prim.IsInstance():
+                self._opened.add(str(prim.GetPath()))
+
+    def _write(self, outcome):
+        """Write the whole layer, of the intervals of an outcome."""
+        spool_end = self._ends[-1] if self._ends else 0
+        parts = {path: [] for path in sorted(self._opened)}
+        for (path, name), samples in self._samples.items():
+            kept = [sample for sample in samples if sample.place < spool_end]
+            if kept:
+                parts.setdefault(path, []).append((name, kept))
+        writer = _Writer(self._output)
+        writer.write(self._head(outcome))
+        end = outcome.intervals[-1].end if outcome.intervals else self._scene.times[0]
+        self._write_prims(writer, "", _tree(parts), parts, end)
+        writer.flush()
+
+    def _head(self, outcome) -> str:
+        """The layer's metadata."""
+        doc = f"Collisions found by warp-bsc replay. {outcome.motion}"
+        if self._uncolored:
+            doc += " Polygons of point instancers are not coloured: their instances are one prim."
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.path.parent.resolve())).as_posix()
+        asset = source if source.startswith("../") else f"./{source}"
+        complete = "true" if outcome.is_complete else "false"
+        stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
+        metadata = "\n    ".join(f"{name} = {value}" for name, value in self._metadata.items())
+        return f"""#usda 1.0
+(
+    customLayerData = {{
+        dictionary collisions = {{
+            bool complete = {complete}
+            int hits = {outcome.hits}
+            int intervals = {len(outcome.intervals)}{stopped}
+        }}
+    }}
+    doc = {_quote(doc)}
+    {metadata}
+    subLayers = [
+        @@@{asset}@@@
+    ]
+)
+"""
+
+    def _write_prims(self, writer, path, tree, parts, end):
+        """Write the prims below a path, from a tree of their names."""
+        indent = "    " * path.count("/")
+        for name, children in tree.items():
+            below = f"{path}/{name}"
+            kind = {self._root_path: "def Scope", self._contacts_path: "def Points"}.get(below, "over")
+            opened = " (\n" + indent + "    instanceable = false\n" + indent + ")" if below in self._opened else ""
+            writer.write(f'\n{indent}{kind} "{name}"{opened}\n{indent}{{\n')
+            if below == self._contacts_path:
+                writer.write(f"{indent}    float[] widths = [{self._width:.9g}] (\n")
+                writer.write(f'{indent}        interpolation = "constant"\n{indent}    )\n')
+            for attribute, samples in parts.get(below, ()):
+                self._write_attribute(writer, indent + "    ", below, attribute, samples, end)
+            self._write_prims(writer, below, children, parts, end)
+            writer.write(f"{indent}}}\n")
+
+    def _write_attribute(self, writer, indent, path, name, samples, end):
+        """Write an attribute's samples, and what it is once the last interval has ended."""
+        if path == self._contacts_path:
+            value_type, interpolation = _CONTACTS[name]
+            after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
+        else:
+            value_type, interpolation = "color3f[]", "uniform"
+            lit_count = samples[-1].lit_count
+            after = _color_text(self._unlit[path], lit_count, []) if lit_count else None
+            writer.write(f"{indent}int[] {name}:indices = None\n")  # the scene's own
+        writer.write(f"{indent}{value_type} {name}")
+        if interpolation:
+            writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
+        writer.write(".timeSamples = {\n")
+        following = [(sample.time, sample.length) for sample in samples[1:]]
+        following += [] if after is None else [(end, len(after))]
+        for sample, (time, length) in zip_longest(samples, following, fillvalue=(None, 0)):
+            self._write_sample(writer, indent, sample.time, sample)
+            # USD interpolates if both have values, and would see points on the way from one contact to another.
+            if sample.length and length and (before := _just_before(time)) > sample.time:
+                if interpolation == "vertex":
+                    writer.write(f"{indent}    {before!r}: [],\n")
+                else:
+                    self._write_sample(writer, indent, before, sample)
+        if after is not None:
+            writer.write(f"{indent}    {end!r}: [{after}],\n")
+        writer.write(f"{indent}}}\n")
+
+    def _write_sample(self, writer, indent, time, sample):
+        writer.write(f"{indent}    {time!r}: [")
+        self._spool.seek(sample.place)
+        for size in [_COPIED] * (sample.length // _COPIED) + [sample.length % _COPIED]:
+            writer.write_bytes(self._spool.read(size))
+        writer.write("],\n")
+
+
+class _Writer:
+    """Writes many short texts as a few long ones."""
+
+    def __init__(self, output):
+        self._output = output
+        self._waiting, self._length = [], 0
+
+    def write(self, text):
+        self.write_bytes(text.encode())
+
+    def write_bytes(self, data):
+        self._waiting.append(data)
+        self._length += len(data)
+        if self._length >= _COPIED:
+            self.flush()
+
+    def flush(self):
+        self._output.write(b"".join(self._waiting))
+        self._waiting, self._length = [], 0
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """A sample that waits in the spool: its time, place and length there; the number of polygons if some are lit."""
+
+    time: float
+    place: int
+    length: int
+    lit_count: int
+
+
+def _metadata(scene) -> dict[str, str]:
+    """The scene's metadata, which sublayers do not hand on: text by name."""
+    stage = scene.stage
+    default = stage.GetDefaultPrim()
+    start, end = scene.times[0], scene.times[-1]
+    if stage.HasAuthoredTimeCodeRange():
+        start, end = (float(stage.GetMetadata(name)) for name in ("startTimeCode", "endTimeCode"))
+    root = stage.GetRootLayer().defaultPrim if default else stage.GetPseudoRoot().GetChildren()[0].GetName()
+    return {
+        "defaultPrim": _quote(root),
+        "endTimeCode": repr(end),
+        "framesPerSecond": repr(stage.GetFramesPerSecond()),
+        "metersPerUnit": repr(scene.meters_per_unit),
+        "startTimeCode": repr(start),
+        "timeCodesPerSecond": repr(stage.GetTimeCodesPerSecond()),
+        "upAxis": f'"{scene.up_axis}"',
+    }
+
+
+def _just_before(time) -> float:
+    from pxr import Usd  # noqa: PLC0415 (slow)
+
+    return time - Usd.TimeCode.SafeStep(max(1e6, abs(time)))
+
+
+def _unlit_colors(stage, path, time) -> np.ndarray:
+    """The colours of a mesh's polygons in the scene, or fewer if they are all the same, shape [n, 3]."""
+    from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+    primvar = UsdGeom.Gprim(stage.GetPrimAtPath(path)).GetDisplayColorPrimvar()
+    values = primvar.ComputeFlattened(time) if primvar and primvar.HasValue() else None
+    if not values:
+        return np.array([_UNLIT])
+    colors = np.array(values, dtype=np.float64)
+    return colors if primvar.GetInterpolation() == UsdGeom.Tokens.uniform else colors.mean(axis=0, keepdims=True)
+
+
+def _color_text(colors, count, lit) -> str:
+    """The colours of a mesh's polygons, those lit being :data:`LIT`."""
+    if len(colors) != count:
+        colors = colors.mean(axis=0, keepdims=True)
+    table, numbers = np.unique(colors, axis=0, return_inverse=True)
+    texts = np.array([_tuples([color]) for color in [*table, LIT]], dtype=object)
+    numbers = np.broadcast_to(numbers.reshape(-1), count).copy()
+    numbers[lit] = len(table)
+    return ", ".join(texts[numbers])
+
+
+def _element_texts(contacts, rows, side) -> str:
+    """The first or the second elements of some contacts, with the names of their meshes."""
+    both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
+    return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
+
+
+def _tree(paths) -> dict:
+    """Names of prims by those of their parents."""
+    tree = {}
+    for path in paths:
+        place = tree
+        for name in path.strip("/").split("/"):
+            place = place.setdefault(name, {})
+    return tree
+
+
+def _tuples(rows) -> str:
+    return ", ".join(f"({x:.9g}, {y:.9g}, {z:.9g})" for x, y, z in np.asarray(rows, dtype=np.float32).tolist())
+
+
+def _quote(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    if escaped.isprintable():
+        return f'"{escaped}"'
+    return '"' + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else "?" for c in escaped) + '"'
+
+
+def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and the highest corner of what moves at first, or of all if nothing does yet."""
+    segment, x, _ = scene.interval(0)
+    meshes, _ = segment.locate_vertices(np.arange(segment.vertex_count))
+    moves = np.array([mesh.moves for mesh in segment.meshes], dtype=bool)[meshes]
+    x = x[moves] if moves.any() else x
+    return (x.min(axis=0), x.max(axis=0)) if len(x) else (np.zeros(3), np.ones(3))

@@ -1,0 +1,191 @@
+"""Asks the answers of a detection again: of the exact checker, about pairs that it finds by itself."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from .. import checker
+
+__all__ = ["Validation", "overlapping_boxes", "validate"]
+
+_CHUNK = 1 << 18  # pairs that are looked at together
+_NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What the exact checker says of the answers for one interval.
+
+    Attributes:
+        hits: How many reported collisions were asked again.
+        others: How many pairs were that were not reported and whose swept boxes overlap.
+        answers: How many answers the detector gave.
+        certified: How many of them floating point had certified.
+        disagreements: Those that the checker answers otherwise, a sentence each.
+        false_hits: How many reported pairs of method "conservative", which may do so, do not collide.
+    """
+
+    hits: int
+    others: int
+    answers: int
+    certified: int
+    disagreements: tuple[str, ...]
+    false_hits: int
+
+
+def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, counted=None) -> Validation:
+    """Ask the answers of a detection again.
+
+    Reported collisions must collide, and do so at the time that was reported. Pairs that were not reported, of all
+    whose swept boxes overlap, must not. These are found by a grid that has nothing in common with the detector.
+
+    Args:
+        detector: The :class:`~warp_bsc.detection.detector.CollisionDetector`.
+        collisions: What it found.
+        x0: Positions at the start, shape [vertex_count, 3].
+        x1: Positions at the end, shape [vertex_count, 3].
+        most: How many collisions and how many other pairs are asked, taken at random; None for all.
+        seed: Of the random choice.
+        counted: Which of the reported pairs are asked, vertex-face before edge-edge, booleans; default: all.
+    """
+    mesh = detector.mesh
+    random = np.random.default_rng(seed)
+    disagreements = []
+    asked_hits = asked_others = false_hits = 0
+    vertices, faces, edges = np.arange(mesh.vertex_count)[:, None], mesh.faces, mesh.edges
+    for kind, first, second in (("vertex_face", vertices, faces), ("edge_edge", edges, edges)):
+        found, toi = getattr(collisions, kind), getattr(collisions, f"{kind}_toi")
+
+        def motions(pairs, first=first, second=second):
+            corners = np.concatenate([first[pairs[:, 0]], second[pairs[:, 1]]], axis=1)
+            return np.concatenate([x0[corners], x1[corners]], axis=1)
+
+        rows = np.arange(len(found))
+        if counted is not None:
+            rows, counted = np.flatnonzero(counted[: len(found)]), counted[len(found) :]
+        if most is not None and len(rows) > most:
+            rows = np.sort(random.choice(rows, most, replace=False))
+        asked_hits += len(rows)
+        bounds = getattr(checker, f"{kind}_toi")(motions(found[rows]))
+        for row, (earliest, latest) in zip(rows, bounds, strict=True):
+            pair = f"{kind.replace('_', '-')} {found[row].tolist()}"
+            if np.isnan(earliest) and detector.method == "conservative":
+                false_hits += 1
+            elif np.isnan(earliest):
+                disagreements.append(f"{pair} was reported and does not collide")
+            elif toi[row] > latest:
+                disagreements.append(f"{pair} was reported at {toi[row]!r} and collides at {latest!r} already")
+            elif detector.method == "exact" and toi[row] < earliest - detector.tolerance:
+                disagreements.append(f"{pair} was reported at {toi[row]!r} and collides at {earliest!r} only")
+
+        others = _unreported(mesh, kind, first, second, found, x0, x1)
+        for pairs in others if most is None else [_choose(others, most, random)]:
+            asked_others += len(pairs)
+            collides = getattr(checker, kind)(motions(pairs))
+            name = kind.replace("_", "-")
+            disagreements += [f"{name} {pair} collides and was not reported" for pair in pairs[collides].tolist()]
+
+    counts = collisions.stats.vertex_face, collisions.stats.edge_edge
+    answers = sum(count.candidates for count in counts)
+    return Validation(
+        hits=asked_hits,
+        others=asked_others,
+        answers=answers,
+        certified=answers - sum(count.unsure for count in counts),
+        disagreements=tuple(disagreements),
+        false_hits=false_hits,
+    )
+
+
+def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray]:
+    """Pairs of elements that share no vertex, whose swept boxes overlap and that are not among those found."""
+    used = mesh.vertices if kind == "vertex_face" else np.arange(len(first))
+
+    def boxes(elements):
+        corners = np.concatenate([x0[elements], x1[elements]], axis=1).astype(np.float64)
+        return corners.min(axis=1), corners.max(axis=1)
+
+    reported = found.astype(np.int64) @ np.array([len(second), 1])
+    for rows, columns in overlapping_boxes(boxes(first[used]), boxes(second)):
+        pairs = np.stack([used[rows], columns], axis=1)
+        if kind == "edge_edge":
+            pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+        apart = (first[pairs[:, 0]][:, :, None] != second[pairs[:, 1]][:, None, :]).all(axis=(1, 2))
+        pairs = pairs[apart]
+        yield pairs[~np.isin(pairs @ np.array([len(second), 1]), reported)]
+
+
+def overlapping_boxes(first, second) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Find all pairs of boxes that overlap or touch, some at a time.
+
+    Boxes are sorted by size. Those of two sizes are put into a grid whose cells are as large as the larger ones, each
+    by its lowest corner: what overlaps is then in the same cell or in neighbours.
+
+    Args:
+        first: Lowest and highest corners of the boxes, two arrays of shape [n, 3].
+        second: The same of the others, of shape [m, 3].
+
+    Yields:
+        Indices of the first and of the second boxes, each shape [k].
+    """
+    both = np.concatenate([*first, *second])
+    if not len(first[0]) or not len(second[0]):
+        return
+    origin = both.min(axis=0)
+    smallest = max(np.ptp(both, axis=0).max() * 2.0**-20, np.finfo(np.float64).tiny)  # cells fit into 21 bits
+
+    def by_size(low, high):
+        sizes = np.ceil(np.log2(np.maximum((high - low).max(axis=1), smallest) / smallest)).astype(int)
+        return {int(size): np.flatnonzero(sizes == size) for size in np.unique(sizes)}
+
+    for size_a, a in by_size(*first).items():
+        for size_b, b in by_size(*second).items():
+            cell = smallest * 2.0 ** max(size_a, size_b) * (1.0 + 1e-6)  # cells are numbered with rounding
+            cells_a = np.floor((first[0][a] - origin) / cell).astype(np.int64)
+            cells_b = np.floor((second[0][b] - origin) / cell).astype(np.int64)
+            keys = _cell_keys(cells_b)
+            order = np.argsort(keys, kind="stable")
+            keys = keys[order]
+            for step in _NEIGHBOURS:
+                wanted = _cell_keys(cells_a + step)
+                begin, end = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
+                for rows, places in _expand(begin, end):
+                    i, j = a[rows], b[order[places]]
+                    for axis in range(3):
+                        overlap = first[0][i, axis] <= second[1][j, axis]
+                        overlap &= second[0][j, axis] <= first[1][i, axis]
+                        i, j = i[overlap], j[overlap]
+                    yield i, j
+
+
+def _cell_keys(cells):
+    return (cells + 1) @ np.array([1 << 42, 1 << 21, 1])
+
+
+def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Rows and the places from begin to end of each, about a chunk at a time."""
+    (rows,) = np.nonzero(end > begin)
+    counts = (end - begin)[rows]
+    totals = np.cumsum(counts)
+    at = 0
+    while at < len(rows):
+        before = totals[at - 1] if at else 0
+        stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
+        some = counts[at:stop]
+        starts = np.cumsum(some) - some
+        places = np.arange(some.sum()) - np.repeat(starts - begin[rows[at:stop]], some)
+        yield np.repeat(rows[at:stop], some), places
+        at = stop
+
+
+def _choose(chunks, most, random) -> np.ndarray:
+    """Some of all pairs, each as likely as any other."""
+    chosen, lots = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    for pairs in chunks:
+        chosen = np.concatenate([chosen, pairs])
+        lots = np.concatenate([lots, random.random(len(pairs))])
+        if len(chosen) > most:
+            keep = np.argpartition(lots, most)[:most]
+            chosen, lots = chosen[keep], lots[keep]
+    return chosen

@@ -1,0 +1,302 @@
+"""The collision mesh of a Newton model: cloth, the surfaces of soft bodies, and rigid shapes cut into triangles."""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+from newton import GeoType, Mesh, ParticleFlags, ShapeFlags
+
+from ..detection.mesh import CollisionMesh
+
+__all__ = ["ModelMesh", "Planes", "ShapeVertices"]
+
+_SEGMENTS = 32
+"""Triangles around a round shape; a multiple of four."""
+
+_BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
+"""For a ``newton.Mesh`` of which only the triangles are used."""
+
+
+class ShapeVertices(NamedTuple):
+    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
+
+    Attributes:
+        position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
+        body: Body that the vertex moves with, -1 for none, int32, shape [n].
+        shape: Shape that it belongs to, as in ``model.shape_material_mu``, int32, shape [n].
+    """
+
+    position: np.ndarray | wp.array
+    body: np.ndarray | wp.array
+    shape: np.ndarray | wp.array
+
+
+class Planes(NamedTuple):
+    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
+
+    Attributes:
+        point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
+        normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
+        body: Body that the plane moves with, -1 for none, int32, shape [n].
+        shape: Shape that it is, int32, shape [n].
+        world: World that it is in, -1 for all of them, int32, shape [n].
+    """
+
+    point: np.ndarray | wp.array
+    normal: np.ndarray | wp.array
+    body: np.ndarray | wp.array
+    shape: np.ndarray | wp.array
+    world: np.ndarray | wp.array
+
+
+class ModelMesh(CollisionMesh):
+    """The triangles of a Newton model that particles can collide with, as one mesh.
+
+    Its vertices are the particles of the model, then those of the tessellated shapes; its faces are the triangles of
+    the model, then the surface triangles of tetrahedra that are none of these, then those of the shapes. Round shapes
+    have their vertices on the surface, so that the mesh of a convex one lies within it. A shape that is in all worlds
+    has vertices in each. Infinite planes are no triangles and are listed apart.
+
+    All but the positions and inverse masses is what the model was when the mesh was made. The margins of shapes and the
+    radii of particles are no part of it.
+
+    Attributes:
+        model: The model.
+        shape_vertices: The vertices from ``model.particle_count`` on, NumPy arrays.
+        planes: The infinite planes, NumPy arrays.
+        inverse_masses: Inverse masses [1/kg] of all vertices, Warp array of float, shape [vertex_count].
+        device_world: World of each vertex, Warp array of int, shape [vertex_count].
+        device_shape_vertices: ``shape_vertices`` as Warp arrays.
+        device_planes: ``planes`` as Warp arrays.
+    """
+
+    def __init__(self, model):
+        """Tessellates the shapes and puts the mesh on the model's device.
+
+        Args:
+            model: The ``newton.Model``.
+
+        Raises:
+            NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
+                cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
+        """
+        particle_world = model.particle_world.numpy()
+        if model.world_count == 1:
+            particle_world = np.zeros_like(particle_world)
+        elif (particle_world < 0).any():
+            raise NotImplementedError(
+                f"particle {np.argmax(particle_world < 0)} is in all of {model.world_count} worlds; add it to one world"
+            )
+        shape_body, shape_world = model.shape_body.numpy(), model.shape_world.numpy()
+        shape_type, shape_scale = model.shape_type.numpy(), model.shape_scale.numpy()
+        transform = model.shape_transform.numpy().astype(np.float64)
+        collides = (model.shape_flags.numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
+        infinite = (shape_type == GeoType.PLANE) & (shape_scale[:, :2] <= 0.0).any(axis=1)
+
+        tessellations = {}
+        shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
+        vertex_count = model.particle_count
+        for shape in np.flatnonzero(collides & ~infinite):
+            key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
+            if key not in tessellations:
+                tessellations[key] = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
+            shape_positions, shape_faces = tessellations[key]
+            shape_positions = transform[shape, :3] + _rotate(transform[shape, 3:], shape_positions)
+            for world in range(model.world_count) if shape_world[shape] < 0 else [shape_world[shape]]:
+                shapes += [shape] * len(shape_positions)
+                worlds += [world] * len(shape_positions)
+                positions.append(shape_positions)
+                faces.append(vertex_count + shape_faces)
+                vertex_count += len(shape_positions)
+        world = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)])
+        worlds = world if model.world_count > 1 else None
+        super().__init__(np.concatenate(faces), vertex_count, world=worlds, device=model.device)
+
+        shapes = np.array(shapes, dtype=np.int32)
+        planes = np.flatnonzero(collides & infinite).astype(np.int32)
+        self.model = model
+        self.shape_vertices = ShapeVertices(np.concatenate(positions).astype(np.float32), shape_body[shapes], shapes)
+        self.planes = Planes(
+            transform[planes, :3].astype(np.float32),
+            _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0])).astype(np.float32),
+            shape_body[planes],
+            planes,
+            shape_world[planes],
+        )
+        self.device_world = self._on_device(world)
+        self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
+        self.device_planes = Planes(*map(self._on_device, self.planes))
+        self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
+        self.refresh_inverse_masses()
+
+    def _on_device(self, values):
+        """A Warp array of ints, or of vectors where the values are two-dimensional."""
+        return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
+
+    def positions(self, particle_q, body_q, out):
+        """Writes the positions of all vertices, those of particles bit for bit. Can be captured in a CUDA graph.
+
+        Args:
+            particle_q: Positions of the particles [m], Warp array of vec3, shape [particle_count], or None if the model
+                has none.
+            body_q: Transforms of the bodies, Warp array of transform, shape [body_count], or None if the model has
+                none.
+            out: Where to write the positions [m], Warp array of vec3, shape [vertex_count].
+
+        Raises:
+            ValueError: If an array has another length.
+        """
+        for name, array, count in (
+            ("particle_q", particle_q, self.model.particle_count),
+            ("body_q", body_q, self.model.body_count),
+            ("out", out, self.vertex_count),
+        ):
+            length = 0 if array is None else len(array)
+            if length != count:
+                raise ValueError(f"{name} must have length {count}, not {length}")
+        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
+
+    def refresh_inverse_masses(self):
+        """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
+
+        What the response cannot move has inverse mass 0: particles of none, inactive particles, and shapes.
+        """
+        model = self.model
+        inputs, outputs = [model.particle_inv_mass, model.particle_flags], [self.inverse_masses]
+        wp.launch(_write_inverse_masses, model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_positions(
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    shape_vertex_position: wp.array[wp.vec3],
+    shape_vertex_body: wp.array[int],
+    positions: wp.array[wp.vec3],
+):
+    vertex = wp.tid()
+    i = vertex - particle_q.shape[0]
+    if i < 0:
+        positions[vertex] = particle_q[vertex]
+    elif shape_vertex_body[i] < 0:
+        positions[vertex] = shape_vertex_position[i]
+    else:
+        positions[vertex] = wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_inverse_masses(
+    particle_inv_mass: wp.array[float], particle_flags: wp.array[int], inverse_masses: wp.array[float]
+):
+    particle = wp.tid()
+    inverse_mass = float(0.0)
+    if particle_flags[particle] & ParticleFlags.ACTIVE:
+        inverse_mass = particle_inv_mass[particle]
+    inverse_masses[particle] = inverse_mass
+
+
+def _soft_faces(model):
+    """The triangles of the model, then the surface triangles of its tetrahedra that are none of them, shape [n, 3]."""
+    triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
+    if model.tet_indices is None:
+        return triangles
+    sides = model.tet_indices.numpy()[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    # an inner side belongs to two tetrahedra; with the triangles counted twice, what occurs once is what is missing
+    corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
+    _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
+    return np.concatenate([triangles, sides[first[count == 1]]])
+
+
+def _tessellate(model, shape, shape_type, scale):
+    """Cuts the surface of a shape into triangles, without two vertices in one place.
+
+    Args:
+        model: The ``newton.Model``.
+        shape: Index of the shape.
+        shape_type: Its type.
+        scale: Its scale, of which each type has its own idea.
+
+    Returns:
+        Positions [m] in the frame of the shape, float64, shape [n, 3], and faces, shape [m, 3].
+
+    Raises:
+        NotImplementedError: If there are no triangles for the type.
+    """
+    x, y, z = scale.astype(np.float64)
+    match shape_type:
+        case GeoType.MESH | GeoType.CONVEX_MESH:
+            positions, faces = _weld(model.shape_source[shape])
+            return positions * (x, y, z), faces
+        case GeoType.PLANE:
+            return _weld(Mesh.create_plane(x, y, **_BARE))
+        case GeoType.BOX:
+            return _weld(Mesh.create_box(x, y, z, **_BARE))
+        case GeoType.SPHERE:
+            return _revolve(_capsule_profile(x, 0.0))
+        case GeoType.ELLIPSOID:
+            positions, faces = _revolve(_capsule_profile(1.0, 0.0))
+            return positions * (x, y, z), faces
+        case GeoType.CAPSULE:
+            return _revolve(_capsule_profile(x, y))
+        case GeoType.CYLINDER:
+            height = np.linspace(-y, y, _SEGMENTS // 2 + 1 if z > 0.0 else 2)
+            # the side of a barrel is an arc of radius z
+            bulge = np.sqrt(z * z - height * height) - np.sqrt(z * z - y * y) if z > 0.0 else np.zeros(2)
+            return _revolve(np.concatenate([[[0.0, -y]], np.stack([x + bulge, height], axis=1), [[0.0, y]]]))
+        case GeoType.CONE:
+            return _revolve(np.array([[0.0, -y], [x, -y], [0.0, y]]))
+    raise NotImplementedError(
+        f"shape {shape} ({model.shape_label[shape]!r}) of type {shape_type.name} collides with particles, but has no "
+        "triangles to collide with: use a mesh, or clear its flag COLLIDE_PARTICLES"
+    )
+
+
+def _weld(mesh):
+    """The triangles of a ``newton.Mesh``, with one vertex where it has several in one place.
+
+    Seams of texture or normals have those, and the triangles on both sides would collide with each other forever.
+
+    Returns:
+        Positions [m], float64, shape [n, 3], and faces, shape [m, 3].
+    """
+    positions, vertex = np.unique(mesh.vertices.astype(np.float64), axis=0, return_inverse=True)
+    return positions, vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
+
+
+def _capsule_profile(radius, half_height):
+    """Radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
+    angle = np.linspace(0.0, np.pi / 2.0, _SEGMENTS // 4 + 1)
+    lower = np.stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)], axis=1)
+    upper = lower[::-1] * (1.0, -1.0)
+    return np.concatenate([lower, upper if half_height > 0.0 else upper[1:]])
+
+
+def _revolve(profile):
+    """Turns a profile around the z axis.
+
+    Args:
+        profile: Radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
+
+    Returns:
+        Positions [m], float64, shape [2 + (n - 2) * _SEGMENTS, 3], and faces, counter-clockwise from outside, shape
+        [2 * (n - 2) * _SEGMENTS, 3].
+    """
+    angle = 2.0 * np.pi / _SEGMENTS * np.arange(_SEGMENTS)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(_SEGMENTS)], axis=1)
+    rings = circle * profile[1:-1, None][:, :, [0, 0, 1]]
+    poles = np.array([[[0.0, 0.0, height]] for height in profile[[0, -1], 1]])
+    positions = np.concatenate([poles[0], rings.reshape(-1, 3), poles[1]])
+    # a row of vertices for each point of the profile, those of the poles all one
+    vertex = np.arange(len(profile) * _SEGMENTS).reshape(-1, _SEGMENTS) - _SEGMENTS + 1
+    vertex = np.clip(vertex, 0, len(positions) - 1)
+    a, d = vertex[:-1], vertex[1:]
+    b, c = np.roll(a, -1, axis=1), np.roll(d, -1, axis=1)
+    return positions, np.concatenate([np.stack([a, b, c], axis=2)[1:], np.stack([a, c, d], axis=2)[:-1]]).reshape(-1, 3)
+
+
+def _rotate(quaternion, vectors):
+    """Vectors rotated by unit quaternions (x, y, z, w), shape [..., 3]."""
+    axis = quaternion[..., :3]
+    twist = 2.0 * np.cross(axis, vectors)
+    return vectors + quaternion[..., 3:] * twist + np.cross(axis, twist)

@@ -1,0 +1,1 @@
+"""From a USD file to moving meshes. OpenUSD is imported here, Warp is not."""

@@ -1,0 +1,425 @@
+"""Finds the meshes of a USD stage and reads one at a time. Imports pxr: to be imported where it is used."""
+
+import hashlib
+import math
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel, Vt
+
+from .instancers import (
+    Instance,
+    find_instances,
+    is_shown,
+    transform_attributes,
+    transform_times,
+    visibility_times,
+)
+from .skinning import Skin, find_bindings
+from .stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
+from .triangulation import triangulate
+
+__all__ = ["UsdMesh", "find_meshes"]
+
+_BETWEEN = 0.382  # where between two samples a transform is looked at: not where a turn by half a circle begins anew
+_MOST_TIMES = 1_000_000
+_ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
+
+
+def find_meshes(stage, file, selection, left_out: LeftOut) -> tuple[list["UsdMesh"], list[str]]:
+    """The meshes of a stage that are selected and visible at some time, and a sentence on each kind of thing left out.
+
+    Args:
+        stage: The stage.
+        file: Its file, for messages.
+        selection: What is checked.
+        left_out: Meshes and instances that are broken are left out.
+
+    Raises:
+        UnreadableError: If a mesh or a point instancer is broken and may not be left out.
+        ValueError: If a pattern of the selection matches nothing.
+    """
+    finder = _Finder(file, left_out)
+    finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())), None)
+    selection.check_patterns(finder.places)
+
+    meshes, invisible, passed_over, warnings = [], [], Counter(), finder.warnings
+    for place in finder.places:
+        if not selection.includes(place):
+            continue
+        try:
+            with reading(f"{file}: {place.name}"):
+                if place.purpose not in selection.purposes:
+                    passed_over[place.purpose] += 1
+                    continue
+                mesh = UsdMesh(place, file)
+        except UnreadableError as error:
+            left_out.add(error)
+            continue
+        if any(mesh.states.values()):
+            meshes.append(mesh)
+        else:
+            invisible.append(mesh.name)
+        if place.is_bound_in_vain:
+            warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
+    if invisible:
+        warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")
+    for purpose, count in sorted(passed_over.items()):
+        warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
+    if finder.other:
+        shapes = ", ".join(f"{count} {name}" for name, count in sorted(finder.other.items()))
+        warnings.append(f"shapes that are not meshes are not checked: {shapes}")
+    return meshes, warnings
+
+
+class _Place:
+    """A mesh prim, or one instance of it, that has not been read.
+
+    Attributes:
+        prim: The prim.
+        path: Its path.
+        name: The same, with the number of the instance if a point instancer places it.
+        instance: That instance, else None.
+        binding: What it is bound to, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
+    """
+
+    def __init__(self, prim, instance: Instance | None, binding: tuple | None):
+        self.prim = prim
+        self.path = str(prim.GetPath())
+        self.name = instance.name_of(prim.GetPath()) if instance else self.path
+        self.instance = instance
+        self.binding = binding
+
+    @property
+    def purpose(self) -> str:
+        return str(UsdGeom.Mesh(self.prim).ComputePurpose())
+
+    @property
+    def is_bound_in_vain(self) -> bool:
+        return self.binding is None and bool(UsdSkel.BindingAPI(self.prim).GetInheritedSkeleton())
+
+
+class _Finder:
+    """Walks a stage, and into the prototypes of point instancers once for each instance."""
+
+    def __init__(self, file, left_out):
+        self._file = file
+        self._left_out = left_out
+        self._bindings = {}
+        self.places = []
+        self.other = Counter()
+        self.warnings = []
+
+    def walk(self, prims, instance):
+        for prim in prims:
+            if prim.IsA(UsdGeom.PointInstancer):
+                # Meshes below are its prototypes: they are not where they stand in the hierarchy.
+                prims.PruneChildren()
+                for inner in find_instances(prim, instance, self._file, self._left_out):
+                    self.walk(inner.prims(), inner)
+            elif prim.IsA(UsdSkel.Root):
+                if not self._find_bindings(prim):
+                    prims.PruneChildren()
+            elif prim.IsA(UsdGeom.Mesh):
+                self.places.append(_Place(prim, instance, self._bindings.get(prim.GetPath())))
+            elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
+                self.other[prim.GetTypeName()] += 1
+
+    def _find_bindings(self, root) -> bool:
+        """Whether what is below a ``SkelRoot`` can be read."""
+        path = root.GetPath()
+        if path not in self._bindings:
+            self._bindings[path] = None
+            try:
+                with reading(f"{self._file}: {path}"):
+                    self._bindings.update(find_bindings(root))
+            except UnreadableError as error:
+                self._left_out.add(error)
+                self._bindings[path] = error
+        return self._bindings[path] is None
+
+
+class UsdMesh:
+    """A mesh prim, or one instance of it.
+
+    Attributes:
+        path: The prim's path.
+        name: The same, with the number of the instance if a point instancer places it.
+        display_name: What the file says to show instead, empty if nothing.
+        times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
+        states: What it is at first, at minus infinity, and from each time on at which that changes: None where it is
+            invisible, not there or empty, else bytes that are others for another topology.
+        turns: Whether a transform or a skeleton moves it, which is not linear between the samples.
+        deforms: Whether anything but its transform moves it.
+        may_jump: Whether it may be elsewhere before a time than at that time.
+        is_placed: Whether its points are in world space as they are: its transform is the identity at all times.
+    """
+
+    def __init__(self, place: _Place, file):
+        """Finds when a mesh changes and moves.
+
+        Args:
+            place: The prim, or the instance.
+            file: Its file, for messages.
+
+        Raises:
+            UnreadableError: If what is found is not what a mesh has.
+        """
+        prim, instance = place.prim, place.instance
+        self.path, self.name = place.path, place.name
+        self.display_name = prim.GetDisplayName()
+        self._where = f"{file}: {self.name}"
+        self._mesh = mesh = UsdGeom.Mesh(prim)
+        self._instance = instance
+        self._skin = skin = Skin(*place.binding, f"{file}: {self.path}") if place.binding else None
+        self._root = instance.root if instance else None
+        # Joints move points to the space of their skeleton.
+        self._frame = skin.skeleton if skin and skin.skeleton else prim
+        self._own_times = {}  # the first and the last of its own times that the scene takes for one, by that
+
+        breaks = visibility_times(prim, self._root) | sample_times(
+            mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
+        )
+        self.states = self._find_states(breaks | (instance.break_times if instance else set()))
+        self.times = sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set())
+        self.deforms = bool(self.times)
+        self.turns = bool(skin and skin.times)
+        self.may_jump = any(attribute.HasSpline() for attribute in transform_attributes(self._frame, self._root))
+
+        placed = sorted(transform_times(self._frame, self._root) | (instance.times if instance else set()))
+        # Between samples as well: a whole turn may end where it began.
+        between = [start + _BETWEEN * (end - start) for start, end in pairwise(placed)]
+        codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*placed, *between]))]
+        # None where an instance is not there.
+        transforms = (transform for code in codes if (transform := self._find_transform(code)) is not None)
+        first = next(transforms, np.eye(4))
+        self.is_placed = np.array_equal(first, np.eye(4))
+        # Some writers sample a transform at every time that never changes.
+        self._placed_times = []
+        if any(not np.array_equal(transform, first) for transform in transforms):
+            self._placed_times = placed
+            self.times.update(placed)
+            self.turns = True
+            self.is_placed = False
+
+    def turning_times(self, start: float, end: float) -> set[float]:
+        """Whole time codes between its samples at which it is not on the straight way from one to the next.
+
+        Args:
+            start: Only after this time.
+            end: Only before this time.
+
+        Raises:
+            ValueError: If there are more than a million.
+        """
+        gaps = [(*gap, True) for gap in pairwise(sorted(self._skin.times))] if self._skin else []
+        gaps += [(*gap, False) for gap in pairwise(self._placed_times)]
+        times = set()
+        for first, last, bends in gaps:
+            low, high = math.floor(max(first, start)) + 1, math.ceil(min(last, end)) - 1
+            if high - low >= _MOST_TIMES - len(times):
+                raise ValueError(
+                    f"{self._where}: turns from time {first:g} to {last:g}, which is to be looked at every whole time "
+                    "code; --frames START:END:STEP looks at fewer"
+                )
+            if low <= high and (bends or self._bends(first, last)):
+                times.update(map(float, range(low, high + 1)))
+        return times
+
+    def take_times(self, scene_times: dict[float, float]) -> None:
+        """Take times that are almost one for that one, which is read as the first of them before, and the last after.
+
+        Args:
+            scene_times: The scene's time for each one that it was found to have.
+        """
+        for time in sorted({*self.times, *self.states} - {-math.inf}):
+            first, _ = self._own_times.get(scene_times[time], (time, time))
+            self._own_times[scene_times[time]] = first, time
+        self.times = {scene_times[time] for time in self.times}
+        self.states = {scene_times.get(time, time): state for time, state in self.states.items()}
+        self.may_jump |= any(first != last for first, last in self._own_times.values())
+
+    def leave_out(self, since: float) -> None:
+        """Take the mesh for gone from a time on, minus infinity for always."""
+        self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
+
+    def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
+        """The points as they are stored, or as a skeleton moves them, shape [point_count, 3].
+
+        Args:
+            time: Time code.
+            before: Whether the moment before it is meant, where something jumps at that time.
+
+        Raises:
+            UnreadableError: If there are none.
+        """
+        with reading(self._where, self, time):
+            code = self._time_code(time, before)
+            attribute = self._mesh.GetPointsAttr()
+            # Elsewhere another number of points is an error, which the moment before would hide.
+            points = attribute.Get(Usd.TimeCode(code.GetValue()) if before and time not in self.states else code)
+            if _is_empty(points):
+                raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
+            if self._skin:
+                self._skin.deform(points, code)
+            array = np.array(points)
+            if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
+                raise UnreadableError(f"{self._where}: its points are no points, but {type(points).__name__}")
+            return array
+
+    def read_positions(
+        self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
+    ) -> np.ndarray:
+        """Positions in world space of some of the points.
+
+        Args:
+            time: Time code.
+            before: Whether the moment before it is meant, where something jumps at that time.
+            used: The points, shape [count].
+            point_count: How many points the mesh must have in all.
+            dtype: float32 only if :attr:`is_placed`, else float64.
+
+        Returns:
+            Positions, shape [count, 3].
+
+        Raises:
+            UnreadableError: If the number of points is another, or a position is not finite.
+        """
+        points = self.read_points(time, before=before)
+        with reading(self._where, self, time):
+            if len(points) != point_count:
+                raise UnreadableError(
+                    f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
+                )
+            positions = points[used].astype(dtype)
+            if not self.is_placed:
+                transform = self._transform(time, before=before)
+                positions = positions @ transform[:3, :3] + transform[3, :3]
+            finite = np.isfinite(positions).all(axis=1)
+            if not finite.all():
+                first = int(np.argmin(finite))
+                raise UnreadableError(
+                    f"{self._where}: vertex {used[first]} is not finite at time {time:g}: {positions[first].tolist()}"
+                )
+            return positions
+
+    def read_triangles(self, time: float, points) -> tuple[np.ndarray, np.ndarray, int]:
+        """The polygons that are no holes, as triangles that turn to the left seen from outside.
+
+        Args:
+            time: Time code.
+            points: The points at the time that says which polygons are concave, shape [point_count, 3].
+
+        Returns:
+            The triangles' points, shape [triangle_count, 3], the polygon that each is a part of, shape
+            [triangle_count], and the number of polygons, holes included.
+
+        Raises:
+            UnreadableError: If the faces are broken, or none.
+        """
+        with reading(self._where, self, time):
+            counts, indices, holes = self._read_topology(self._time_code(time, False))
+            if counts.size == 0:
+                raise UnreadableError(f"{self._where}: the mesh has no faces")
+            if counts.min() < 3:
+                face = int(np.argmin(counts))
+                raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
+            if counts.sum() != indices.size:
+                raise UnreadableError(
+                    f"{self._where}: faceVertexCounts add up to {counts.sum()}, "
+                    f"but there are {indices.size} faceVertexIndices"
+                )
+            outside = (indices < 0) | (indices >= len(points))
+            if outside.any():
+                corner = int(np.argmax(outside))
+                face = int(np.searchsorted(np.cumsum(counts), corner, side="right"))
+                raise UnreadableError(
+                    f"{self._where}: face {face} refers to vertex {indices[corner]}, "
+                    f"but the mesh has {len(points)} points"
+                )
+
+            triangles, polygons = triangulate(counts, indices, points)
+            solid = ~np.isin(polygons, holes)
+            if not solid.any():
+                raise UnreadableError(f"{self._where}: all faces of the mesh are holes")
+            is_left_handed = self._mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+            is_mirrored = np.linalg.det(self._transform(time)[:3, :3]) < 0
+            if is_left_handed != is_mirrored:
+                triangles = triangles[:, ::-1]
+            return triangles[solid], polygons[solid], len(counts)
+
+    def _time_code(self, time, before) -> Usd.TimeCode:
+        """A time of the scene, or the moment before it, as the mesh has it."""
+        first, last = self._own_times.get(time, (time, time))
+        return as_time_code(first if before else last, before=before)
+
+    def _transform(self, time, *, before=False) -> np.ndarray:
+        """The matrix that takes points, as rows, to world space, shape [4, 4]."""
+        transform = self._find_transform(self._time_code(time, before))
+        if transform is None:
+            raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
+        return transform
+
+    def _bends(self, start, end) -> bool:
+        """Whether the transform goes from one sample to the next in another way than straight."""
+        codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
+        first, between, last = map(self._find_transform, codes)
+        if first is None or between is None or last is None:
+            return False
+        straight = first + _BETWEEN * (last - first)
+        return any(
+            np.abs(between[rows] - straight[rows]).max() > _ROUNDING * np.abs([first[rows], last[rows]]).max()
+            for rows in (slice(0, 3), slice(3, 4))
+        )
+
+    def _find_transform(self, time) -> np.ndarray | None:
+        if not self._instance:
+            return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
+        transform = self._instance.transform(self._frame, time)
+        return None if transform is None else np.array(transform)
+
+    def _read_topology(self, time) -> list[np.ndarray]:
+        """Counts, indices and holes at a time."""
+        mesh = self._mesh
+        attributes = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
+        return [self._read_integers(attribute, time) for attribute in attributes]
+
+    def _read_integers(self, attribute, time) -> np.ndarray:
+        value = attribute.Get(time)
+        array = np.array(Vt.IntArray() if value is None else value)
+        if array.ndim != 1 or array.dtype.kind not in "iu":
+            raise UnreadableError(f"{self._where}: {attribute.GetName()} is no list of integers")
+        return array.astype(np.int64)
+
+    def _find_states(self, times) -> dict[float, bytes | None]:
+        states, last = {}, b""
+        for time in [-math.inf, *sorted(times)]:
+            code = Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time)
+            state = self._topology_digest(code) if self._is_present(code) else None
+            if state != last:
+                states[time] = last = state
+        return states
+
+    def _is_present(self, time) -> bool:
+        """Whether the mesh is there, visible and not empty."""
+        if not is_shown(self._mesh.GetPrim(), self._root, time):
+            return False
+        if self._instance and not self._instance.is_present(time):
+            return False
+        # As where a fluid has not begun to flow.
+        values = [
+            attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())
+        ]
+        return not all(value is not None and _is_empty(value) for value in values)
+
+    def _topology_digest(self, time) -> bytes:
+        digest = hashlib.blake2b()
+        for values in self._read_topology(time):
+            digest.update(len(values).to_bytes(8, "little") + values.tobytes())
+        return digest.digest()
+
+
+def _is_empty(value) -> bool:
+    """Whether there is nothing in a value that should be a list."""
+    return value is None or (hasattr(value, "__len__") and len(value) == 0)

@@ -1,0 +1,360 @@
+"""The meshes of a USD scene as motions between time samples: fixed faces, and positions in world space.
+
+What is read
+------------
+Every ``UsdGeom.Mesh`` that is loaded and selected, wherever references, payloads, variants, native instances and point
+instancers put it, merged to one list of vertices and one of faces: collisions of a mesh with itself and with others
+are then found alike. A mesh with a subdivision scheme is read as its control cage. Polygons become triangles and stay
+cut that way; holes and points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel
+has it.
+
+Vertices that are in one place at every time are welded to one. Such are the two sides of a seam, or of a cloth that was
+written as one mesh for each of its colours: they belong together, and not welded would touch for ever.
+
+What moves
+----------
+The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
+meshes together; at a time that is not a mesh's own sample, USD interpolates. What is not straight from one sample to
+the next, as what a transform turns or a skeleton moves, is sampled at every whole time code between as well, and a
+spline as finely as :func:`~warp_bsc.usd.stage.sample_times` says. From one time to the next each vertex is taken to
+move straight, from where USD has it at the first to where USD has it when the second comes: what jumps there, from one
+value clip to the next or because it was held, ends where it was before.
+
+Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, are
+one: files have them by rounding, and OpenUSD to tell the end of a value clip from the start of the next.
+
+Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
+begins.
+
+Precision
+---------
+USD stores points in single precision, transforms in double. Where every transform is the identity, positions are those
+stored, in single precision; otherwise all are computed and returned in double precision.
+
+What cannot be read
+-------------------
+Meshes and instances that are broken and what cannot be opened is left out, from the time on at which it is broken, and
+named in :attr:`Scene.left_out`; the rest is read, if anything is left that moves.
+
+What the file has but this module does not read (spheres and other shapes that are not meshes, what is not selected) is
+named in :attr:`Scene.warnings`, and so is what becomes of the motion.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from .files import SceneFiles
+from .segment import Segment
+from .selection import Selection
+
+__all__ = ["FrameRange", "Scene"]
+
+_JUMP = 1e-4  # more than this share of the way that a mesh goes in an interval; times that were merged make less
+_NAMED = 5  # of what is left out, in the warnings
+_ROUNDING = 1e-12
+_SAME_TIME = 1e-6
+
+# Mapped into memory, every page of a crate file that has been read counts as memory of this process, which would then
+# seem to grow with each frame. USD looks at this when it is loaded, and would else say so on standard error.
+if "USDC_USE_ASSET" not in os.environ:
+    os.environ["USDC_USE_ASSET"] = "1"
+    os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """A part of a scene's time.
+
+    Attributes:
+        start: First time code, None for that of the scene.
+        end: Last time code, None for that of the scene.
+        step: Time codes from one time to the next, None for the samples that the scene has.
+    """
+
+    start: float | None = None
+    end: float | None = None
+    step: float | None = None
+
+    def bounds(self, samples: list[float]) -> tuple[float, float]:
+        """The first and the last time, of all times of the scene, ascending."""
+        return (
+            samples[0] if self.start is None else max(self.start, samples[0]),
+            samples[-1] if self.end is None else min(self.end, samples[-1]),
+        )
+
+    def times(self, samples: list[float], changes: set[float]) -> list[float]:
+        """The times to look at.
+
+        Args:
+            samples: All times of the scene, ascending.
+            changes: Those at which meshes change their topology, appear or vanish, which are not stepped over.
+
+        Raises:
+            ValueError: If there are not two of them.
+        """
+        start = samples[0] if self.start is None else self.start
+        end = samples[-1] if self.end is None else self.end
+        low, high = self.bounds(samples)
+        if self.step is None:
+            times = {low, high, *samples}
+        else:
+            first, last = math.ceil((low - start) / self.step), math.floor((high - start) / self.step + 1e-9)
+            times = {*(min(start + number * self.step, high) for number in range(first, last + 1)), *changes}
+        times = sorted(time for time in times if low <= time <= high)
+        if len(times) < 2:
+            raise ValueError(
+                f"--frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
+                f"{samples[-1]:g}"
+            )
+        return times
+
+
+class Scene:
+    """The meshes of a USD file. Holds one segment of its motion and reads others when asked for.
+
+    Attributes:
+        path: The file.
+        selection: Which of its meshes are checked.
+        stage: The open ``Usd.Stage``.
+        files: The files that it is read from.
+        times: Time codes between which motion is straight, ascending, at least two.
+        time_codes_per_second: How many time codes make a second.
+        meters_per_unit: How many metres make the scene's unit of length.
+        up_axis: "Y" or "Z".
+        dtype: Of the positions, float32 or float64.
+        names: Of all meshes that are checked at some time.
+        display_names: What the file says to show instead, by name, empty if nothing.
+        comments: What the file says of itself, pairs of a title and a text.
+        vertex_count: Number of vertices of the first segment, welded.
+        face_count: Number of triangles of the first segment.
+        turning: How many of them transforms or skeletons move, which is not straight between samples.
+    """
+
+    def __init__(
+        self,
+        path,
+        *,
+        selection: Selection | None = None,
+        frames: FrameRange | None = None,
+        subdivide: int = 1,
+        sample_turns: bool = True,
+        strict: bool = False,
+    ):
+        """Opens the file and finds its meshes.
+
+        Args:
+            path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
+            selection: Which of its meshes are checked; default: those to be rendered.
+            frames: The part of its time; default: all.
+            subdivide: Into how many intervals each one between times is divided.
+            sample_turns: Whether what turns is sampled at every whole time code too, if ``frames`` has no step.
+            strict: Whether nothing may be left out.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is not USD, has no mesh that can be read or none that moves, or a selection selects
+                nothing; if ``strict``, also if something cannot be read. The message names the file, the prim and the
+                time.
+        """
+        from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+        from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
+        from . import stage as usd_stage  # noqa: PLC0415
+
+        self.path = str(path)
+        self.selection = selection or Selection()
+        self._unreadable = usd_stage.UnreadableError
+        self._left_out = usd_stage.LeftOut(path, strict)
+        self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
+        self.files = SceneFiles(self.stage)
+        self._messages = []  # OpenUSD's
+        self._collecting = usd_stage.collecting
+        with self._collecting(self._messages, path):
+            self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
+            # As old exporters have it, a number in single precision, which UsdGeom.GetStageMetersPerUnit does not take.
+            self.meters_per_unit = float(self.stage.GetMetadata("metersPerUnit"))
+            self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
+            texts = {"Comment": "comment", "Documentation": "documentation"}
+            self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
+            self._usd_meshes, self._warnings = usd_meshes.find_meshes(self.stage, path, self.selection, self._left_out)
+            self._check_meshes(bool(selection))
+            self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
+            changes = self._find_times(frames or FrameRange(), subdivide, sample_turns)
+            self._note_changes()
+            inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
+            self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
+            self._segment, self._span = None, None
+            self._last = None  # the last interval that was read
+            self._jump_times = {}  # by the mesh's name
+            self._welded = 0
+            segment = self._segment_at(0)
+        self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
+        read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
+        self.names = [mesh.name for mesh in read]
+        self.display_names = {mesh.name: mesh.display_name for mesh in read}
+        self.turning = sum(mesh.turns for mesh in read)
+
+    @property
+    def left_out(self) -> list[str]:
+        """What could not be read and was left out, and why, a sentence each; so far, as it is read when asked for."""
+        return self._left_out.reasons
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is passed over or changed, a sentence each; of what jumps, what has been read so far."""
+        warnings = [f"left out: {reason}" for reason in self.left_out[:_NAMED]]
+        if len(self.left_out) > _NAMED:
+            warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
+        warnings += [f"OpenUSD says: {message}" for message in self._messages[:_NAMED]]
+        warnings += self._warnings
+        for name, times in self._jump_times.items():
+            warnings.append(f"{name} jumps {_times_in_words(sorted(times))}: what it jumps through is not checked")
+        if self._welded:
+            warnings.append(f"vertices in one place at all times were welded: {self._welded}")
+        return warnings
+
+    def interval(self, index: int) -> tuple[Segment, np.ndarray, np.ndarray]:
+        """The motion from one time to the next.
+
+        Args:
+            index: Of the time in :attr:`times`.
+
+        Returns:
+            The meshes that are there, and the positions of their vertices at the start and at the end, in the scene's
+            unit of length, shape [vertex_count, 3].
+
+        Raises:
+            ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
+        """
+        start, end = self.times[index : index + 2]
+        with self._collecting(self._messages, self.path):
+            while True:
+                segment = self._segment_at(index)
+                try:
+                    interval = segment, segment.positions(start), segment.positions(end, before=True)
+                    break
+                except self._unreadable as error:
+                    self._leave_out(error, index)
+        self._note_jumps(index, *interval)
+        return interval
+
+    def _check_meshes(self, is_selection):
+        """Sees to it that there are meshes, and that some move."""
+        reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
+        if not self._usd_meshes:
+            none_selected = ", or none is selected" * is_selection
+            raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
+        if not any(mesh.times for mesh in self._usd_meshes):
+            raise ValueError(
+                f"{self.path}: nothing moves: no mesh has points or a transform that change with time{reason}"
+            )
+
+    def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
+        """Finds the times to look at. Returns those at which meshes change their topology, appear or vanish."""
+        own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
+        whole = set()
+        if sample_turns and frames.step is None:
+            low, high = frames.bounds(sorted(own))
+            whole = whole.union(*(mesh.turning_times(low, high) for mesh in self._usd_meshes))
+        scene_times = _merge(own | whole)
+        for mesh in self._usd_meshes:
+            mesh.take_times(scene_times)
+        changes = {time for mesh in self._usd_meshes for time in mesh.states if time != -math.inf}
+        samples = sorted(set(scene_times.values()))
+        self.times = frames.times(samples, changes)
+        if skipped := sum(self.times[0] < time < self.times[-1] for time in set(samples) - set(self.times)):
+            self._warnings.append(f"--frames steps over {skipped} time samples: motion is straight from step to step")
+        if subdivide > 1:
+            self.times = [
+                start + (end - start) * part / subdivide
+                for start, end in pairwise(self.times)
+                for part in range(subdivide)
+            ] + self.times[-1:]
+        return changes
+
+    def _segment_at(self, index) -> Segment:
+        """The segment of an interval: the last one, if it is of that."""
+        while self._span is None or not self._span[0] <= index < self._span[1]:
+            span = next(span for span in self._spans if span[0] <= index < span[1])
+            start, stop = span
+            present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
+            self._segment = self._span = self._last = None  # before the next is read, for the sake of memory
+            try:
+                self._segment = Segment(present, self.times[start : stop + 1], self.dtype)
+            except self._unreadable as error:
+                self._leave_out(error, start)
+            else:
+                self._span = span
+                self._welded = max(self._welded, self._segment.welded)
+        return self._segment
+
+    def _leave_out(self, error, index):
+        """Leaves out a mesh from the interval on that could not be read, at the earliest an interval given."""
+        ends_at = self.times.index(error.time)
+        since = max(index, ends_at - 1)
+        self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
+        error.mesh.leave_out(self.times[since] if since else -math.inf)
+        if not any(mesh.times and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
+            raise error
+        first, last = next(span for span in self._spans if span[0] <= since < span[1])
+        if first < since:
+            place = self._spans.index((first, last))
+            self._spans[place : place + 1] = [(first, since), (since, last)]
+        self._span = self._last = None
+
+    def _note_jumps(self, index, segment, start, end):
+        """Notes which meshes do not start an interval where they ended the one before."""
+        last, self._last = self._last, (index, segment, start, end)
+        if last is None or last[:2] != (index - 1, segment) or np.array_equal(start, last[3]):
+            return
+        _, _, last_start, last_end = last
+        gaps = np.abs(start - last_end).max(axis=1)
+        ways = np.maximum(np.abs(last_end - last_start).max(axis=1), np.abs(end - start).max(axis=1))
+        rounding = _ROUNDING * np.abs(start).max()
+        meshes = segment.vertex_meshes
+        for number in np.unique(meshes[gaps > rounding]):
+            own = meshes == number
+            if gaps[own].max() > _JUMP * ways[own].max() + rounding:
+                self._jump_times.setdefault(segment.meshes[number].name, set()).add(self.times[index])
+
+    def _note_changes(self):
+        for mesh in self._usd_meshes:
+            times_of = {}
+            for (_, old), (time, new) in pairwise(mesh.states.items()):
+                if self.times[0] < time <= self.times[-1]:
+                    what = "appears" if old is None else "vanishes" if new is None else "changes its topology"
+                    times_of.setdefault(what, []).append(time)
+            for what, times in times_of.items():
+                at = _times_in_words(times)
+                self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
+
+
+def _times_in_words(times) -> str:
+    return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
+
+
+def _merge(times) -> dict[float, float]:
+    """For each time the one that stands for all that are the same: of those the nearest to a whole time code."""
+    times = sorted(times)
+    most = _SAME_TIME * min(1.0, times[-1] - times[0])
+    groups = []
+    for time in times:
+        if groups and time - groups[-1][0] <= most:
+            groups[-1].append(time)
+        else:
+            groups.append([time])
+    return {time: min(group, key=lambda time: abs(time - round(time))) for group in groups for time in group}
+
+
+def _is_there(mesh, time) -> bool:
+    """Whether a mesh is there at a time or later."""
+    return _state_at(mesh, time) is not None or any(state for since, state in mesh.states.items() if since > time)
+
+
+def _state_at(mesh, time):
+    """What a mesh is at a time, see :attr:`UsdMesh.states`."""
+    return next(state for since, state in reversed(mesh.states.items()) if since <= time)
