@@ -16,8 +16,8 @@ _NEAR = wp.constant(int(Count.NEAR))
 
 _CHUNK = wp.constant(16)
 _CHUNK_SLOTS = wp.constant(wp.int64(16))
-"""Slots of face pairs that a thread takes at once, in both types: Warp reads a constant that a kernel converts, and uses
-as it is, before it is set."""
+"""Slots of face pairs that a thread takes at once, in both types: Warp reads a constant that a kernel both converts and
+uses as it is before it is set."""
 
 _KERNEL = {"enable_backward": False, "module": "unique"}
 
