@@ -25,7 +25,7 @@ _RIGID, _SMALL_PARTS = "#cfc6b8", "#4a4a4f"
 
 
 class View(NamedTuple):
-    """How a scene is drawn.
+    """The view of a scene.
 
     Attributes:
         interval: Interval of the recording whose start is drawn.
@@ -97,7 +97,7 @@ def axes_of(elevation, azimuth):
 
 
 def project(axes, points, view, extent, pixels):
-    """Points in pixels of a square picture."""
+    """Returns points in pixels of a square picture, and their distances from the eye."""
     return (points - view.centre) @ axes.T * (pixels / extent) + (0.5 * pixels, 0.5 * pixels, 0.0)
 
 

@@ -22,8 +22,8 @@ SEAMS = [0.7, 0.56, 0.42, 0.28]  # m, heights of the upper borders of the ruffle
 RUFFLE = 0.165  # m, height of a ruffle
 GAP, BULGE, WAVE = 0.006, 0.025, 0.028  # m, of a ruffle off the skirt at the seam, more at its hem, and waves there
 WAVES = 16  # around
-COLUMNS, CELL = 64, 0.0375  # around the skirt, and height of its cells [m], at the size of which there are
-COARSE_TRIANGLES = 7168  # triangles
+COLUMNS, CELL = 64, 0.0375  # around the skirt, and height of its cells [m], of a dress of COARSE_TRIANGLES
+COARSE_TRIANGLES = 7168
 
 
 class Example(PaperScene):

@@ -1,4 +1,4 @@
-"""Signs and order of algebraic numbers: roots of quadratics and cubics, in exact integers (paper, 4.1 and 4.2).
+"""Signs and order of algebraic numbers: roots of quadratics and cubics, in exact integers (Sec. 4.1 and 4.2).
 
 A polynomial over the step is taken in z = t / (1 - t), which maps the inside of the step to z > 0: the Bernstein
 coefficients of a cubic times 1, 3, 3, 1 are its coefficients in z, and the sign of its value is the same. The ends

@@ -1,4 +1,4 @@
-"""Exact decision of a query in wide integers: first contact, with every degenerate case (paper, BSC-exact).
+"""Exact decision of a query in wide integers: first contact, with every degenerate case (BSC-exact).
 
 One question
 ------------
