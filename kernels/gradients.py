@@ -14,10 +14,9 @@ the velocity of one feature relative to the other. So for adjoints adj_t, adj_x,
     q . e = adj_t,  -q . u = adj_x,  -q . v = adj_y,
 
 and -q, x q, y q are the adjoints of w, u, v at the time of contact. Of the adjoint of a point there, the share 1 - t
-belongs to its start, and t to its end. With n = u x v, N = n / |n| and the dual vectors u* = v x n / n^2, v* = n x u /
-n^2,
+belongs to its start, and t to its end. With n = u x v, N = n / |n| and the dual vectors of u and v,
 
-    q = (adj_t + d . e) / (N . e) N - d,  d = adj_x u* + adj_y v*.
+    q = (adj_t + d . e) / (N . e) N - d,  d = adj_x u* + adj_y v*,  u* = v x n / n^2,  v* = n x u / n^2.
 
 For the time alone q is n / (dY/dt), with Y = w . n: the implicit function theorem for Y(t) = 0. The normal N is a
 function of u and v, hence of the time too, which adds to adj_t.

@@ -168,7 +168,7 @@ def approximate_extremum(k: wp.vec4d) -> wp.float64:
 
 @wp.func
 def where_to_look(k: wp.vec4d) -> wp.float64:
-    """Returns an uncertified time in (0, 1) at which a cubic is about zero or nearest to it; 0 or 1 if there is none."""
+    """Returns an uncertified time in (0, 1) at which a cubic is about zero or nearest to it; 0 or 1 if none."""
     if k[0] * k[3] < _ZERO:
         return approximate_root(k)
     return approximate_extremum(k)
