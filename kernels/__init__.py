@@ -1,8 +1,9 @@
 """Device functions for continuous collision detection, to call from any Warp kernel.
 
 ``ccd_vertex_face`` and ``ccd_edge_edge`` return FREE, HIT or UNSURE; ``impact_vertex_face`` and ``impact_edge_edge``
-return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. Each of the other
-modules holds one idea of the method.
+return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. FREE and HIT are
+certain whatever the options of the calling module, ``fast_math`` among them, and on processors that flush subnormal
+numbers to zero, as long as these round to nearest. Each of the other modules holds one idea of the method.
 
 References:
     Min Tang, Ruofeng Tong, Zhendong Wang, and Dinesh Manocha. "Fast and Exact Continuous Collision Detection with
