@@ -197,6 +197,15 @@ def test_bullet_passes_without_stage():
         example.test_final()
 
 
+def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch, capsys):
+    program = load_module(FOLDER / "speed_limit.py")
+    monkeypatch.setattr(sys, "argv", ["speed_limit.py", "--device", str(wp.get_device())])
+    program.main()
+    rows = re.findall(r"│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│", capsys.readouterr().out)
+    assert [tuple(map(float, row)) for row in rows] == [(v, 0.89, v, v) for v in (1.0, 10.0, 60.0)]
+    assert pytest.approx(0.8925) == program.LIMIT
+
+
 def path_of(name):
     return FOLDER / "paper" / f"example_{name}.py"
 
