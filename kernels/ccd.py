@@ -36,14 +36,17 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
 @wp.func
 def _answer(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # time of impact
     timed: bool,
     tolerance: wp.float64,
 ) -> Impact:
@@ -68,14 +71,17 @@ def _answer(
 @wp.func_grad(_answer)
 def _adjoint_of_answer(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # time of impact
     timed: bool,
     tolerance: wp.float64,
     adj_ret: Impact,

@@ -145,14 +145,17 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
 @wp.func
 def with_gradients(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # first contact
     found: Impact,
     tolerance: wp.float64,
 ) -> Impact:
@@ -188,14 +191,17 @@ def with_gradients(
 @wp.func_grad(with_gradients)
 def _adjoint_of_with_gradients(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # first contact
     found: Impact,
     tolerance: wp.float64,
     adj_ret: Impact,

@@ -167,14 +167,17 @@ def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
 @wp.func
 def _motion_of_kind(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # rounding
     roundoff: wp.float64,
 ) -> Motion:
     """Returns the scaled relative motion of a query, whose points are in double precision."""

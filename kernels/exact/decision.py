@@ -315,14 +315,17 @@ def decide_in(limbs: int) -> wp.Function:
     @wp.func
     def decide(
         kind: int,
+        # points at the start
         a0: wp.vec3d,
         b0: wp.vec3d,
         c0: wp.vec3d,
         d0: wp.vec3d,
+        # points at the end
         a1: wp.vec3d,
         b1: wp.vec3d,
         c1: wp.vec3d,
         d1: wp.vec3d,
+        # time of impact
         timed: bool,
         digits: int,
     ) -> wp.float64:

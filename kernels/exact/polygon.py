@@ -84,15 +84,19 @@ for _limbs in BITS:
     @wp.func_native(snippet=_FROM_POINTS)
     def make_polygon(
         edges: bool,
+        # points at the start
         a0: wp.vec3d,
         b0: wp.vec3d,
         c0: wp.vec3d,
         d0: wp.vec3d,
+        # points at the end
         a1: wp.vec3d,
         b1: wp.vec3d,
         c1: wp.vec3d,
         d1: wp.vec3d,
+        # scale
         exponents: wp.vec3i,
+        # out
         polygon: wp.array[_Integer],
     ):
         """Writes the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
@@ -147,10 +151,12 @@ def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp
 @wp.func
 def spread(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
