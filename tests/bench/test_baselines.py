@@ -61,6 +61,7 @@ def test_what_never_moves_is_answered(kind):
             assert (answer(method, kind, queries).find_hits() == touches).all(), method
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_hand_made_queries():
     """Wang et al. 2021: El Topo's solver has 242 false positives and 2 false negatives there."""

@@ -75,6 +75,7 @@ def test_first_frames(path):
     assert report.uncertified_steps == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTED)
 def test_printed_commands_run_without_a_window_and_without_a_browser(tmp_path, name):
     for missing in ("pyglet", "viser"):
@@ -172,6 +173,7 @@ def test_help(path, capsys):
     assert "--no-ccd" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_bullet_is_stopped(capsys):
     example = run(BULLET, 60, "--speed", "10")
     assert example.solver.report.steps >= 240
@@ -247,6 +249,7 @@ def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch):
         example.test_final()
 
 
+@pytest.mark.slow
 def test_funnel_is_passed(capsys):
     example = run(path_of("funnel"), 46, "--triangles", "1000")
     example.test_final()
@@ -264,6 +267,7 @@ def test_dancer_without_stage():
         run(path_of("dancer"), 40, "--triangles", "1000", "--no-ccd").test_final()
 
 
+@pytest.mark.slow
 def test_car_is_crushed():
     run(path_of("crashing"), 38, "--triangles", "1500").test_final()
 
