@@ -12,7 +12,7 @@ import math
 import warp as wp
 
 from ..kernels.closest import contact_at
-from ..kernels.exact.decision import NONE, TOO_WIDE, decide_in
+from ..kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
 from ..kernels.motion import double, relative_motion
 from ..kernels.pipeline.pairs import vertices_of_pair
