@@ -35,7 +35,7 @@ from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
-from .detector import median_milliseconds
+from .timing import median_milliseconds
 
 __all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace_stages"]
 

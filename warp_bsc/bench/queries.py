@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..cli.query_file import KINDS
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.narrow_phase import TOLERANCE
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -18,9 +17,10 @@ from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
-from .detector import median_milliseconds
+from .timing import median_milliseconds
 
 __all__ = [
+    "KINDS",
     "MODES",
     "SEED",
     "QueryBenchmark",
@@ -30,6 +30,8 @@ __all__ = [
     "generate_queries",
     "generate_touching_queries",
 ]
+
+KINDS = ("vertex-face", "edge-edge")
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """What is measured, with the bytes of a query and its answer: the status only, one thread a query; with time of impact,
