@@ -22,7 +22,7 @@ from ..detection.narrow_phase import Count
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
 from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
-from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
+from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .scenes import BenchmarkScene
 from .timing import count_threads
 from .worst_case import WorstQuery, adversarial_queries, find_worst
@@ -210,7 +210,7 @@ def benchmark_scene(
     errors, collisions, checked, sample, truth = _compare(queries, answers, effort)
     stages = np.zeros(len(STAGES), dtype=int)
     for found in queries.values():
-        stages += np.bincount(trace_stages(QuerySet(found, places[-1].device)), minlength=len(STAGES))
+        stages += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(STAGES))
 
     timings = []
     for place in places:
@@ -309,7 +309,7 @@ def _find_answers(
                 else:
                     answers[kind, method] = hits
                     if method == "conservative":
-                        unsure += int((run.status.numpy() == UNSURE).sum())
+                        unsure += int((run.read_status() == UNSURE).sum())
     return answers, unsure, disagreeing
 
 

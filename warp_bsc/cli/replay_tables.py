@@ -61,8 +61,8 @@ def print_replay(console: Console, outcome: Outcome) -> None:
         unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
         say(
             console,
-            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not certify: "
-            f"{unsure:,}.",
+            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not "
+            f"certify: {unsure:,}.",
         )
     else:
         say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
