@@ -25,6 +25,7 @@ TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     monkeypatch.setattr(Effort, "quick", classmethod(lambda cls: TINY))
+    monkeypatch.setattr(bench_paper, "_CPU_QUERIES", 1)
     monkeypatch.setattr("warp_bsc.bench.worst_case._SUSPECTS", 2)
     monkeypatch.setattr("warp_bsc.bench.worst_case._CPU_NANOSECONDS", 1e4)
 
