@@ -50,7 +50,7 @@ PACKAGES = {
 
 LIBRARIES = {
     "newton": {"response"},
-    "pxr": {"usd", "replay"},
+    "pxr": {"usd"},
     "rich": {"cli"},
     "argparse": {"cli"},
     "matplotlib": {"bench"},
@@ -62,7 +62,7 @@ LIBRARIES = {
 
 
 def imports():
-    """Every import of our sources: the file, its package, and the names of the imported module, ours from "warp_bsc" on."""
+    """Every import of our sources: file, package and names of the imported module, which begin with "warp_bsc" if it is ours."""
     for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
         for path in sorted(folder.rglob("*.py")):
             relative = path.relative_to(folder)
