@@ -62,7 +62,7 @@ LIBRARIES = {
 
 
 def imports():
-    """Every import of our sources: file, package and names of the imported module, which begin with "warp_bsc" if it is ours."""
+    """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
     for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
         for path in sorted(folder.rglob("*.py")):
             relative = path.relative_to(folder)

@@ -103,9 +103,10 @@ def benchmark_detector(
     before = wp.get_mempool_used_mem_current(device) if counts_memory else 0
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     detector = CollisionDetector(mesh, method=method)
-    detector.detect(x0, x1)
+    collisions = detector.detect(x0, x1)
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None
 
+    stats = collisions.stats
     detect, read, stages = [], [], []
     for _ in range(repeat):
         wp.synchronize_device(device)
@@ -138,6 +139,7 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
         collisions = detector.detect(x0, x1)
+    assert capture.graph
     milliseconds = replay_graph(capture.graph, device, replays=_GRAPH_REPLAYS)
     if (collisions.stats.vertex_face, collisions.stats.edge_edge) != (stats.vertex_face, stats.edge_edge):
         raise RuntimeError("the CUDA graph found other pairs than the detection outside it")

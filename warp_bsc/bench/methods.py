@@ -44,7 +44,7 @@ from .timing import median_milliseconds
 
 __all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
 
-METHODS = (*NARROW_PHASE_METHODS, "cubic", "reduced")
+METHODS: tuple[str, ...] = (*NARROW_PHASE_METHODS, "cubic", "reduced")
 """The methods that are compared."""
 
 STAGES = ("axis boxes", "Bernstein signs", "separating direction", "classification", "subdivision", "exact")

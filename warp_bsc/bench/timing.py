@@ -20,6 +20,7 @@ def median_milliseconds(run: Callable[[], None], device: wp.Device, repeat: int)
     if device.is_cuda:
         with wp.ScopedCapture(device) as capture:
             run()
+        assert capture.graph
         return replay_graph(capture.graph, device, replays=repeat)
     seconds = []
     for _ in range(repeat):

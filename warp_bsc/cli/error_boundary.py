@@ -1,6 +1,7 @@
 """Turns every error and every signal that ends a command into an exit status and one line. Imports little."""
 
 import contextlib
+import io
 import os
 import sys
 import traceback
@@ -59,7 +60,7 @@ def describe(error: BaseException) -> str:
 def _encodable_output() -> Iterator[None]:
     """Writes characters that the encoding of standard output lacks as escapes."""
     stream = sys.stdout
-    if not hasattr(stream, "reconfigure"):
+    if not isinstance(stream, io.TextIOWrapper):
         yield
         return
     errors = stream.errors

@@ -3,10 +3,11 @@
 import argparse
 import json
 import time
+from collections.abc import Callable
 
 import numpy as np
 
-from ..detection.query import query_edge_edge, query_vertex_face
+from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
 from .options import EXIT_STATUS, Commands, add_command, add_detection_options, add_fail_on_collision, add_json
 from .query_file import KINDS, find_query_files, read_query_file
@@ -29,7 +30,7 @@ examples:
 
 {EXIT_STATUS}"""
 
-_QUERIES = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
+_QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
 
 
 def add_to(commands: Commands) -> None:

@@ -42,9 +42,11 @@ class QueryAnswers:
         return {name: int((self.result.status == code).sum()) for code, name in enumerate(_STATUS)}
 
     @property
-    def confusion(self) -> dict[str, int]:
-        """Number of true and false positives and negatives; only where the truth is known."""
+    def confusion(self) -> dict[str, int] | None:
+        """Number of true and false positives and negatives; None if the truth is not known."""
         hit, truth = self.result.hit, self.file.truth
+        if truth is None:
+            return None
         return {
             "true_positives": int((hit & truth).sum()),
             "false_positives": int((hit & ~truth).sum()),
@@ -73,15 +75,15 @@ def print_queries(console: Console, answers: list[QueryAnswers], *, method: str,
     )
     console.print(table)
 
-    known = [answer for answer in answers if answer.file.truth is not None]
+    known = [(answer.file, answer.confusion) for answer in answers if answer.confusion]
     if known:
         table = make_table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
-        _add_files(table, folder, [(answer.file, list(answer.confusion.values())) for answer in known])
+        _add_files(table, folder, [(file, list(confusion.values())) for file, confusion in known])
         console.print()
         console.print(table)
-    for answer in known:
-        if answer.file.truth_path != answer.file.path:
-            say(console, f"Truth of {answer.file.path.name} from {answer.file.truth_path.name}.")
+    for file, _ in known:
+        if file.truth_path and file.truth_path != file.path:
+            say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
 
 
 def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) -> dict[str, Any]:
@@ -97,11 +99,13 @@ def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) ->
                 "hits": answer.hits,
                 "certified": answer.certified,
                 "truth_path": str(answer.file.truth_path) if answer.file.truth_path else None,
-                "confusion": answer.confusion if answer.file.truth is not None else None,
+                "confusion": answer.confusion,
                 "milliseconds": answer.milliseconds,
                 "hit": answer.result.hit.tolist(),
                 "status": [_STATUS[status] for status in answer.result.status],
-                "toi": [toi if toi <= 1.0 else None for toi in answer.result.toi.tolist()],
+                "toi": None
+                if answer.result.toi is None
+                else [toi if toi <= 1.0 else None for toi in answer.result.toi],
             }
             for answer in answers
         ],

@@ -6,7 +6,7 @@ import errno
 import importlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -324,7 +324,9 @@ def _open_outputs(
     return outputs
 
 
-def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Iterator[tuple[Interval, Contacts]]:
+def _track(
+    scene: Scene, arguments: argparse.Namespace, device: wp.Device
+) -> Generator[tuple[Interval, Contacts], None, None]:
     """Yields the intervals as they are found, and shows progress, rate and time left on a terminal."""
     progress = Progress(
         TextColumn("Replaying"),

@@ -87,6 +87,7 @@ def _print_worst(console: Console, listed: list[Interval]) -> None:
         table = make_table("Interval", *headers, caption=caption)
         table.columns[0].no_wrap = True
         for interval in listed:
+            assert interval.earliest  # it collides
             table.add_row(
                 Text(f"{interval.start:g} {arrow} {interval.end:g}"),
                 f"{interval.pairs_tested:,}",
@@ -116,6 +117,7 @@ def _print_collisions(console: Console, outcome: Outcome) -> None:
     if len(outcome.mesh_pairs) > LONGEST:
         say(console, f"  and {len(outcome.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest
+    assert contact  # it collides
     (first, second), (first_element, second_element) = contact.meshes, contact.elements
     other = "its" if first == second else f"{second},"
     say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")

@@ -18,7 +18,7 @@ class Console(rich.console.Console):
         raise BrokenPipeError
 
 
-def say(console: Console, line: str) -> None:
+def say(console: rich.console.Console, line: str) -> None:
     """Prints a line without markup; on a terminal it wraps."""
     console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
