@@ -1,5 +1,6 @@
 """The package: what of a checkout can be imported as a part of it."""
 
+import ast
 import importlib.util
 import os
 import shutil
@@ -30,3 +31,79 @@ def test_a_checkout_that_is_not_installed_has_its_own_kernels(tmp_path):
     command, environment = [sys.executable, "-c", script], os.environ | {"PYTHONPATH": str(tmp_path)}
     found = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert found.stdout.split() == [str(tmp_path / name / "__init__.py") for name in ("warp_bsc", "kernels")]
+
+
+PACKAGES = {
+    "kernels": set(),
+    "_arrays": set(),
+    "_atomic_file": set(),
+    "checker": {"_arrays"},
+    "detection": {"kernels", "checker", "_arrays"},
+    "response": {"detection", "kernels"},
+    "usd": set(),
+    "replay": {"usd", "detection", "checker", "_atomic_file"},
+    "bench": {"detection", "kernels", "usd", "checker"},
+    "cli": {"replay", "bench", "detection", "usd", "_atomic_file"},
+    "__main__": {"cli"},
+}
+"""Whom a package of ours, or a module beside them, may import; the names that it exports import what they need."""
+
+LIBRARIES = {
+    "newton": {"response"},
+    "pxr": {"usd"},
+    "rich": {"cli"},
+    "argparse": {"cli"},
+    "matplotlib": {"bench"},
+    "ipctk": {"bench"},
+    "trimesh": {"bench"},
+    "warp": {"kernels", "detection", "response", "bench", "cli"},
+}
+"""Who may import a library."""
+
+
+def imports():
+    """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
+    for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
+        for path in sorted(folder.rglob("*.py")):
+            relative = path.relative_to(folder)
+            inside = ["warp_bsc", *(["kernels"] if folder.name == "kernels" else []), *relative.with_suffix("").parts]
+            package = inside[1]
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    modules = [alias.name.split(".") for alias in node.names]
+                elif isinstance(node, ast.ImportFrom):
+                    base = [*inside[: -node.level], *(node.module or "").split(".")] if node.level else []
+                    base = [name for name in base or node.module.split(".") if name]
+                    modules = [[*base, alias.name] for alias in node.names]
+                else:
+                    continue
+                for module in modules:
+                    yield str(path.relative_to(ROOT)), package, module
+
+
+def test_packages_import_only_what_the_layout_allows():
+    found = {(package, module[1]) for _, package, module in imports() if module[0] == "warp_bsc" and module[1:]}
+    names = {package for package, _ in found} | {imported for _, imported in found if imported != "__version__"}
+    assert names - {"__init__"} == PACKAGES.keys()
+    wrong = [
+        f"{path}: {'.'.join(module)}"
+        for path, package, module in imports()
+        if module[0] == "warp_bsc" and module[1:] not in (["__version__"], [])
+        if package != module[1] and module[1] not in PACKAGES.get(package, ())
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_chain_of_packages_is_longer_than_six():
+    def depth(package):
+        return 1 + max((depth(imported) for imported in PACKAGES[package]), default=0)
+
+    assert max(map(depth, PACKAGES)) <= 6  # an endless chain ends in a RecursionError
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_libraries_are_imported_only_where_the_layout_allows(library):
+    users = {(path, package) for path, package, module in imports() if module[0] == library}
+    assert users
+    wrong = [path for path, package in users if package not in LIBRARIES[library]]
+    assert not wrong, "\n".join(sorted(wrong))

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from benchmark_data import load_queries
 from generators import GENERATORS
 
 from warp_bsc import checker
-from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace_stages
+from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
+from warp_bsc.detection.narrow_phase import NarrowPhase
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
 KINDS = ("vertex_face", "edge_edge")
@@ -39,7 +39,7 @@ def test_degenerate_queries_are_answered(kind):
     wrong = {}
     for method in METHODS:
         run = answer(method, kind, points)
-        assert set(np.unique(run.status.numpy())) <= {FREE, HIT, UNSURE}
+        assert set(np.unique(run.read_status())) <= {FREE, HIT, UNSURE}
         wrong[method] = (run.find_hits() != truth).mean()
         if method == "conservative":
             assert run.find_hits()[truth].all()
@@ -84,18 +84,29 @@ def test_stages_are_those_that_decide(kind):
     points = np.concatenate([GENERATORS[name](rng, 100, kind, np.float32) for name in names])
     points[:50, [0, 1, 4, 5] if kind == "edge_edge" else [0, 4]] += 9.0
     queries = QuerySet(Queries.of_points(kind, points), "cpu")
-    stages = trace_stages(queries)
+    stages, _ = trace(queries, "exact")
     assert set(stages) == set(range(len(STAGES)))
     assert (stages[:50] == STAGES.index("axis boxes")).all()
     run = MethodRun("conservative", queries)
     run.launch()
-    assert np.array_equal(stages == STAGES.index("exact"), run.status.numpy() == UNSURE)
+    assert np.array_equal(stages == STAGES.index("exact"), run.read_status() == UNSURE)
 
 
-def test_clock_runs_for_every_query():
+def test_clock_runs_for_every_query(device):
     points = GENERATORS["uniform"](np.random.default_rng(4), 100, "edge_edge", np.float32)
-    queries = QuerySet(Queries.of_points("edge_edge", points), "cpu")
+    queries = QuerySet(Queries.of_points("edge_edge", points), device)
     for method in METHODS:
-        ticks = wp.zeros(100, dtype=wp.int64, device="cpu")
-        MethodRun(method, queries).launch(ticks=ticks)
-        assert (ticks.numpy() > 0).all()
+        _, cycles = trace(queries, method)
+        assert cycles.shape == (100,) and (cycles > 0).all()
+
+
+@pytest.mark.parametrize("method", ["float", "conservative", "exact"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_detectors_own_methods_are_its_narrow_phase(monkeypatch, kind, method):
+    """A benchmark that launched a copy of the narrow phase would not see what replaces it."""
+    points = GENERATORS["mostly_hits"](np.random.default_rng(5), 100, kind, np.float32)
+    run = MethodRun(method, QuerySet(Queries.of_points(kind, points), "cpu"))
+    launched = []
+    monkeypatch.setattr(NarrowPhase, "run", lambda *_, **options: launched.append(options))
+    run.launch()
+    assert launched == [{"method": method, "timed": False}]

@@ -8,9 +8,9 @@ import pytest
 import warp as wp
 
 from warp_bsc import CollisionDetector, CollisionMesh, checker
-from warp_bsc.bench import ipc_toolkit as bench_peers
+from warp_bsc.bench import ipc_toolkit
 from warp_bsc.bench import paper as bench_paper
-from warp_bsc.bench.ipc_toolkit import measure_peer
+from warp_bsc.bench.ipc_toolkit import time_queries
 from warp_bsc.bench.methods import METHODS, STAGES
 from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
 from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
@@ -19,12 +19,13 @@ from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
 from warp_bsc.detection.launch import one_core
 
-TINY = Effort(intervals=2, queries=3000, sample=100, peer_queries=20, adversaries=50, repeat=1)
+TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries=50, repeat=1)
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     monkeypatch.setattr(Effort, "quick", classmethod(lambda cls: TINY))
+    monkeypatch.setattr(bench_paper, "_CPU_QUERIES", 1)
     monkeypatch.setattr("warp_bsc.bench.worst_case._SUSPECTS", 2)
     monkeypatch.setattr("warp_bsc.bench.worst_case._CPU_NANOSECONDS", 1e4)
 
@@ -112,10 +113,10 @@ def test_what_a_call_takes_is_taken_off(monkeypatch, kind, query, expected):
         far = np.linalg.norm(points[0] - points[3]) > 1e3
         clock.now += 1e-9 * (100 if far else query)
 
-    monkeypatch.setattr(bench_peers, "_ask", lambda peer, kind: ask)
-    monkeypatch.setattr(bench_peers, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr(ipc_toolkit, "_ccd", lambda method, kind: ask)
+    monkeypatch.setattr(ipc_toolkit, "time", SimpleNamespace(perf_counter=lambda: clock.now))
     points = np.random.default_rng(1).uniform(size=(20, 8, 3))
-    assert measure_peer("additive", kind, points) == pytest.approx((expected, 100))
+    assert time_queries("additive", kind, points) == pytest.approx((expected, 100))
 
 
 def test_wrong_answers_are_counted(monkeypatch):

@@ -8,9 +8,8 @@ import pytest
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench import queries as bench_queries
-from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
+from warp_bsc.bench.queries import KINDS, MODES, benchmark_queries, generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
-from warp_bsc.cli.query_file import KINDS
 
 
 def measure(capsys, device, *arguments):

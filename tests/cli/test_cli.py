@@ -280,7 +280,7 @@ def test_scene_that_is_not_usd(capsys, tmp_path):
 
 def test_conservative_says_what_it_could_not_certify(capsys, falling_scene):
     output = run(capsys, "replay", falling_scene, "--method", "conservative")
-    assert "no collision is missing. Pairs tested that could not be told apart from collisions: " in output
+    assert "no collision is missing. Pairs tested that floating point could not certify: " in output
     assert "every answer" not in output
     assert "collisions may be missing" in run(capsys, "replay", falling_scene, "--method", "float")
 
@@ -391,7 +391,7 @@ def test_error_while_the_program_is_loaded(safe_scene, tmp_path):
     (tmp_path / "rich.py").write_text("raise RuntimeError('broken\\ninstallation')")
     done = run_program("replay", safe_scene, env={**os.environ, "PYTHONPATH": str(tmp_path)})
     assert done.returncode == 2
-    assert done.stderr.startswith("warp-bsc: error: RuntimeError: broken installation (cli.py:")
+    assert done.stderr.startswith("warp-bsc: error: RuntimeError: broken installation (bench_detector.py:")
     assert len(done.stderr.splitlines()) == 1
 
 

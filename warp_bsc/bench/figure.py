@@ -1,5 +1,8 @@
 """Draws the paper's benchmarks in the layout of its Figure 7: a group of bars for each scene, a bar for each method."""
 
+import os
+from typing import Any
+
 import numpy as np
 
 __all__ = ["draw_paper_benchmarks"]
@@ -11,19 +14,19 @@ _METHODS = {
     "reduced": ("float, the paper's inside tests", "#c9d98f"),
     "cubic": ("cubic solver", "#d6604d"),
 }
-_PEERS = {"additive": ("Additive CCD", "#b2abd2"), "tight inclusion": ("Tight Inclusion", "#7b6ca8")}
+_IPC_METHODS = {"additive": ("Additive CCD", "#b2abd2"), "tight inclusion": ("Tight Inclusion", "#7b6ca8")}
 _WIDTH = 0.84
 
 
-def draw_paper_benchmarks(benchmarks: list[dict], path) -> None:
-    """Writes a figure of the mean times of a query, a panel for each place at which methods were timed.
+def draw_paper_benchmarks(benchmarks: list[dict[str, Any]], path: str | os.PathLike) -> None:
+    """Writes a figure of the mean times of a query, one panel for each place at which methods were timed.
 
     Args:
-        benchmarks: What runs of ``warp-bsc bench --json`` printed, such as one of the CPU and one of a GPU.
-        path: File to write, .png, .svg or .pdf.
+        benchmarks: The JSON of runs of ``warp-bsc bench --json``, such as one on the CPU and one on a GPU.
+        path: The file to write, .png, .svg or .pdf.
 
     Raises:
-        ValueError: If something else was printed, or the format is unknown.
+        ValueError: If the JSON is that of another benchmark, or the format of the file is unknown.
     """
     import matplotlib  # noqa: PLC0415 (optional)
 
@@ -33,12 +36,12 @@ def draw_paper_benchmarks(benchmarks: list[dict], path) -> None:
     panels = {}
     for benchmark in benchmarks:
         if benchmark.get("benchmark") != "paper":
-            raise ValueError("a figure is drawn of what warp-bsc bench --json prints, not of another benchmark")
+            raise ValueError("a figure needs the JSON of warp-bsc bench paper, not of another benchmark")
         for scene in benchmark["scenes"]:
             for timing in scene["timings"]:
                 bars = dict(timing["nanoseconds"])
                 if timing["cores"] == 1:
-                    bars |= {peer: took["nanoseconds"] for peer, took in scene["peers"].items()}
+                    bars |= {method: took["nanoseconds"] for method, took in scene["peers"].items()}
                 panels.setdefault(timing["place"], {})[scene["name"]] = bars
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
@@ -48,7 +51,7 @@ def draw_paper_benchmarks(benchmarks: list[dict], path) -> None:
         shown |= _draw_panel(place_axes, place, scenes)
     for unused in axes.flat[len(panels) :]:
         unused.set_visible(False)
-    named = {name: shown[name] for name, _ in (*_METHODS.values(), *_PEERS.values()) if name in shown}
+    named = {name: shown[name] for name, _ in (*_METHODS.values(), *_IPC_METHODS.values()) if name in shown}
     figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=120)
     plt.close(figure)
@@ -58,7 +61,9 @@ def _draw_panel(axes, place, scenes):
     """Draws the bars of one place; returns those of each method by its name."""
     from matplotlib.ticker import NullFormatter  # noqa: PLC0415 (optional)
 
-    methods = {key: style for key, style in (_METHODS | _PEERS).items() if any(key in bars for bars in scenes.values())}
+    methods = {
+        key: style for key, style in (_METHODS | _IPC_METHODS).items() if any(key in bars for bars in scenes.values())
+    }
     width = _WIDTH / len(methods)
     shown = {}
     for number, (key, (name, color)) in enumerate(methods.items()):

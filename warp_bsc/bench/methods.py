@@ -1,31 +1,36 @@
-"""What the paper's benchmarks compare: each method as kernels that read a query's points and write its answer.
+"""The methods that the paper's benchmarks compare.
 
-All read the same arrays, positions by the vertices of a pair's elements, as a detector does, and answer the same
-question: whether the two features meet. What each does, and what not, so that the times can be compared:
+All methods read the same arrays, positions by the vertices of a pair's elements, as a detector does, and answer the
+same question: do the two features meet? They differ as follows:
 
-- ``float``, ``conservative``: the stages of the detector, without and with error bounds: boxes, the signs of the
-  Bernstein coefficients, a separating direction, on a CPU for eight queries at once; then, for what these leave, in a
-  kernel of its own, classification, and with bounds the subdivision of what that leaves open. UNSURE is a collision.
-- ``exact``: the same as ``conservative``, and the exact stage of the detector for what is UNSURE.
+- ``float``, ``conservative``, ``exact``: the detector's own narrow phase,
+  :class:`~warp_bsc.detection.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the answers of the
+  contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector leaves to
+  the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has compared
+  them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
+  favors ``cubic``.
 - ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
-  so it knows a time, too; that time is not written.
-- ``reduced``: ``float`` with the paper's own inside tests, :mod:`warp_bsc.bench.baselines.reduced_inside_test`. As
-  there is no subdivision in the paper, what classification leaves open is a collision at once: weak inequalities, as
-  it has them. Its culls are those of ``float``.
+  so it knows a time as well; that time is not written.
+- ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5,
+  :mod:`warp_bsc.bench.baselines.reduced_inside_test`. The culls are those of the narrow phase, in the same order. The
+  paper does not subdivide, so a query that classification leaves open is a collision at once, as the paper's weak
+  inequalities imply.
 
-None is asked for a time of impact, and none looks whether numbers are finite, which is done once a vertex.
+No method finds times of impact, and none checks whether positions are finite, which the detector does once a vertex.
+
+The stage that decides a query and its clock cycles come from a kernel of its own, which is never timed: see
+:func:`trace`.
 """
 
-import enum
 import functools
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from ..detection.exact_stage import launch_exact_stage
 from ..detection.launch import launch_over, launch_over_queue
-from ..detection.narrow_phase import TOLERANCE
+from ..detection.narrow_phase import METHODS as NARROW_PHASE_METHODS
+from ..detection.narrow_phase import TOLERANCE, Count, NarrowPhase
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
@@ -35,20 +40,27 @@ from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
-from .detector import median_milliseconds
+from .timing import median_milliseconds
 
-__all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace_stages"]
+__all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
 
-METHODS = ("float", "conservative", "exact", "cubic", "reduced")
-"""What is compared."""
+METHODS: tuple[str, ...] = (*NARROW_PHASE_METHODS, "cubic", "reduced")
+"""The methods that are compared."""
 
 STAGES = ("axis boxes", "Bernstein signs", "separating direction", "classification", "subdivision", "exact")
-"""What decides a query, in the order in which they are tried."""
+"""The stages that decide queries, in the order of the culls on a CPU."""
+
+_AXIS_BOXES, _BERNSTEIN_SIGNS, _SEPARATING_DIRECTION, _CLASSIFICATION, _SUBDIVISION, _EXACT = (
+    wp.constant(stage) for stage in range(len(STAGES))
+)
+
+_WARP_SIZE = 32
 
 _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
 """Without fused operations every device computes the same bits."""
 
-_CYCLES = """
+
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     return clock64();
 #elif defined(__aarch64__)
@@ -56,33 +68,17 @@ _CYCLES = """
 #else
     return (int64_t)__builtin_readcyclecounter();
 #endif
-"""
-
-
-class _Count(enum.IntEnum):
-    """Places of the counts of a run: queries that culls, floating point, each width, and classification leave."""
-
-    SURVIVORS = 0
-    UNSURE = 1
-    WIDE = 2
-    WIDER = 3
-    WIDEST = 4
-    REFUTED = 5
-    OPEN = 6
-
-
-_SURVIVORS = wp.constant(int(_Count.SURVIVORS))
-_UNSURE = wp.constant(int(_Count.UNSURE))
-_OPEN = wp.constant(int(_Count.OPEN))
-
-
-@wp.func_native(_CYCLES)
-def _cycles() -> wp.int64: ...
+""")
+def _clock() -> wp.int64: ...
 
 
 @functools.cache
 def _kernels(kind, dtype):
-    """The kernels for one kind of query and one type of position, each in a module of its own, by name."""
+    """The kernels for one kind of query and one type of position, each in a module of its own.
+
+    Returns:
+        Kernels that solve cubics, cull on a GPU, cull on a CPU, classify by the reduced inside tests, and trace.
+    """
     vertex_face = kind == "vertex_face"
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
@@ -96,199 +92,132 @@ def _kernels(kind, dtype):
             return x[first], x[elements[second, 0]], x[elements[second, 1]], x[elements[second, 2]]
         return x[elements[first, 0]], x[elements[first, 1]], x[elements[second, 0]], x[elements[second, 1]]
 
-    @wp.func
-    def started(ticks: wp.array[wp.int64]) -> wp.int64:
-        if ticks:
-            return _cycles()
-        return wp.int64(0)
-
-    @wp.func
-    def stop(ticks: wp.array[wp.int64], i: int, start: wp.int64):
-        if ticks:
-            wp.atomic_add(ticks, i, _cycles() - start)
-
     @wp.kernel(**_KERNEL)
-    def cull(
+    def cubic(
         first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
-        roundoff: wp.float64,
-        survivors: wp.array[int],
-        counts: wp.array[wp.int64],
-        ticks: wp.array[wp.int64],
+        # out
+        status: wp.array[wp.int8],
     ):
         i = first + wp.tid()
-        start = started(ticks)
         a0, b0, c0, d0 = read(x0, elements, pairs[i])
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        if not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-            motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-            y = coplanarity(motion)
-            if certified_sign_cubic(y.k, y.bound) == 0:
-                if not direction_separates(motion, centroid_direction(motion)):
-                    survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i
-        stop(ticks, i, start)
+        status[i] = wp.int8(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
+
+    @wp.kernel(**_KERNEL)
+    def cull(
+        first: int,
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        # out
+        survivors: wp.array[int],
+        survivor_count: wp.array[wp.int64],
+    ):
+        i = first + wp.tid()
+        a0, b0, c0, d0 = read(x0, elements, pairs[i])
+        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+        y = coplanarity(motion)
+        if certified_sign_cubic(y.k, y.bound) != 0:
+            return
+        if direction_separates(motion, centroid_direction(motion)):
+            return
+        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+            return
+        survivors[wp.int32(take_slot(survivor_count, 0))] = i
 
     cull_batch = cull_batch_of(dtype, vertex_face)
 
     @wp.kernel(**_KERNEL)
     def cull_batches(
         first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
-        roundoff: wp.float64,
+        # out
         survivors: wp.array[int],
-        counts: wp.array[wp.int64],
-        ticks: wp.array[wp.int64],
+        survivor_count: wp.array[wp.int64],
     ):
         i = BATCH * (first + wp.tid())
-        start = started(ticks)
-        count = wp.min(BATCH, pairs.shape[0] - i)
-        left = cull_batch(x0, x1, elements, pairs, i, count, roundoff)
+        left = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), wp.float64(0.0))
         while left != wp.uint64(0):
-            lane = lowest_bit(left)
-            survivors[wp.int32(take_slot(counts, _SURVIVORS))] = i + lane
+            survivors[wp.int32(take_slot(survivor_count, 0))] = i + lowest_bit(left)
             left = left & (left - wp.uint64(1))
-        if ticks:
-            passed = _cycles() - start
-            for lane in range(count):
-                wp.atomic_add(ticks, i + lane, passed // wp.int64(count))
 
     @wp.kernel(**_KERNEL)
     def classify_survivors(
         first: int,
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        roundoff: wp.float64,
-        survivors: wp.array[int],
-        status: wp.array[wp.int8],
-        open: wp.array[int],
-        counts: wp.array[wp.int64],
-        ticks: wp.array[wp.int64],
-    ):
-        slot = first + wp.tid()
-        if wp.int64(slot) >= counts[_SURVIVORS]:
-            return
-        i = survivors[slot]
-        start = started(ticks)
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        answer = classify(motion, coplanarity(motion))
-        status[i] = wp.int8(answer)
-        if answer == UNSURE:
-            open[wp.int32(take_slot(counts, _OPEN))] = i
-        stop(ticks, i, start)
-
-    @wp.kernel(**_KERNEL)
-    def subdivide(
-        first: int,
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        roundoff: wp.float64,
-        open: wp.array[int],
-        status: wp.array[wp.int8],
-        unsure: wp.array[int],
-        counts: wp.array[wp.int64],
-        ticks: wp.array[wp.int64],
-    ):
-        slot = first + wp.tid()
-        if wp.int64(slot) >= counts[_OPEN]:
-            return
-        i = open[slot]
-        start = started(ticks)
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        answer = impact(motion, coplanarity(motion), UNSURE, wp.float64(TOLERANCE)).status
-        status[i] = wp.int8(answer)
-        if answer == UNSURE:
-            unsure[wp.int32(take_slot(counts, _UNSURE))] = i
-        stop(ticks, i, start)
-
-    @wp.kernel(**_KERNEL)
-    def classify_survivors_reduced(
-        first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
         survivors: wp.array[int],
+        survivor_count: wp.array[wp.int64],
+        # out
         status: wp.array[wp.int8],
-        counts: wp.array[wp.int64],
-        ticks: wp.array[wp.int64],
     ):
         slot = first + wp.tid()
-        if wp.int64(slot) >= counts[_SURVIVORS]:
+        if wp.int64(slot) >= survivor_count[0]:
             return
         i = survivors[slot]
-        start = started(ticks)
         a0, b0, c0, d0 = read(x0, elements, pairs[i])
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         status[i] = wp.int8(classify_reduced(motion, coplanarity(motion)))
-        stop(ticks, i, start)
-
-    @wp.kernel(**_KERNEL)
-    def cubic(
-        first: int,
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        status: wp.array[wp.int8],
-        ticks: wp.array[wp.int64],
-    ):
-        i = first + wp.tid()
-        start = started(ticks)
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        status[i] = wp.int8(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
-        stop(ticks, i, start)
 
     @wp.kernel(**_KERNEL)
     def trace(
         first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         pairs: wp.array[wp.vec2i],
+        lanes: int,
+        solves_cubic: bool,
+        reduced: bool,
         roundoff: wp.float64,
+        # out
         stage: wp.array[wp.int8],
+        cycles: wp.array[wp.int64],
     ):
-        i = first + wp.tid()
+        i = (first + wp.tid()) // lanes
+        start = _clock()
         a0, b0, c0, d0 = read(x0, elements, pairs[i])
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        y = coplanarity(motion)
-        decided = int(4)
-        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-            decided = int(0)
-        elif certified_sign_cubic(y.k, y.bound) != 0:
-            decided = int(1)
-        elif direction_separates(motion, centroid_direction(motion)):
-            decided = int(2)
-        elif classify(motion, y) != UNSURE:
-            decided = int(3)
+        decided = _AXIS_BOXES
+        if solves_cubic:
+            # any stage: what counts is that the status is computed
+            decided = wp.int32(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
+        elif not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
+            motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            y = coplanarity(motion)
+            if certified_sign_cubic(y.k, y.bound) != 0:
+                decided = _BERNSTEIN_SIGNS
+            elif direction_separates(motion, centroid_direction(motion)):
+                decided = _SEPARATING_DIRECTION
+            elif reduced:
+                decided = wp.where(classify_reduced(motion, y) != UNSURE, _CLASSIFICATION, _SUBDIVISION)
+            elif classify(motion, y) != UNSURE:
+                decided = _CLASSIFICATION
+            elif impact(motion, y, UNSURE, wp.float64(TOLERANCE)).status != UNSURE:
+                decided = _SUBDIVISION
+            else:
+                decided = _EXACT
         stage[i] = wp.int8(decided)
+        cycles[i] = _clock() - start
 
-    return {
-        "cull": cull,
-        "cull_batches": cull_batches,
-        "classify_survivors": classify_survivors,
-        "subdivide": subdivide,
-        "classify_survivors_reduced": classify_survivors_reduced,
-        "cubic": cubic,
-        "trace": trace,
-    }
+    return cubic, cull, cull_batches, classify_survivors, trace
 
 
 @dataclass(frozen=True)
@@ -297,10 +226,10 @@ class Queries:
 
     Attributes:
         kind: "vertex_face" or "edge_edge".
-        x0: Positions of the mesh at the start, float32 or float64, shape [vertex_count, 3].
+        x0: Positions of the mesh at the start of the step, float32 or float64, shape [vertex_count, 3].
         x1: Positions at its end, of the same type.
         elements: Vertices of its faces (vertex_face) or edges (edge_edge), int32, shape [element_count, 3 or 2].
-        pairs: (vertex, face) or (edge, edge), int32, shape [n, 2].
+        pairs: (vertex, face) or (edge, edge), no pair twice, int32, shape [n, 2].
     """
 
     kind: str
@@ -310,8 +239,8 @@ class Queries:
     pairs: np.ndarray
 
     @classmethod
-    def of_points(cls, kind, points) -> "Queries":
-        """Queries with four vertices each of their own, from rows as of :func:`warp_bsc.query_vertex_face`."""
+    def of_points(cls, kind: str, points: np.ndarray) -> "Queries":
+        """Queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
         n = len(points)
         x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
         vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
@@ -319,15 +248,15 @@ class Queries:
             return cls(kind, x0, x1, np.ascontiguousarray(vertices[:, 1:]), np.stack([4 * rows, rows], axis=1))
         return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
 
-    def points(self, which=slice(None)) -> np.ndarray:
+    def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
         """Points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
         pairs = self.pairs[which]
         first = pairs[:, :1] if self.kind == "vertex_face" else self.elements[pairs[:, 0]]
         corners = np.concatenate([first, self.elements[pairs[:, 1]]], axis=1)
         return np.concatenate([self.x0[corners], self.x1[corners]], axis=1)
 
-    def __len__(self):
-        """How many queries there are."""
+    def __len__(self) -> int:
+        """The number of queries."""
         return len(self.pairs)
 
 
@@ -336,123 +265,136 @@ class QuerySet:
 
     Attributes:
         kind: "vertex_face" or "edge_edge".
-        count: How many.
-        arrays: What all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d; elements,
-            two-dimensional array of int; and pairs, array of vec2i.
+        count: Number of queries.
+        pairs: The queries' pairs on the host, without repetitions, int32, shape [n, 2].
+        arrays: The arrays that all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d;
+            elements, two-dimensional array of int; and pairs, array of vec2i.
     """
 
-    def __init__(self, queries, device, *, repeated=1):
-        """Copies :class:`Queries` to a device, their pairs so many times one after the other."""
+    def __init__(self, queries: Queries, device: wp.DeviceLike, *, repeated: int = 1):
+        """Copies queries to a device, with their pairs ``repeated`` times one after the other."""
         self.kind = queries.kind
         self.device = wp.get_device(device)
         self.dtype = wp.vec3 if queries.x0.dtype == np.float32 else wp.vec3d
-        pairs = np.tile(queries.pairs, (repeated, 1))
-        self.count = len(pairs)
+        self.pairs = queries.pairs
+        self.count = repeated * len(queries)
         self.arrays = [
             *(wp.array(x, dtype=self.dtype, device=device) for x in (queries.x0, queries.x1)),
             wp.array(queries.elements, dtype=int, device=device),
-            wp.array(pairs, dtype=wp.vec2i, device=device),
+            wp.array(np.tile(queries.pairs, (repeated, 1)), dtype=wp.vec2i, device=device),
         ]
 
 
 class MethodRun:
-    """A method on a set of queries, with its arrays on the device.
+    """A method on a set of queries, with its buffers on the device.
 
     Attributes:
         method: One of :data:`METHODS`.
         queries: The queries.
-        status: Of each query after a launch, FREE, HIT or UNSURE, Warp array of int8.
     """
 
-    def __init__(self, method, queries):
-        """Makes the arrays."""
+    def __init__(self, method: str, queries: QuerySet):
+        """Allocates buffers that are large enough for all launches."""
         self.method = method
         self.queries = queries
         n, device = queries.count, queries.device
-        self.status = wp.zeros(n, dtype=wp.int8, device=device)
-        self._counts = wp.zeros(len(_Count), dtype=wp.int64, device=device)
-        self._survivors, self._open, *self._unsure = (wp.empty(n, dtype=int, device=device) for _ in range(4))
-        self._keys = wp.empty(n if method == "exact" else 0, dtype=wp.int64, device=device)
-
-    def launch(self, *, ticks=None):
-        """Answers all queries, without asking the device anything.
-
-        Args:
-            ticks: To which the clock cycles of each query are added, but for exact arithmetic's, Warp array of int64.
-        """
-        queries = self.queries
-        kernels = _kernels(queries.kind, queries.dtype)
-        arrays = queries.arrays
-        if self.method == "cubic":
-            outputs = [self.status, ticks]
-            launch_over(kernels["cubic"], queries.count, inputs=arrays, outputs=outputs, device=queries.device)
+        if method not in NARROW_PHASE_METHODS:
+            self._status = wp.zeros(n, dtype=wp.int8, device=device)
+            self._survivors = wp.empty(n, dtype=int, device=device)
+            self._survivor_count = wp.zeros(1, dtype=wp.int64, device=device)
             return
-        counts = self._counts
-        counts.zero_()
-        self.status.zero_()  # FREE, but for what the culls leave
-        roundoff = 0.0 if self.method in ("float", "reduced") else ROUNDOFF
-        outputs = [self._survivors, counts, ticks]
-        inputs = [*arrays, roundoff]
-        if queries.device.is_cpu:
-            batches = -(-queries.count // BATCH)
-            launch_over(
-                kernels["cull_batches"], batches, inputs=inputs, outputs=outputs, device=queries.device, chunk=16
-            )
-        else:
-            launch_over(kernels["cull"], queries.count, inputs=inputs, outputs=outputs, device=queries.device)
-        entries = [self._survivors, counts, _Count.SURVIVORS]
-        if self.method == "reduced":
-            inputs, outputs = [*arrays, self._survivors], [self.status, counts, ticks]
-            launch_over_queue(kernels["classify_survivors_reduced"], *entries, inputs=inputs, outputs=outputs)
-            return
-        inputs, outputs = [*arrays, roundoff, self._survivors], [self.status, self._open, counts, ticks]
-        launch_over_queue(kernels["classify_survivors"], *entries, inputs=inputs, outputs=outputs)
-        if self.method == "float":
-            return  # nothing is open
-        inputs, outputs = [*arrays, roundoff, self._open], [self.status, self._unsure[0], counts, ticks]
-        launch_over_queue(
-            kernels["subdivide"], self._open, counts, _Count.OPEN, inputs=inputs, outputs=outputs, block_dim=32
+        x0, _, elements, pairs = queries.arrays
+        first_elements = len(x0) if queries.kind == "vertex_face" else len(elements)
+        self._counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+        self._start_counts = wp.array(
+            [n if count == Count.NEAR else 0 for count in Count], dtype=wp.int64, device=device
         )
-        if self.method == "exact":
-            launch_exact_stage(
-                queries.kind,
-                *arrays[:3],
-                timed=False,
-                tolerance=TOLERANCE,
-                queues=self._unsure,
-                counts=counts,
-                asked=int(_Count.UNSURE),
-                too_wide=[int(_Count.WIDE), int(_Count.WIDER), int(_Count.WIDEST)],
-                refuted=int(_Count.REFUTED),
-                contacts=[arrays[3], self.status, *[None] * 4],
-                keys=self._keys,
-                last_key=0,
-            )
+        self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(elements)))
+        wp.copy(self._narrow_phase.near, pairs)
+        while True:
+            self.launch()
+            counts = self._counts.numpy()
+            if not self._narrow_phase.overflowed(counts):
+                break
+            self._narrow_phase.grow(counts)
 
-    def find_hits(self):
-        """Which queries collide by the method after a launch, bool, shape [n]: all that it has not shown to be free."""
-        return self.status.numpy() != FREE
+    def launch(self) -> None:
+        """Answers all queries; on a GPU without synchronizing with the device."""
+        queries = self.queries
+        arrays, device = queries.arrays, queries.device
+        if self.method in NARROW_PHASE_METHODS:
+            wp.copy(self._counts, self._start_counts)
+            self._narrow_phase.run(*arrays[:3], method=self.method, timed=False)
+            return
+        cubic, cull, cull_batches, classify_survivors, _ = _kernels(queries.kind, queries.dtype)
+        if self.method == "cubic":
+            launch_over(cubic, queries.count, inputs=arrays, outputs=[self._status], device=device)
+            return
+        self._status.zero_()  # FREE, unless a query survives the culls
+        self._survivor_count.zero_()
+        outputs = [self._survivors, self._survivor_count]
+        if device.is_cpu:
+            batches = -(-queries.count // BATCH)
+            launch_over(cull_batches, batches, inputs=arrays, outputs=outputs, device=device, chunk=16)
+        else:
+            launch_over(cull, queries.count, inputs=arrays, outputs=outputs, device=device)
+        inputs = [*arrays, self._survivors, self._survivor_count]
+        launch_over_queue(
+            classify_survivors, self._survivors, self._survivor_count, 0, inputs=inputs, outputs=[self._status]
+        )
+
+    def read_status(self) -> np.ndarray:
+        """The status of each query after a launch: FREE, HIT or UNSURE, int8, shape [n]. Not for repeated queries."""
+        if self.method not in NARROW_PHASE_METHODS:
+            return self._status.numpy().copy()
+        status = np.full(self.queries.count, FREE, dtype=np.int8)
+        contacts = self._narrow_phase.unsorted
+        count = int(self._counts.numpy()[Count.CONTACTS])
+        keys, of_contacts = (
+            np.ascontiguousarray(pairs, dtype=np.int32).view(np.int64)[:, 0]
+            for pairs in (self.queries.pairs, contacts.pairs.numpy()[:count])
+        )
+        order = np.argsort(keys)
+        status[order[np.searchsorted(keys, of_contacts, sorter=order)]] = contacts.answers.numpy()[:count]
+        return status
+
+    def find_hits(self) -> np.ndarray:
+        """Whether each query collides by the method, bool, shape [n]: it does unless it is shown to be free."""
+        return self.read_status() != FREE
 
 
-def measure_nanoseconds(run, *, repeat):
-    """Median time of a query [ns], all being launched at once: replays of a CUDA graph, launches on the CPU.
+def measure_nanoseconds(run: MethodRun, *, repeat: int) -> float:
+    """Median time of a query [ns] in launches of all queries: replays of a CUDA graph, calls on the CPU.
 
     A first launch, which loads the kernels, is not timed.
 
     Args:
-        run: The :class:`MethodRun`.
-        repeat: How many repetitions to take the median of.
+        run: The method and its queries.
+        repeat: Number of repetitions; their median counts.
     """
     return 1e6 * median_milliseconds(run.launch, run.queries.device, repeat) / run.queries.count
 
 
-def trace_stages(queries):
-    """Which of :data:`STAGES` decides each query by method "exact", int8, shape [n]."""
-    stage = wp.empty(queries.count, dtype=wp.int8, device=queries.device)
-    trace = _kernels(queries.kind, queries.dtype)["trace"]
-    launch_over(trace, queries.count, inputs=[*queries.arrays, ROUNDOFF], outputs=[stage], device=queries.device)
-    stages = stage.numpy().copy()
-    conservative = MethodRun("conservative", queries)
-    conservative.launch()
-    stages[conservative.status.numpy() == UNSURE] = STAGES.index("exact")
-    return stages
+def trace(queries: QuerySet, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the stage that decides each query, and the clock cycles that the query takes up to there.
+
+    One kernel runs all stages of a query one after the other, without the queues and vector instructions of the narrow
+    phase and without exact arithmetic. Cycles therefore rank queries; they do not measure a method. On a GPU each query
+    has a warp of its own, because lanes of a warp wait for each other.
+
+    Args:
+        queries: The queries.
+        method: One of :data:`METHODS`. The stages of "cubic" have no meaning.
+
+    Returns:
+        Indices into :data:`STAGES`, int8, shape [n]; cycles, int64, shape [n].
+    """
+    n, device = queries.count, queries.device
+    stage = wp.empty(n, dtype=wp.int8, device=device)
+    cycles = wp.empty(n, dtype=wp.int64, device=device)
+    lanes = _WARP_SIZE if device.is_cuda else 1
+    roundoff = 0.0 if method in ("float", "reduced") else ROUNDOFF
+    inputs = [*queries.arrays, lanes, method == "cubic", method == "reduced", roundoff]
+    *_, kernel = _kernels(queries.kind, queries.dtype)
+    launch_over(kernel, lanes * n, inputs=inputs, outputs=[stage, cycles], device=device)
+    return stage.numpy().copy(), cycles.numpy().copy()

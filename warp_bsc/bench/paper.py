@@ -1,14 +1,14 @@
-"""The paper's benchmarks: what each method takes for the candidate pairs of five scenes, and how often it is wrong.
+"""The paper's benchmarks: time and errors of each method on the candidate pairs of five scenes.
 
-Queries are the candidate pairs of the broad phase, which share no vertex and whose swept boxes overlap, of some of a
-scene's intervals; a random part of them where they are very many. All methods get the same arrays.
+Queries are the candidate pairs of the broad phase in some of a scene's intervals: pairs that share no vertex and whose
+swept boxes overlap. Where there are too many, a random part of them is measured. All methods get the same arrays.
 
-Answers are compared with the exact checker's for every query that any method calls a collision, which are all that are
-UNSURE and all that methods disagree about, and for a random sample of the others.
+The exact checker checks every query that any method calls a collision, which includes all that are UNSURE and all that
+the methods disagree about, and a random sample of the others.
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +20,11 @@ from ..detection.launch import one_core
 from ..detection.mesh import CollisionMesh
 from ..detection.narrow_phase import Count
 from ..kernels.signs import UNSURE
-from .detector import benchmark_detector, count_threads
-from .ipc_toolkit import PEERS, PeerMeasurement, ask_peer, measure_peer
-from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace_stages
+from .detector import benchmark_detector
+from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
+from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .scenes import BenchmarkScene
+from .timing import count_threads
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 
 __all__ = [
@@ -40,8 +41,8 @@ __all__ = [
 
 KINDS = ("vertex_face", "edge_edge")
 SEED = 0
-_TURNS = 8  # in which methods are timed
-_GPU_QUERIES = 2**22  # so many at least, by repeating them, are launched at once on a GPU
+_TURNS = 8  # of timing all methods
+_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # in a launch at least: fewer are repeated, so that its start does not count
 
 
 @dataclass(frozen=True)
@@ -49,30 +50,30 @@ class Effort:
     """How much is measured.
 
     Attributes:
-        intervals: Of a scene, evenly spaced.
-        queries: Of a scene at most.
-        sample: How many queries that no method calls a collision are checked, of a scene.
-        peer_queries: How many queries peers are timed on, of a scene.
-        adversaries: How many queries of each kind aim at trouble.
-        repeat: How many repetitions there are.
+        intervals: Number of intervals of a scene, evenly spaced.
+        queries: Largest number of queries of a scene.
+        sample: Number of queries of a scene that are checked although no method calls them a collision.
+        ipc_queries: Number of queries of a scene on which the IPC Toolkit is timed.
+        adversaries: Number of adversarial queries of each kind.
+        repeat: Number of repetitions.
     """
 
     intervals: int
     queries: int
     sample: int
-    peer_queries: int
+    ipc_queries: int
     adversaries: int
     repeat: int
 
     @classmethod
     def full(cls) -> "Effort":
-        """That of the whole benchmark."""
-        return cls(intervals=8, queries=2**19, sample=20_000, peer_queries=4000, adversaries=100_000, repeat=24)
+        """The effort of the whole benchmark."""
+        return cls(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
 
     @classmethod
     def quick(cls) -> "Effort":
-        """That of a first look."""
-        return cls(intervals=2, queries=2**15, sample=1000, peer_queries=500, adversaries=5000, repeat=3)
+        """The effort of a first look."""
+        return cls(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversaries=5000, repeat=3)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ class Place:
     Attributes:
         device: Warp device.
         cores: CPU cores, None on a GPU.
-        name: For people.
+        name: Name in tables.
     """
 
     device: wp.Device
@@ -92,12 +93,12 @@ class Place:
 
 @dataclass(frozen=True)
 class Timing:
-    """What the methods take at one place.
+    """Times of the methods at one place.
 
     Attributes:
-        place: Where.
+        place: The place.
         nanoseconds: Mean time of a query by method [ns].
-        worst: The slowest query of each method; empty where it was not looked for.
+        worst: The slowest query of each method; empty where it was not searched for.
     """
 
     place: Place
@@ -107,12 +108,12 @@ class Timing:
 
 @dataclass(frozen=True)
 class Errors:
-    """How the answers of a method compare with the truth.
+    """The answers of a method, compared with the truth.
 
     Attributes:
-        hits: Queries that it calls collisions.
-        false_positives: Those of them that are none, all of which were checked.
-        false_negatives: Collisions among the checked queries that it does not find.
+        hits: Number of queries that it calls collisions; all of them were checked.
+        false_positives: Number of hits that are free.
+        false_negatives: Number of collisions among the checked queries that it calls free.
     """
 
     hits: int
@@ -125,23 +126,23 @@ class SceneBenchmark:
     """The measurements of a scene.
 
     Attributes:
-        name: Of the scene.
-        triangles: Of its mesh, the largest of its intervals.
+        name: Name of the scene.
+        triangles: Number of triangles in the largest mesh of its intervals.
         precision: Bits of a coordinate, 32 or 64.
         intervals: The numbers of the intervals that were measured.
-        candidates: How many candidate pairs these have.
-        queries: How many of them were asked, by kind.
-        collisions: How many of the checked ones collide.
-        unsure: How many floating point could not certify.
-        checked: How many answers were compared with the truth: all that any method calls a collision and ``sample``.
-        sample: How many of them are a random part of the others.
-        errors: By method.
-        disagreeing: How many answers of a method differ between places; none should.
-        stages: How many queries each of :data:`STAGES` decides.
-        timings: By place.
-        stage_milliseconds: Mean time of a detection by stage, on the last place's device [ms].
-        frame_milliseconds: Mean time of a detection with method "exact", likewise [ms].
-        peers: Measurements of the IPC Toolkit by method; empty if it was not asked for.
+        candidates: Number of their candidate pairs.
+        queries: Number of these pairs that are measured, by kind.
+        collisions: Number of checked queries that collide.
+        unsure: Number of queries that floating point could not certify.
+        checked: Number of queries compared with the truth: all that any method calls a collision, ``sample`` others.
+        sample: Number of checked queries that no method calls a collision.
+        errors: Errors by method.
+        disagreeing: Number of answers of a method that differ between devices; none should.
+        stages: Number of queries that each of :data:`STAGES` decides.
+        timings: Times by place.
+        stage_milliseconds: Mean time of a detection with method "exact" by stage, on the last place's device [ms].
+        frame_milliseconds: Mean time of such a detection [ms].
+        ipc_toolkit: Measurements of the IPC Toolkit by method; empty if it was not measured.
     """
 
     name: str
@@ -160,11 +161,11 @@ class SceneBenchmark:
     timings: list[Timing]
     stage_milliseconds: dict[str, float]
     frame_milliseconds: float
-    peers: dict[str, PeerMeasurement]
+    ipc_toolkit: dict[str, IpcQueryTiming]
 
 
-def find_places(devices) -> list[Place]:
-    """Where to time methods on some devices: one core of the CPU, all that may be used, and GPUs."""
+def find_places(devices: list[wp.Device]) -> list[Place]:
+    """The places of some devices: one core of the CPU, all cores that may be used, and GPUs."""
     places = []
     for device in devices:
         if device.is_cuda:
@@ -178,26 +179,23 @@ def find_places(devices) -> list[Place]:
 
 
 def benchmark_scene(
-    name,
+    name: str,
     intervals: list[tuple[int, BenchmarkScene]],
     places: list[Place],
     effort: Effort,
     *,
-    peers=False,
+    compare: bool = False,
     progress: Callable[[str], None] = lambda doing: None,
 ) -> SceneBenchmark:
     """Measures all methods on a scene.
 
     Args:
-        name: What to call it.
+        name: Name of the scene.
         intervals: Its intervals, with their numbers.
-        places: Where to time the methods.
+        places: The places at which to time the methods.
         effort: How much to measure.
-        peers: Whether to measure the IPC Toolkit, too.
-        progress: Called with what comes next.
-
-    Returns:
-        SceneBenchmark: The measurements.
+        compare: Whether to measure the IPC Toolkit as well.
+        progress: Called before each part with its name.
 
     Raises:
         ValueError: If there are no candidate pairs.
@@ -205,14 +203,14 @@ def benchmark_scene(
     progress("candidate pairs")
     queries, candidates = _gather(intervals, places[-1].device, effort.queries)
     if not candidates:
-        raise ValueError(f"{name}: no candidate pairs, nothing comes near anything in the intervals measured")
+        raise ValueError(f"{name}: no candidate pairs: no swept boxes overlap in the intervals measured")
 
     answers, unsure, disagreeing = _find_answers(queries, places, progress)
     progress("the truth")
     errors, collisions, checked, sample, truth = _compare(queries, answers, effort)
     stages = np.zeros(len(STAGES), dtype=int)
     for found in queries.values():
-        stages += np.bincount(trace_stages(QuerySet(found, places[-1].device)), minlength=len(STAGES))
+        stages += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(STAGES))
 
     timings = []
     for place in places:
@@ -222,11 +220,11 @@ def benchmark_scene(
     scenes = [scene for _, scene in intervals]
     frames = [benchmark_detector(s, method="exact", device=places[-1].device, repeat=3) for s in scenes]
     by_stage = [frame.stage_milliseconds for frame in frames]
-    found_peers = {}
-    if peers:
-        for peer in PEERS:
-            progress(f"IPC Toolkit, {peer}")
-            found_peers[peer] = _measure_peer(peer, queries, truth, effort)
+    compared = {}
+    if compare:
+        for method in CCD_CLASSES:
+            progress(f"IPC Toolkit, {method}")
+            compared[method] = _time_ipc_toolkit(method, queries, truth, effort)
     return SceneBenchmark(
         name=name,
         triangles=max(len(scene.faces) for scene in scenes),
@@ -244,12 +242,14 @@ def benchmark_scene(
         timings=timings,
         stage_milliseconds={stage: float(np.mean([found[stage] for found in by_stage])) for stage in by_stage[0]},
         frame_milliseconds=float(np.mean([frame.detect_milliseconds for frame in frames])),
-        peers=found_peers,
+        ipc_toolkit=compared,
     )
 
 
-def _gather(intervals, device, most) -> tuple[dict[str, Queries], int]:
-    """The candidate pairs of some intervals by kind, or a random part of them; and how many there are."""
+def _gather(
+    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, most: int
+) -> tuple[dict[str, Queries], int]:
+    """The candidate pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
     x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
     elements, pairs = ({kind: [] for kind in KINDS} for _ in range(2))
@@ -275,7 +275,7 @@ def _gather(intervals, device, most) -> tuple[dict[str, Queries], int]:
     return {kind: found for kind, found in queries.items() if len(found)}, candidates
 
 
-def _find_candidates(scene, device):
+def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     detector = CollisionDetector(mesh)
@@ -286,13 +286,15 @@ def _find_candidates(scene, device):
     found = {}
     for kind, narrow_phase, elements in zip(KINDS, detector.narrow_phases, (mesh.faces, mesh.edges), strict=True):
         pairs = narrow_phase.near.numpy()[: int(narrow_phase.counts.numpy()[Count.NEAR])]
-        # a GPU finds them in any order
+        # a GPU finds them in an order that varies
         found[kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     return found
 
 
-def _find_answers(queries, places, progress):
-    """Which queries collide by each method and kind, how many are unsure, and how many answers depend on the place."""
+def _find_answers(
+    queries: dict[str, Queries], places: list[Place], progress: Callable[[str], None]
+) -> tuple[dict[tuple[str, str], np.ndarray], int, int]:
+    """Finds which queries collide by kind and method; and the numbers of UNSURE and of device-dependent answers."""
     answers, unsure, disagreeing = {}, 0, 0
     for place in {str(place.device): place for place in places}.values():
         progress(f"answers, {place.device}")
@@ -307,16 +309,18 @@ def _find_answers(queries, places, progress):
                 else:
                     answers[kind, method] = hits
                     if method == "conservative":
-                        unsure += int((run.status.numpy() == UNSURE).sum())
+                        unsure += int((run.read_status() == UNSURE).sum())
     return answers, unsure, disagreeing
 
 
-def _compare(queries, answers, effort):
+def _compare(
+    queries: dict[str, Queries], answers: dict[tuple[str, str], np.ndarray], effort: Effort
+) -> tuple[dict[str, Errors], int, int, int, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Compares the answers with the truth.
 
     Returns:
-        Errors by method; how many collide, were checked, and are in the random sample; and the checked queries of each
-        kind with their truth.
+        Errors by method; numbers of collisions, of checked queries and of those in the random sample; and by kind the
+        indices of the checked queries with their truth.
     """
     random = np.random.default_rng(SEED)
     total = sum(map(len, queries.values()))
@@ -328,32 +332,32 @@ def _compare(queries, answers, effort):
         suspicious = np.any(list(by_method.values()), axis=0)
         others = np.flatnonzero(~suspicious)
         some = random.permutation(others)[: int(np.ceil(effort.sample * len(found) / total))]
-        asked = np.concatenate([np.flatnonzero(suspicious), some])
-        truth = getattr(checker, kind)(found.points(asked))
-        truths[kind] = asked, truth
+        indices = np.concatenate([np.flatnonzero(suspicious), some])
+        truth = getattr(checker, kind)(found.points(indices))
+        truths[kind] = indices, truth
         collisions += int(truth.sum())
-        checked += len(asked)
+        checked += len(indices)
         sample += len(some)
         for method, hits in by_method.items():
-            hit = hits[asked]
+            hit = hits[indices]
             wrong[method] += [int(hits.sum()), int((hit & ~truth).sum()), int((~hit & truth).sum())]
     errors = {method: Errors(*map(int, counts)) for method, counts in wrong.items()}
     return errors, collisions, checked, sample, truths
 
 
-def _time_methods(queries, place, effort) -> Timing:
-    """Mean times of the methods at a place, and their slowest queries where queries run one beside the other."""
+def _time_methods(queries: dict[str, Queries], place: Place, effort: Effort) -> Timing:
+    """Mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
     if place.cores == 1:
         with one_core():
             return _time_methods_here(queries, place, effort, worst=True)
     return _time_methods_here(queries, place, effort, worst=place.device.is_cuda)
 
 
-def find_adversarial_worst(places, effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
-    """The slowest of queries that aim at trouble, by method, on one core and on GPUs.
+def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
+    """Finds the slowest adversarial query of each method, on one core and on GPUs.
 
     Args:
-        places: Where methods are timed.
+        places: The places at which to time the methods; other places are skipped.
         effort: How much to measure.
     """
     found = []
@@ -365,7 +369,7 @@ def find_adversarial_worst(places, effort) -> list[tuple[Place, dict[str, WorstQ
     return found
 
 
-def _find_slowest(queries, place, effort) -> dict[str, WorstQuery]:
+def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> dict[str, WorstQuery]:
     slowest = {}
     for of_kind in queries:
         for method, query in find_worst(of_kind, place.device, repeat=effort.repeat).items():
@@ -375,14 +379,14 @@ def _find_slowest(queries, place, effort) -> dict[str, WorstQuery]:
     return slowest
 
 
-def _time_methods_here(queries, place, effort, *, worst) -> Timing:
+def _time_methods_here(queries: dict[str, Queries], place: Place, effort: Effort, *, worst: bool) -> Timing:
     total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
     for found in queries.values():
-        repeated = -(-_GPU_QUERIES // total) if place.device.is_cuda else 1
+        repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
         on_device = QuerySet(found, place.device, repeated=repeated)
         runs = {method: MethodRun(method, on_device) for method in METHODS}
-        # in turns, of which the fastest counts: what else the machine does at times only slows
+        # in turns, the fastest of which counts: other work on the machine can only slow a turn down
         repeat = -(-effort.repeat // _TURNS)
         took = [
             {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
@@ -392,21 +396,23 @@ def _time_methods_here(queries, place, effort, *, worst) -> Timing:
     return Timing(place, nanoseconds, _find_slowest(queries.values(), place, effort) if worst else {})
 
 
-def _measure_peer(peer, queries, truths, effort) -> PeerMeasurement:
-    """Measures a method of the IPC Toolkit, on one core: Python asks one query after the other."""
+def _time_ipc_toolkit(
+    method: str, queries: dict[str, Queries], truths: dict[str, tuple[np.ndarray, np.ndarray]], effort: Effort
+) -> IpcQueryTiming:
+    """Measures a method of the IPC Toolkit, on one core: Python calls it query by query."""
     random = np.random.default_rng(SEED)
     total = sum(map(len, queries.values()))
     number = nanoseconds = call = 0
     wrong = np.zeros(3, dtype=int)
     for kind, found in queries.items():
         share = len(found) / total
-        some = random.permutation(len(found))[: int(np.ceil(effort.peer_queries * share))]
-        took, called = measure_peer(peer, kind, found.points(some))
+        some = random.permutation(len(found))[: int(np.ceil(effort.ipc_queries * share))]
+        took, called = time_queries(method, kind, found.points(some))
         number += len(some)
         nanoseconds += took * share
         call += called * share
-        asked, truth = truths[kind]
-        part = random.permutation(len(asked))[: int(np.ceil(effort.peer_queries * share))]
-        hit, truth = ask_peer(peer, kind, found.points(asked[part])), truth[part]
+        indices, truth = truths[kind]
+        part = random.permutation(len(indices))[: int(np.ceil(effort.ipc_queries * share))]
+        hit, truth = answer_queries(method, kind, found.points(indices[part])), truth[part]
         wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
-    return PeerMeasurement(number, nanoseconds, call, *map(int, wrong))
+    return IpcQueryTiming(number, nanoseconds, call, *map(int, wrong))

@@ -1,4 +1,4 @@
-"""Benchmark of elementary queries: how many a second are answered where queries and answers stay on the device."""
+"""Measures how many elementary queries a second are answered; queries and answers stay on the device."""
 
 import functools
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..cli.query_file import KINDS
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.narrow_phase import TOLERANCE
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -18,9 +17,10 @@ from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
-from .detector import median_milliseconds
+from .timing import median_milliseconds
 
 __all__ = [
+    "KINDS",
     "MODES",
     "SEED",
     "QueryBenchmark",
@@ -31,19 +31,26 @@ __all__ = [
     "generate_touching_queries",
 ]
 
+KINDS = ("vertex-face", "edge-edge")
+
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
-"""What is measured, with the bytes of a query and its answer: the status only, one thread a query; with time of impact,
-coordinates and normal; the status only, a second kernel deciding what the culls of a first one leave; and the status
-only, by exact integers alone, of one limb a coordinate, of as many queries that floating point leaves open."""
+"""The modes that are measured, with the bytes of a query and its answer.
+
+- ``status``: finds the status, one thread a query.
+- ``impact``: finds the time of impact, coordinates and normal as well.
+- ``queued``: finds the status by two kernels: one culls, the other decides the survivors.
+- ``exact``: finds the status by exact integers of one limb a coordinate, for as many queries that floating point cannot
+  certify.
+"""
 
 SEED = 0
-"""Of the random numbers."""
+"""Seed of the random numbers."""
 
 _MOST_QUERIES = 2**26
-_COPIED_BYTES = 2**28  # more than caches hold
+_COPIED_BYTES = 2**28  # more than a cache holds
 _MISSES = dict(zip(KINDS, (1.32, 2.33), strict=True))
-"""By how much, at most along each axis, features that fly at each other fail to change places: such that the culls
-leave a third of the queries."""
+"""The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
+culls."""
 
 _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
 """Without fused operations every device computes the same bits."""
@@ -51,12 +58,12 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 
 @dataclass(frozen=True)
 class QueryBenchmark:
-    """What the queries of one kind were answered, and how long it took.
+    """Answers to the queries of one kind, and the times to find them.
 
     Attributes:
         kind: "vertex-face" or "edge-edge".
         status: The answers, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
-        survivors: How many queries the culls leave.
+        survivors: Number of queries that no cull decides.
         milliseconds: Median time to answer all queries, by mode [ms].
     """
 
@@ -67,7 +74,7 @@ class QueryBenchmark:
 
     @property
     def survivor_share(self) -> float:
-        """Which part of the queries the culls leave."""
+        """The share of the queries that no cull decides."""
         return self.survivors / len(self.status)
 
     @property
@@ -82,7 +89,7 @@ class QueryBenchmark:
 
     @property
     def unsure(self) -> int:
-        """Number of queries that floating point could not certify either way."""
+        """Number of queries that floating point could not certify."""
         return int((self.status == UNSURE).sum())
 
     @property
@@ -92,7 +99,7 @@ class QueryBenchmark:
 
     @property
     def bytes_per_second(self) -> dict[str, float]:
-        """Bytes of queries and answers that are moved at least, by mode [1/s]."""
+        """Bytes of queries read and of answers written, by mode [1/s]."""
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
 
@@ -121,9 +128,9 @@ def _rounded(x: wp.vec3) -> wp.vec3:
 
 @wp.kernel(**_KERNEL)
 def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
-    """Moves the first point of each query so that it is on an edge, from point ``other`` to the next, at half time.
+    """Moves the first point of each query onto the edge from point ``other`` to the next, at half time.
 
-    After rounding all numbers are small multiples of 2^-11, so that this is exact.
+    After rounding, all numbers are small multiples of 2^-11, so that this is exact.
     """
     i = first + wp.tid()
     for j in range(8):
@@ -245,23 +252,23 @@ def _kernels(kind):
     return find_status, find_impact, cull, classify_survivors, find_exact_status
 
 
-def check_query_count(count):
+def check_query_count(count: int) -> None:
     """Raises ValueError if there are too few or too many queries."""
     if not 1 <= count <= _MOST_QUERIES:
         raise ValueError(f"the number of queries must be in [1, {_MOST_QUERIES}], not {count}")
 
 
-def generate_queries(kind, count, *, device=None) -> wp.array:
-    """Random queries, the same on every device, the first of many being those of few.
+def generate_queries(kind: str, count: int, *, device: wp.DeviceLike = None) -> wp.array:
+    """Random queries, the same on every device; a larger number begins with the queries of a smaller one.
 
     Args:
         kind: "vertex-face" or "edge-edge".
-        count: How many.
+        count: Number of queries.
         device: Warp device; default: Warp's default.
 
     Returns:
-        Positions, rows as those of :func:`query_vertex_face` or :func:`query_edge_edge`, array of vec3, shape
-        [count, 8].
+        Positions, rows as of :func:`warp_bsc.query_vertex_face` or :func:`warp_bsc.query_edge_edge`, array of vec3,
+        shape [count, 8].
     """
     device = wp.get_device(device)
     points = wp.empty((count, 8), dtype=wp.vec3, device=device)
@@ -270,10 +277,10 @@ def generate_queries(kind, count, *, device=None) -> wp.array:
     return points
 
 
-def generate_touching_queries(kind, count, *, device=None) -> wp.array:
-    """Queries that touch an edge, or a vertex that edge, at half time: floating point leaves nearly all open.
+def generate_touching_queries(kind: str, count: int, *, device: wp.DeviceLike = None) -> wp.array:
+    """Random queries whose first point touches an edge at half time: floating point can certify almost none.
 
-    Arguments and result as of :func:`generate_queries`, of which they are made.
+    Arguments and result: as of :func:`generate_queries`, whose queries they are made from.
     """
     points = generate_queries(kind, count, device=device)
     other = 1 if kind == "vertex-face" else 2
@@ -281,23 +288,22 @@ def generate_touching_queries(kind, count, *, device=None) -> wp.array:
     return points
 
 
-def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBenchmark:
-    """Measures how long random queries take, in each mode: replays of a CUDA graph, launches on the CPU.
+def benchmark_queries(
+    kind: str, *, count: int | None = None, device: wp.DeviceLike = None, repeat: int = 20
+) -> QueryBenchmark:
+    """Measures the time of random queries in each mode: replays of a CUDA graph, launches on the CPU.
 
     A first run of each mode is not timed.
 
     Args:
         kind: "vertex-face" or "edge-edge".
-        count: How many queries; default: 2^24 on a GPU, 2^18 on the CPU.
+        count: Number of queries; default: 2^24 on a GPU, 2^18 on the CPU.
         device: Warp device; default: Warp's default.
-        repeat: How many repetitions the medians are of.
-
-    Returns:
-        QueryBenchmark: The measurements.
+        repeat: Number of repetitions; their medians count.
 
     Raises:
         ValueError: If there are too few or too many queries.
-        RuntimeError: If two modes find different answers, or exact arithmetic none where features touch.
+        RuntimeError: If two modes find different answers, or exact arithmetic misses features that touch.
     """
     device = wp.get_device(device)
     if count is None:
@@ -306,7 +312,7 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
     find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
     touching = generate_touching_queries(kind, count, device=device)
-    # of no value that an answer has
+    # no answer is -1
     status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
     toi = wp.empty(count, dtype=wp.float64, device=device)
     coordinates, normal = (wp.empty(count, dtype=wp.vec3d, device=device) for _ in range(2))
@@ -344,12 +350,12 @@ def benchmark_queries(kind, *, count=None, device=None, repeat=20) -> QueryBench
     return QueryBenchmark(kind, answers["status"].copy(), int(counts.numpy()[0]), milliseconds)
 
 
-def benchmark_copy(*, device=None, repeat=20) -> float:
-    """Measures how fast a device copies large arrays: bytes read and bytes written per second [1/s].
+def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
+    """Measures the rate at which a device copies a large array: bytes read plus bytes written [1/s].
 
     Args:
         device: Warp device; default: Warp's default.
-        repeat: How many repetitions to take the median of.
+        repeat: Number of repetitions; their median counts.
     """
     device = wp.get_device(device)
     source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)

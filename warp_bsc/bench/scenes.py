@@ -1,4 +1,4 @@
-"""The scenes that benchmarks measure: read from files, or generated."""
+"""The scenes that benchmarks measure, read from files or generated."""
 
 import re
 from collections.abc import Callable
@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 PAPER_SCENES = ("twisting", "funnel", "dancer", "flamenco", "crashing")
-"""Names of the scenes of the paper's benchmarks (paper, 5.2)."""
+"""Names of the scenes of the paper's benchmarks (Sec. 5.2)."""
 
 _FEWEST_TRIANGLES, _MOST_TRIANGLES = 1000, 20_000_000
 
@@ -32,7 +32,7 @@ class BenchmarkScene:
     """A mesh and one step of its motion.
 
     Attributes:
-        name: What the user called it.
+        name: The name that the user gave.
         faces: Vertex indices, int32, shape [face_count, 3].
         x0: Positions at the start of the step, float32 or float64, shape [vertex_count, 3].
         x1: Positions at its end, of the same type.
@@ -45,7 +45,7 @@ class BenchmarkScene:
 
 
 def default_scenes() -> list[str]:
-    """What is measured if nothing is named: the scene of a checkout, if this is one, and generated ones."""
+    """The scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
     scene = Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
     return [*([str(scene)] if scene.exists() else []), "cloth:5000", "cloth:50000"]
 
@@ -56,14 +56,11 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
     Args:
         name: A USD file; two meshes joined by a comma, ``first.ply,second.ply``, of any format that trimesh reads; or
             a generator and a number of triangles, ``cloth:5000``.
-        interval: Which interval between time samples of a USD file.
-
-    Returns:
-        BenchmarkScene: The scene.
+        interval: Number of the interval between time samples of a USD file, from 0.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If a file is broken, the two meshes do not fit, or there is no such generator or interval.
+        ValueError: If a file is broken, the two meshes do not fit together, or there is no such generator or interval.
     """
     generated = re.fullmatch(r"(\w+):([^/\\]*)", name)
     if generated:
@@ -78,10 +75,10 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
 
 
 def paper_scenes() -> list[str]:
-    """The scenes of the paper's benchmarks, which a checkout has.
+    """Paths of the scenes of the paper's benchmarks, which a checkout has.
 
     Raises:
-        FileNotFoundError: If this is none, or a scene is missing.
+        FileNotFoundError: If this is not a checkout, or a scene is missing.
     """
     assets = Path(__file__).parents[2] / "assets"
     paths = [assets / f"{name}.usd" for name in PAPER_SCENES]
@@ -95,9 +92,11 @@ def paper_scenes() -> list[str]:
 
 
 def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
-    """Reads some intervals of a scene, evenly spaced, with their numbers; one of what is no USD file.
+    """Reads intervals of a scene, evenly spaced, with their numbers; a scene that is not a USD file has one.
 
-    Arguments and errors as of :func:`load_scene`.
+    Args:
+        name: The scene, as of :func:`load_scene`, with its errors.
+        most: Largest number of intervals.
     """
     if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
         return [(0, load_scene(name))]
@@ -105,7 +104,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     count = len(scene.times) - 1
     if count < 1:
         raise ValueError(f"{name}: there is no interval, its meshes never move")
-    # the middles of so many equal parts
+    # the middles of equal parts
     chosen = sorted({(2 * i + 1) * count // (2 * min(most, count)) for i in range(min(most, count))})
     intervals = []
     for index in chosen:
@@ -114,7 +113,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     return intervals
 
 
-def _find_generator(name, generator, triangles):
+def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The mesh and the motion of a generated scene."""
     if generator not in GENERATORS:
         raise ValueError(f"{name}: there is no generator {generator}, only {', '.join(GENERATORS)}")
@@ -125,7 +124,7 @@ def _find_generator(name, generator, triangles):
     return GENERATORS[generator](int(triangles))
 
 
-def _load_pair(name):
+def _load_pair(name: str) -> BenchmarkScene:
     """A step from the vertices of one mesh file to those of another."""
     paths = name.split(",")
     if len(paths) != 2:
@@ -151,7 +150,7 @@ def _read_mesh(path):
     try:
         mesh = trimesh.load_mesh(path, process=False)
         faces = mesh.faces
-    except Exception as error:  # of any kind, as its readers meet what they did not expect
+    except Exception as error:  # its readers raise errors of any kind
         raise ValueError(f"{path}: not a readable triangle mesh: {error}") from error
     if not len(faces):
         raise ValueError(f"{path}: it has no triangles")
@@ -162,7 +161,7 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A wrinkled sheet, folded in half, that closes until the wrinkles of its two layers meet.
 
     Args:
-        triangles: About how many.
+        triangles: Approximate number of triangles.
 
     Returns:
         Faces, int32, shape [n, 3]; positions at the start and at the end [m], float32, shape [vertex_count, 3].
@@ -191,13 +190,13 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def generate_crash(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A square tube of thin sheet, crushed along its axis and pushed aside, every second fold of which just closes.
+    """A square tube of thin sheet, crushed along its axis and pushed aside; every second fold just closes.
 
-    A fold is of 16 triangles, and no vertex moves further than a few of them, so that candidates and hits grow with
-    the number of triangles, and no faster.
+    A fold has 16 triangles, and no vertex moves further than a few of them, so that candidates and hits grow in
+    proportion to the number of triangles.
 
     Args:
-        triangles: About how many.
+        triangles: Approximate number of triangles.
 
     Returns:
         Faces, int32, shape [n, 3]; positions at the start and at the end [m], float32, shape [vertex_count, 3].
@@ -231,8 +230,8 @@ GENERATORS: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """Generated scenes by name."""
 
 
-def _grid_shape(quads):
-    """Rows and columns of a nearly square grid of so many quads."""
+def _grid_shape(quads: int) -> tuple[int, int]:
+    """Rows and columns of a nearly square grid of about this number of quads."""
     side = int(quads**0.5)
     rows = np.arange(int(0.8 * side), side + 1)
     columns = np.round(quads / rows).astype(int)
@@ -240,8 +239,8 @@ def _grid_shape(quads):
     return int(rows[best]), int(columns[best])
 
 
-def _grid_faces(rows, columns, *, closed=False):
-    """Two triangles for each four vertices of a grid; a closed one has the first column beside the last."""
+def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
+    """Two triangles for each four vertices of a grid; in a closed grid the first column is next to the last."""
     vertex = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     if closed:
         vertex = np.column_stack([vertex, vertex[:, 0]])
@@ -249,10 +248,10 @@ def _grid_faces(rows, columns, *, closed=False):
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
-def _noise(*shape):
-    """Numbers in [-1, 1), the same each time, so that nothing lies exactly above anything."""
+def _noise(*shape: int) -> np.ndarray:
+    """Random numbers in [-1, 1), the same each time, so that no two features are aligned exactly."""
     return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
 
-def _stack(x, y, z):
+def _stack(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)

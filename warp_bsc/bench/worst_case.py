@@ -1,9 +1,9 @@
-"""The slowest query of each method: found by the clock of the processor, confirmed by many copies of it.
+"""The slowest query of each method: suspects by the processor's clock, times by copies of a query.
 
-A clock that is read before and after a query sees interrupts and waits for memory as well, so that all queries are
-measured a few times, the fewest cycles of each count, and the slowest few dozen are measured once more: each one alone,
-in so many copies that reading the clock, and starting a kernel, no longer matters; the shortest of several launches
-counts, as interrupts are no part of a query. On a GPU the copies fill it, so that every warp is full of the same query.
+A tracing kernel reads the clock before and after each query, a few times, as interrupts and waits for memory lengthen a
+query; the fewest cycles count. These cycles only choose suspects. The suspects are timed by the method itself: each one
+alone, in a launch of copies that is long against the start of a kernel. The shortest of several launches counts. On a
+GPU the copies fill the device, so that every warp is full of the same query.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..kernels.signs import UNSURE
-from .methods import METHODS, MethodRun, Queries, QuerySet, measure_nanoseconds
+from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 
 __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
 
@@ -20,7 +19,7 @@ _LOOKS = 3
 _SUSPECTS = 24
 _FEWEST_COPIES, _MOST_COPIES = 256, 2**16
 _GPU_COPIES = 2**18
-_CPU_NANOSECONDS = 4e6  # that a launch of copies takes on the CPU at least, if the copies are not too many
+_CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would take too many copies
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,9 @@ class WorstQuery:
     Attributes:
         method: The method.
         kind: "vertex_face" or "edge_edge".
-        index: Which of the queries of its kind.
-        points: Its points, as of :func:`warp_bsc.query_vertex_face`, shape [8, 3].
-        nanoseconds: Time that it takes by each method [ns].
+        index: Its index among the queries of its kind.
+        points: Its points, rows as of :func:`warp_bsc.query_vertex_face`, shape [8, 3].
+        nanoseconds: Its time by each method [ns].
     """
 
     method: str
@@ -42,16 +41,16 @@ class WorstQuery:
     nanoseconds: dict[str, float]
 
 
-def find_worst(queries, device, *, repeat) -> dict[str, WorstQuery]:
+def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str, WorstQuery]:
     """Finds the slowest query of each method.
 
     Args:
-        queries: The :class:`~warp_bsc.bench.methods.Queries`.
+        queries: The queries to search.
         device: Warp device.
-        repeat: How many repetitions to take the shortest of.
+        repeat: Number of repetitions; the shortest counts.
 
     Returns:
-        By method.
+        The slowest queries by method.
     """
     kind = queries.kind
     on_device = QuerySet(queries, device)
@@ -66,11 +65,11 @@ def find_worst(queries, device, *, repeat) -> dict[str, WorstQuery]:
     return slowest
 
 
-def adversarial_queries(kind, count, *, seed=0) -> Queries:
-    """Queries that aim at trouble, a third each, with small integers for coordinates, so that much is exactly zero.
+def adversarial_queries(kind: str, count: int, *, seed: int = 0) -> Queries:
+    """Random degenerate queries, whose coordinates are small integers, so that many polynomials are exactly zero.
 
-    Points anywhere, which touch at corners and edges, rest, and turn back from zero; motion in one plane; and features
-    that start in one plane and leave it.
+    A third of them move in one plane, a third start in one plane and leave it, and a third have points anywhere: these
+    touch at corners and edges, rest, or turn back from zero.
     """
     random = np.random.default_rng(seed)
     points = random.integers(-2, 3, (count, 8, 3)).astype(np.float32)
@@ -79,27 +78,21 @@ def adversarial_queries(kind, count, *, seed=0) -> Queries:
     return Queries.of_points(kind, points)
 
 
-def _find_suspects(method, queries):
-    """The queries that seem to be slowest, by their numbers."""
-    run = MethodRun(method, queries)
-    fewest = np.full(queries.count, np.iinfo(np.int64).max)
-    ticks = wp.empty(queries.count, dtype=wp.int64, device=queries.device)
-    for _ in range(_LOOKS):
-        ticks.zero_()
-        run.launch(ticks=ticks)
-        fewest = np.minimum(fewest, ticks.numpy())
+def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
+    """Indices of the queries that are likely to be the slowest."""
+    stages, cycles = trace(queries, method)
+    for _ in range(_LOOKS - 1):
+        cycles = np.minimum(cycles, trace(queries, method)[1])
     count = min(_SUSPECTS, queries.count)
-    suspects = np.argpartition(fewest, -count)[-count:]
+    suspects = np.argpartition(cycles, -count)[-count:]
     if method == "exact":
-        # the clock does not run in the exact stage
-        unsure = MethodRun("conservative", queries)
-        unsure.launch()
-        left = np.flatnonzero(unsure.status.numpy() == UNSURE)
-        suspects = np.concatenate([suspects, np.random.default_rng(0).permutation(left)[:count]])
+        # the trace has no exact arithmetic
+        undecided = np.flatnonzero(stages == STAGES.index("exact"))
+        suspects = np.concatenate([suspects, np.random.default_rng(0).permutation(undecided)[:count]])
     return suspects
 
 
-def _time_alone(method, kind, points, device, repeat) -> float:
+def _time_alone(method: str, kind: str, points: np.ndarray, device: wp.Device, repeat: int) -> float:
     """Time of a query [ns] among copies of itself."""
     if device.is_cuda:
         copies = _GPU_COPIES
@@ -110,7 +103,7 @@ def _time_alone(method, kind, points, device, repeat) -> float:
     return _time_copies(method, kind, points, copies, device, repeat)
 
 
-def _time_copies(method, kind, points, copies, device, repeat):
+def _time_copies(method: str, kind: str, points: np.ndarray, copies: int, device: wp.Device, repeat: int) -> float:
     queries = QuerySet(Queries.of_points(kind, points[None]), device, repeated=copies)
     run = MethodRun(method, queries)
     return min(measure_nanoseconds(run, repeat=1) for _ in range(repeat))

@@ -1,5 +1,6 @@
-"""``warp-bsc bench``: the paper's benchmarks from the command line."""
+"""The command ``warp-bsc bench paper``: measures the paper's benchmarks."""
 
+import argparse
 import importlib.util
 import json
 from pathlib import Path
@@ -7,23 +8,46 @@ from pathlib import Path
 import warp as wp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .._atomic_file import OutputFile
+from .._atomic_file import STDOUT, OutputFile
+from ..bench import ipc_toolkit
 from ..bench.figure import draw_paper_benchmarks
-from ..bench.ipc_toolkit import has_peers
-from ..bench.paper import Effort, benchmark_scene, find_adversarial_worst, find_places
-from ..bench.scenes import PAPER_SCENES, load_intervals, paper_scenes
+from ..bench.paper import Effort, Place, SceneBenchmark, benchmark_scene, find_adversarial_worst, find_places
+from ..bench.scenes import PAPER_SCENES, BenchmarkScene, load_intervals, paper_scenes
+from ..bench.timing import limited_threads
 from .bench_paper_tables import paper_benchmarks_to_dict, print_paper_benchmarks
+from .device import find_device
+from .options import BENCH_EXIT_STATUS, Commands, add_command, add_threads
 from .tables import Console
 
-__all__ = ["add_paper_options", "run_paper_benchmarks"]
+__all__ = ["add_to"]
+
+_DESCRIPTION = """\
+Measure the paper's five benchmarks, on the candidate pairs of each scene: the
+mean and the worst time of a query by this project's methods, by a
+floating-point cubic solver, by the paper's own inside tests and, if installed,
+by the IPC Toolkit's methods; the wrong answers of each, found by exact
+arithmetic; the stages that decide the queries; and the time of a detection by
+stage. A scene is one of the five by name, or a scene of warp-bsc bench
+detector. All five take some minutes, with --quick one or two."""
+
+_EPILOG = f"""\
+examples:
+  warp-bsc bench
+  warp-bsc bench --quick
+  warp-bsc bench paper twisting crash:100000 --json times.json
+  warp-bsc bench paper cloth.usd --device cpu --figure times.png
+
+{BENCH_EXIT_STATUS}"""
 
 _FIGURES = (".png", ".svg", ".pdf")
-_STDOUT = "-"
 
 
-def add_paper_options(command) -> None:
-    """Add the options of the paper's benchmarks to their command."""
-    command.add_argument("scenes", metavar="SCENE", nargs="*", help="what to measure (default: the paper's five)")
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands, "paper", _run, summary="measure the paper's benchmarks", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure (default: the paper's five)")
     command.add_argument("--quick", action="store_true", help="take a first look: few intervals and queries")
     command.add_argument(
         "--device", help="Warp device, such as cpu or cuda:0 (default: the CPU, and the first GPU if there is one)"
@@ -32,29 +56,16 @@ def add_paper_options(command) -> None:
         "--json",
         metavar="FILE",
         nargs="?",
-        const=_STDOUT,
-        help="write JSON with everything found to a file; without one print it, and nothing else",
+        const=STDOUT,
+        help="write all results as JSON to a file; without FILE, print them instead of tables",
     )
     command.add_argument(
         "--figure", metavar="FILE", help="draw the paper's Figure 7: .png, .svg or .pdf; needs matplotlib"
     )
+    add_threads(command)
 
 
-def run_paper_benchmarks(arguments, find_device, limited_threads) -> int:
-    """Run the paper's benchmarks.
-
-    Args:
-        arguments: Of the command line.
-        find_device: The function that finds a Warp device by its name.
-        limited_threads: What keeps all that is measured to so many cores.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ValueError: If something cannot be measured or drawn.
-        OSError: If a file cannot be read or written.
-    """
+def _run(arguments: argparse.Namespace) -> int:
     _check(arguments)
     effort = Effort.quick() if arguments.quick else Effort.full()
     known = dict(zip(PAPER_SCENES, paper_scenes(), strict=True)) if _needs_assets(arguments.scenes) else {}
@@ -72,7 +83,7 @@ def run_paper_benchmarks(arguments, find_device, limited_threads) -> int:
             benchmarks = _measure(scenes, places, effort)
             adversarial = find_adversarial_worst(places, effort)
         found = paper_benchmarks_to_dict(benchmarks, adversarial, quick=arguments.quick)
-        if arguments.json != _STDOUT:
+        if arguments.json != STDOUT:
             print_paper_benchmarks(Console(), benchmarks, adversarial)
         else:
             print(json.dumps(found))
@@ -87,8 +98,8 @@ def run_paper_benchmarks(arguments, find_device, limited_threads) -> int:
     return 0
 
 
-def _check(arguments):
-    """Raises ValueError for what would fail after all has been measured."""
+def _check(arguments: argparse.Namespace) -> None:
+    """Raises ValueError for options that would fail only after everything has been measured."""
     if arguments.figure:
         if Path(arguments.figure).suffix not in _FIGURES:
             raise ValueError(f"--figure {arguments.figure}: its name must end in one of {', '.join(_FIGURES)}")
@@ -98,29 +109,32 @@ def _check(arguments):
         raise ValueError(f"--json {arguments.json}: this is a scene; name scenes before the options")
 
 
-def _needs_assets(names):
+def _needs_assets(names: list[str]) -> bool:
     return not names or any(name in PAPER_SCENES for name in names)
 
 
-def _outputs(arguments):
-    """The files to write, by option; their places are tried before anything is measured."""
-    outputs = {"json": None if arguments.json == _STDOUT else arguments.json, "figure": arguments.figure}
+def _outputs(arguments: argparse.Namespace) -> dict[str, str]:
+    """The files to write by option; they are opened before anything is measured, so that no result is lost."""
+    outputs = {"json": None if arguments.json == STDOUT else arguments.json, "figure": arguments.figure}
     return {option: path for option, path in outputs.items() if path}
 
 
-def _measure(scenes, places, effort):
-    """Measures scene by scene, with a bar on standard error."""
+def _measure(
+    scenes: list[tuple[str, list[tuple[int, BenchmarkScene]]]], places: list[Place], effort: Effort
+) -> list[SceneBenchmark]:
+    """Measures scene by scene, with a progress bar on standard error."""
     console = Console(stderr=True)
+    compare = ipc_toolkit.is_installed()
     columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        steps = 4 + len({str(place.device) for place in places}) + len(places) + 2 * has_peers()
+        steps = 4 + len({str(place.device) for place in places}) + len(places) + 2 * compare
         task = progress.add_task("Measuring", total=steps * len(scenes))
         benchmarks = []
         for number, (name, intervals) in enumerate(scenes):
             progress.update(task, completed=number * steps)
 
-            def show(doing, name=name):
-                progress.update(task, advance=1, description=f"{Path(name).stem}: {doing}")
+            def show(part: str, name: str = name) -> None:
+                progress.update(task, advance=1, description=f"{Path(name).stem}: {part}")
 
-            benchmarks.append(benchmark_scene(name, intervals, places, effort, peers=has_peers(), progress=show))
+            benchmarks.append(benchmark_scene(name, intervals, places, effort, compare=compare, progress=show))
         return benchmarks

@@ -1,36 +1,44 @@
-"""Shows what the paper's benchmarks found: tables for people, plain data for programs."""
+"""Shows the measurements of the paper's benchmarks: tables for people, plain data for programs."""
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
-from ..bench.ipc_toolkit import version_of_peers
+from ..bench import ipc_toolkit
 from ..bench.methods import METHODS, STAGES
-from ..bench.paper import SceneBenchmark, Timing
+from ..bench.paper import Place, SceneBenchmark, Timing
+from ..bench.worst_case import WorstQuery
 from .tables import count, make_table, say
 
-__all__ = ["METHOD_NAMES", "paper_benchmarks_to_dict", "print_paper_benchmarks"]
+__all__ = ["paper_benchmarks_to_dict", "print_paper_benchmarks"]
 
-METHOD_NAMES = {
+_HEADERS = {
     "float": "float",
     "conservative": "conserv.",
     "exact": "exact",
     "cubic": "cubic",
     "reduced": "reduced",
 }
-"""What tables and figures call the methods."""
+"""Short names of the methods, for the headers of tables."""
 
-_STAGE_HEADERS = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
+_STAGE_NAMES = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
 
 
-def print_paper_benchmarks(console: Console, benchmarks: list[SceneBenchmark], adversarial) -> None:
-    """Print what was measured, scene by scene.
+_Rows = list[tuple[str, SceneBenchmark]]
+"""Measurements of the scenes with their short names."""
+
+
+def print_paper_benchmarks(
+    console: Console, benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]]
+) -> None:
+    """Prints the measurements, a row a scene.
 
     Args:
-        console: Where to.
+        console: The terminal or file to print to.
         benchmarks: The measurements of each scene.
-        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
+        adversarial: The slowest adversarial queries at each place, by method.
     """
     rows = [(_short(found.name), found) for found in benchmarks]
     _print_queries(console, rows)
@@ -40,19 +48,22 @@ def print_paper_benchmarks(console: Console, benchmarks: list[SceneBenchmark], a
     _print_worst(console, rows, adversarial)
     _print_errors(console, rows)
     _print_frames(console, rows)
-    if any(found.peers for found in benchmarks):
-        _print_peers(console, rows)
-    say(console, "float, conservative, exact: this project's methods; all that is not certified free is a collision.")
-    say(console, "cubic: a floating-point cubic solver as in Provot 1997, Bridson et al. 2002 and El Topo.")
-    say(console, "reduced: float with the paper's own inside tests (3.5 there), without subdivision, as it has none.")
+    if any(found.ipc_toolkit for found in benchmarks):
+        _print_ipc_toolkit(console, rows)
+    say(
+        console,
+        "float, conservative, exact: this project's methods; all that is not certified free is a collision.",
+    )
+    say(console, "cubic: a floating-point cubic solver, as in Provot 1997, Bridson et al. 2002 and El Topo.")
+    say(console, "reduced: float with the inside tests of the paper's Sec. 3.5; like the paper, it does not subdivide.")
 
 
-def _short(name):
-    """Name of a scene without its folder and ending."""
+def _short(name: str) -> str:
+    """The name of a scene without folder and ending."""
     return ",".join(Path(path).stem if "/" in path or path.endswith(".usd") else path for path in name.split(","))
 
 
-def _print_queries(console, rows):
+def _print_queries(console: Console, rows: _Rows) -> None:
     table = make_table(
         "Scene",
         "Triangles",
@@ -61,7 +72,7 @@ def _print_queries(console, rows):
         "Queries",
         "Collisions",
         "Unsure",
-        caption="Candidates: pairs whose swept boxes overlap. Queries: a random part of them, all below.",
+        caption="Candidates: pairs whose swept boxes overlap. Queries: a random part of them, measured below.",
     )
     for name, found in rows:
         numbers = [found.triangles, len(found.intervals), found.candidates, sum(found.queries.values())]
@@ -70,8 +81,8 @@ def _print_queries(console, rows):
     console.print()
 
 
-def _print_stages(console, rows):
-    table = make_table("Decided by", *_STAGE_HEADERS, caption="Shares of the queries; by method exact.")
+def _print_stages(console: Console, rows: _Rows) -> None:
+    table = make_table("Decided by", *_STAGE_NAMES, caption="Shares of the queries, with method exact.")
     for name, found in rows:
         total = sum(found.stages.values())
         table.add_row(name, *(f"{found.stages[stage] / total:.2%}" for stage in STAGES))
@@ -79,9 +90,9 @@ def _print_stages(console, rows):
     console.print()
 
 
-def _print_times(console, rows: list[tuple[str, Timing]]):
+def _print_times(console: Console, rows: list[tuple[str, Timing]]) -> None:
     place = rows[0][1].place
-    table = make_table(f"ns a query, {place.name}", *METHOD_NAMES.values(), "cubic /\nfloat", "reduced\n/ float")
+    table = make_table(f"ns a query, {place.name}", *_HEADERS.values(), "cubic /\nfloat", "reduced\n/ float")
     for name, timing in rows:
         took = timing.nanoseconds
         ratios = (f"{took[method] / took['float']:.2f}" for method in ("cubic", "reduced"))
@@ -90,20 +101,20 @@ def _print_times(console, rows: list[tuple[str, Timing]]):
     console.print()
 
 
-def _few_digits(number):
-    """A number without fractions, or with two digits where it is small: times on a GPU are of many queries at once."""
+def _few_digits(number: float) -> str:
+    """A number without fraction, or with two digits if it is small, as times on a GPU are."""
     return f"{number:,.0f}" if number >= 10.0 else f"{number:.2g}"
 
 
-def _print_worst(console, rows, adversarial):
-    for place, worst_of_trouble in adversarial:
+def _print_worst(console: Console, rows: _Rows, adversarial: list[tuple[Place, dict[str, WorstQuery]]]) -> None:
+    for place, adversarial_worst in adversarial:
         found = [(name, timing.worst) for name, scene in rows for timing in scene.timings if timing.place == place]
-        found.append(("adversarial", worst_of_trouble))
+        found.append(("adversarial", adversarial_worst))
         table = make_table(
             f"Slowest query, ns, {place.name}",
-            *METHOD_NAMES.values(),
+            *_HEADERS.values(),
             "cubic /\nfloat",
-            caption="Each method's own slowest. In the paper: float 105, exact 876, El Topo's cubic solver 953.",
+            caption="The slowest query of each method. In the paper: float 105, exact 876, El Topo's solver 953.",
         )
         for name, worst in found:
             took = {method: query.nanoseconds[method] for method, query in worst.items()}
@@ -111,7 +122,7 @@ def _print_worst(console, rows, adversarial):
             table.add_row(name, *(_few_digits(took[method]) for method in METHODS), ratio)
         console.print(table)
         console.print()
-        table = make_table("Slowest of all", "Kind", "Number", *METHOD_NAMES.values())
+        table = make_table("Slowest of all", "Kind", "Number", *_HEADERS.values())
         for method in METHODS:
             name, query = max(
                 ((name, worst[method]) for name, worst in found),
@@ -123,12 +134,12 @@ def _print_worst(console, rows, adversarial):
         console.print()
 
 
-def _print_errors(console, rows):
+def _print_errors(console: Console, rows: _Rows) -> None:
     table = make_table(
         "Wrong answers",
         "Checked",
-        *METHOD_NAMES.values(),
-        caption="False positives + false negatives, of all that any method calls a collision and a random sample.",
+        *_HEADERS.values(),
+        caption="False positives + false negatives, of all collisions by any method and a random sample.",
     )
     for name, found in rows:
         wrong = (f"{e.false_positives:,} + {e.false_negatives:,}" for e in (found.errors[m] for m in METHODS))
@@ -140,11 +151,11 @@ def _print_errors(console, rows):
     console.print()
 
 
-def _print_frames(console, rows):
+def _print_frames(console: Console, rows: _Rows) -> None:
     stages = list(rows[0][1].stage_milliseconds)
     place = rows[0][1].timings[-1].place
     headers = ["\n".join(stage.rsplit(" ", 1)) for stage in stages]
-    table = make_table(f"ms a frame, {place.name}", *headers, "All", caption="The detector, by method exact.")
+    table = make_table(f"ms a frame, {place.name}", *headers, "All", caption="The detector, with method exact.")
     for name, found in rows:
         numbers = [*(found.stage_milliseconds[stage] for stage in stages), found.frame_milliseconds]
         table.add_row(name, *(f"{number:,.2f}" for number in numbers))
@@ -152,44 +163,46 @@ def _print_frames(console, rows):
     console.print()
 
 
-def _print_peers(console, rows):
+def _print_ipc_toolkit(console: Console, rows: _Rows) -> None:
     table = make_table(
-        f"IPC Toolkit {version_of_peers()}, 1 core",
+        f"IPC Toolkit {ipc_toolkit.version()}, 1 core",
         "ns a\nquery",
         "Call,\nns",
         "Checked",
         "False\npos.",
         "False\nneg.",
-        caption="Asked one by one from Python: what a call takes for features far apart is taken off.",
+        caption="Called query by query from Python; the time of a call for features far apart is subtracted.",
     )
     for name, found in rows:
-        for peer, took in found.peers.items():
+        for method, took in found.ipc_toolkit.items():
             numbers = (took.nanoseconds, took.call_nanoseconds)
             counts = (took.checked, took.false_positives, took.false_negatives)
-            table.add_row(f"{name}, {peer}", *(f"{number:,.0f}" for number in numbers), *(f"{n:,}" for n in counts))
+            table.add_row(f"{name}, {method}", *(f"{number:,.0f}" for number in numbers), *(f"{n:,}" for n in counts))
     console.print(table)
     console.print()
 
 
-def paper_benchmarks_to_dict(benchmarks: list[SceneBenchmark], adversarial, *, quick: bool) -> dict:
-    """Every measurement, to be written as JSON.
+def paper_benchmarks_to_dict(
+    benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]], *, quick: bool
+) -> dict[str, Any]:
+    """The measurements as plain data for JSON.
 
     Args:
         benchmarks: The measurements of each scene.
-        adversarial: The slowest of queries that aim at trouble, with the place that it is about.
+        adversarial: The slowest adversarial queries at each place, by method.
         quick: Whether only a first look was taken.
     """
     return {
         "benchmark": "paper",
         "quick": quick,
         "methods": list(METHODS),
-        "ipc_toolkit": version_of_peers() if any(found.peers for found in benchmarks) else None,
+        "ipc_toolkit": ipc_toolkit.version() if any(found.ipc_toolkit for found in benchmarks) else None,
         "scenes": [_scene_to_dict(found) for found in benchmarks],
         "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
     }
 
 
-def _scene_to_dict(found):
+def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
     return {
         "scene": found.name,
         "name": _short(found.name),
@@ -208,11 +221,11 @@ def _scene_to_dict(found):
         "timings": [_timing_to_dict(timing) for timing in found.timings],
         "stage_milliseconds": found.stage_milliseconds,
         "frame_milliseconds": found.frame_milliseconds,
-        "peers": {peer: asdict(took) for peer, took in found.peers.items()},
+        "peers": {method: asdict(took) for method, took in found.ipc_toolkit.items()},
     }
 
 
-def _timing_to_dict(timing):
+def _timing_to_dict(timing: Timing) -> dict[str, Any]:
     return {
         "place": timing.place.name,
         "device": str(timing.place.device),
@@ -223,7 +236,7 @@ def _timing_to_dict(timing):
     }
 
 
-def _worst_to_dict(worst):
+def _worst_to_dict(worst: dict[str, WorstQuery]) -> dict[str, Any]:
     return {
         method: {
             "kind": query.kind,

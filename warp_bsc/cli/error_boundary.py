@@ -1,10 +1,11 @@
-"""Where every error and every signal that ends a command becomes an exit status and one line. Imports little."""
+"""Turns every error and every signal that ends a command into an exit status and one line. Imports little."""
 
 import contextlib
+import io
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .._atomic_file import naming
@@ -13,18 +14,18 @@ from .interrupts import INTERRUPTS, Interrupted
 __all__ = ["describe", "run_guarded"]
 
 _BROKEN_PIPE = 141
-"""What a shell makes of the end by SIGPIPE."""
+"""The exit status that a shell reports after SIGPIPE."""
 
 
 def run_guarded(command: Callable[[], int]) -> int:
-    """Run a command.
+    """Runs a command and returns its exit status, also after an error or a signal.
 
     Args:
         command: Returns the exit status.
 
     Returns:
-        The exit status: 2 after any error, 128 and the number of the signal after one, which a line on standard error
-        then explains; without a line 141 where nobody reads the output any more.
+        2 after an error, 128 plus the number of a signal after a signal; a line on standard error says which. 141
+        without a line if the reader of standard output or standard error has closed it.
     """
     with INTERRUPTS.handled(), _encodable_output():
         try:
@@ -37,16 +38,14 @@ def run_guarded(command: Callable[[], int]) -> int:
         except KeyboardInterrupt as interrupt:
             return _explain(str(interrupt) or "interrupted", getattr(interrupt, "status", Interrupted().status))
         except BrokenPipeError:
-            with open(os.devnull, "w") as nowhere:  # for what is left, which Python would try to write at exit
-                for output in (1, 2):
-                    os.dup2(nowhere.fileno(), output)
+            _discard(1, 2)
             return _BROKEN_PIPE
         except Exception as error:
             return _explain(f"error: {describe(error)}", 2)
 
 
 def describe(error: BaseException) -> str:
-    """What an error says, in one line; of one that nobody foresaw also what it is and where it comes from."""
+    """The message of an error in one line; of an unforeseen error also its type and the line that raised it."""
     usd_errors = [part.commentary for part in error.args if hasattr(part, "commentary")]  # of a Tf.ErrorException
     text = " ".join(("; ".join(usd_errors) or str(error)).split())
     if usd_errors or (isinstance(error, OSError | ValueError) and text):
@@ -58,10 +57,10 @@ def describe(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _encodable_output():
-    """Write to standard output with escapes what its encoding does not have."""
+def _encodable_output() -> Iterator[None]:
+    """Writes characters that the encoding of standard output lacks as escapes."""
     stream = sys.stdout
-    if not hasattr(stream, "reconfigure"):
+    if not isinstance(stream, io.TextIOWrapper):
         yield
         return
     errors = stream.errors
@@ -69,11 +68,23 @@ def _encodable_output():
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # of what could not be written, which was said then
+        with contextlib.suppress(OSError):  # reported when the text was written
             stream.reconfigure(errors=errors)
 
 
-def _explain(line, status) -> int:
-    with contextlib.suppress(OSError):  # if standard error is full or closed as well
+def _explain(line: str, status: int) -> int:
+    """Prints why a command ended on standard error and returns the exit status."""
+    try:
         print(f"warp-bsc: {line}", file=sys.stderr, flush=True)
+    except OSError as error:  # standard error is full or closed as well
+        _discard(2)
+        if isinstance(error, BrokenPipeError):
+            return _BROKEN_PIPE
     return status
+
+
+def _discard(*outputs: int) -> None:
+    """Discards what is still buffered for standard output (1) or error (2): Python would fail on it at exit."""
+    with open(os.devnull, "w") as nowhere:
+        for output in outputs:
+            os.dup2(nowhere.fileno(), output)

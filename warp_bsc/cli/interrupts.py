@@ -1,8 +1,10 @@
-"""Signals that end a program: raised as Ctrl-C is, once, so that what is finished can be kept."""
+"""Signals that end the program: raised once, as KeyboardInterrupt, so that finished results can be kept."""
 
 import contextlib
 import signal
 import threading
+from collections.abc import Iterator
+from typing import Any
 
 __all__ = ["INTERRUPTS", "Interrupted"]
 
@@ -13,7 +15,7 @@ class Interrupted(KeyboardInterrupt):
     """A signal that ends the program.
 
     Attributes:
-        status: The exit status that is usual after it, 128 and its number.
+        status: The usual exit status after it: 128 plus its number.
     """
 
     def __init__(self, number: int = signal.SIGINT):
@@ -22,30 +24,30 @@ class Interrupted(KeyboardInterrupt):
 
 
 class _Interrupts:
-    """What becomes of SIGINT, SIGTERM and SIGHUP while :meth:`handled` says so.
+    """Handles SIGINT, SIGTERM and SIGHUP within :meth:`handled`.
 
-    Those that the program was told to ignore, as ``nohup`` does, stay ignored. In a thread other than the main one, to
-    which Python hands no signals, nothing changes.
+    Ignored signals, as under ``nohup``, stay ignored. In other threads than the main one, in which Python runs no
+    signal handlers, nothing changes.
 
     Attributes:
-        came: The first that came, None if there was none.
+        came: The first signal that came, None if none has come.
     """
 
     def __init__(self):
-        self.came = None
-        self._handlers = {}
+        self.came: Interrupted | None = None
+        self._handlers: dict[int, Any] = {}
         self._raises = False
 
     @contextlib.contextmanager
-    def handled(self):
-        """Let signals wait in the block, except where they are raised; then all is as it was."""
+    def handled(self) -> Iterator[None]:
+        """Lets signals wait in the block, except where they are raised; restores the handlers at its end."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         self.came, self._raises = None, False
         try:
             for number in _NUMBERS:
-                # None is a handler that was not set from Python and could not be brought back.
+                # None is a handler that was not set from Python; it could not be restored.
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._handlers[number] = signal.signal(number, self._handle)
             yield
@@ -54,24 +56,24 @@ class _Interrupts:
                 signal.signal(*self._handlers.popitem())
 
     @contextlib.contextmanager
-    def raised(self, raises: bool = True):
-        """Raise the first signal that comes in the block; those after it wait, so that nothing disturbs the end."""
+    def raised(self, raises: bool = True) -> Iterator[None]:
+        """Raises the first signal that comes in the block; later ones wait, so that they do not disturb the cleanup."""
         before, self._raises = self._raises, raises
         try:
             yield
         finally:
             self._raises = before and (self._raises or not raises)
 
-    def held(self):
-        """Let signals wait in the block."""
+    def held(self) -> contextlib.AbstractContextManager[None]:
+        """Lets signals wait in the block."""
         return self.raised(False)
 
-    def check(self):
-        """Raise the signal that came, if one did: while it waited, or where an exception is not handed on."""
+    def check(self) -> None:
+        """Raises the signal that came, if any: while it waited, or where its exception was swallowed."""
         if self.came:
             raise self.came
 
-    def _handle(self, number, _frame):
+    def _handle(self, number: int, _frame: object) -> None:
         self.came = self.came or Interrupted(number)
         if self._raises:
             self._raises = False

@@ -1,18 +1,20 @@
 """Reads the query files of the CCD benchmark: elementary queries in exact rational numbers, with their true answers.
 
 A file holds eight rows for each query, the points in the order of :func:`warp_bsc.query_vertex_face` or
-:func:`warp_bsc.query_edge_edge`. A row holds six integers, the numerator and denominator of x, y and z; or seven, the
-last being the query's true answer, 0 or 1, the same on all of its rows. The true answers may stand next to ``NAME.csv``
-in ``NAME_mma_bool.json`` as well, as a list of true and false.
+:func:`warp_bsc.query_edge_edge`. A row holds six integers, the numerator and denominator of x, y and z, or seven: the
+seventh is the query's true answer, 0 or 1, the same on all of its rows. The true answers may also be in
+``NAME_mma_bool.json`` next to ``NAME.csv``, as a list of true and false.
 
-Files of vertex-face and of edge-edge queries look the same. Which they are is told by the folder that they are in,
-``vertex-face`` or ``edge-edge``, or by a name that ends in ``vf`` or ``ee``.
+Files of vertex-face and of edge-edge queries look the same. The folder, ``vertex-face`` or ``edge-edge``, or a name
+that ends in ``vf`` or ``ee`` tells their kind.
 """
 
 import json
+import os
 import re
 import reprlib
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +25,7 @@ __all__ = ["KINDS", "QueryFile", "find_query_files", "read_query_file"]
 KINDS = ("vertex-face", "edge-edge")
 
 _INTEGERS = re.compile("-?[0-9]+(,-?[0-9]+)*")
-"""A row; Python takes more for an integer, 1_0 for ten."""
+"""A row; Python's ``int`` would accept more, such as 1_0 for ten."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,9 @@ class QueryFile:
     Attributes:
         path: The file.
         kind: ``"vertex-face"`` or ``"edge-edge"``.
-        points: Exactly the numbers of the file, shape [query_count, 8, 3], float64.
-        truth: The true answers, shape [query_count], bool; None where they are not known.
-        truth_path: The file that the true answers are from; None where they are not known.
+        points: The points, exactly the numbers of the file, float64, shape [query_count, 8, 3].
+        truth: The true answers, bool, shape [query_count]; None if they are not known.
+        truth_path: The file with the true answers; None if they are not known.
     """
 
     path: Path
@@ -45,11 +47,11 @@ class QueryFile:
     truth_path: Path | None
 
 
-def find_query_files(paths) -> list[Path]:
-    """The given files, and in the place of a folder all ``.csv`` files below it.
+def find_query_files(paths: Iterable[str | os.PathLike]) -> list[Path]:
+    """The given files, with each folder replaced by all ``.csv`` files in it and below.
 
     Raises:
-        FileNotFoundError: If a path does not exist, or there is no such file below a folder.
+        FileNotFoundError: If a path does not exist, or a folder has no such file.
     """
     files = []
     for path in map(Path, paths):
@@ -65,17 +67,17 @@ def find_query_files(paths) -> list[Path]:
     return files
 
 
-def read_query_file(path, *, kind: str | None = None) -> QueryFile:
-    """Read a file of queries.
+def read_query_file(path: str | os.PathLike, *, kind: str | None = None) -> QueryFile:
+    """Reads a file of queries.
 
     Args:
         path: The file.
-        kind: ``"vertex-face"`` or ``"edge-edge"``; None to tell it by the path.
+        kind: ``"vertex-face"`` or ``"edge-edge"``; default: told by the path.
 
     Raises:
-        ValueError: If the kind cannot be told, the file is not as described above, a number in it is not exactly a
-            double (the answer would be that of another query), or the true answers stand in both places and differ. The
-            message names the file and the line.
+        ValueError: If the path does not tell the kind, the file is not as described above, a number in it is not
+            exactly a double (the answer would be that of another query), or the true answers are in both places and
+            differ. The message names the file and the line.
     """
     path = Path(path)
     kind = kind or _kind_of(path)
@@ -131,8 +133,8 @@ def _read_rows(path: Path) -> np.ndarray:
         return np.array(rows, dtype=object)
 
 
-def _divide(path: Path, numerators, denominators) -> np.ndarray:
-    """The quotients as doubles, shape [row_count, 3], all exact."""
+def _divide(path: Path, numerators: np.ndarray, denominators: np.ndarray) -> np.ndarray:
+    """The exact quotients as doubles, shape [row_count, 3]."""
     quotients = np.zeros(numerators.shape)
     exact = np.zeros(numerators.shape, bool)
     if numerators.dtype != object:
@@ -155,12 +157,12 @@ def _divide(path: Path, numerators, denominators) -> np.ndarray:
     return quotients
 
 
-def _ratio(numerator, denominator) -> str:
-    """A ratio as text, shortened where it is long."""
+def _ratio(numerator: int, denominator: int) -> str:
+    """A ratio as text, shortened if it is long."""
     return f"{reprlib.repr(numerator)}/{reprlib.repr(denominator)}"
 
 
-def _truth_of_rows(path: Path, column) -> np.ndarray:
+def _truth_of_rows(path: Path, column: np.ndarray) -> np.ndarray:
     truth = column.reshape(-1, 8)
     wrong = (truth != truth[:, :1]) | ((truth != 0) & (truth != 1))
     if wrong.any():

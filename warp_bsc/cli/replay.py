@@ -1,4 +1,4 @@
-"""The command ``warp-bsc replay``: its options, and how a replay goes from the scene to all that was asked for."""
+"""The command ``warp-bsc replay``: finds the collisions in a USD scene and writes them to tables and files."""
 
 import argparse
 import contextlib
@@ -6,39 +6,95 @@ import errno
 import importlib
 import math
 import os
+from collections.abc import Generator
 
+import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .._atomic_file import STDOUT, ReplayOutput, naming
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
-from ..replay.intervals import replay
+from ..replay.intervals import Interval, replay
+from ..replay.scene_contacts import Contacts
 from ..replay.summary import Outcome
 from ..replay.usd_overlay import Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
+from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
 from .interrupts import INTERRUPTS, Interrupted
+from .options import (
+    ERROR_STATUS,
+    SIGNAL_STATUS,
+    Commands,
+    add_command,
+    add_detection_options,
+    add_fail_on_collision,
+    positive,
+)
 from .replay_tables import print_replay
 from .tables import Console, say
 
-__all__ = ["add_replay_options", "open_scene", "run_replay"]
+__all__ = ["add_to", "open_scene", "run_replay"]
+
+_DESCRIPTION = """\
+Find the collisions of the meshes of a USD scene, with themselves and with each
+other, between each two consecutive time samples; vertices move straight from
+sample to sample. Meshes that never move are obstacles: contacts between
+obstacles are excluded, and so are contacts of a mesh with itself if only its
+transform moves it. Rotations are sampled at every whole time code as well.
+Parts that cannot be read are named and left out. Files are written atomically.
+A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
+finished intervals, marked partial."""
+
+_EPILOG = f"""\
+examples:
+  warp-bsc replay cloth.usd
+  warp-bsc replay shot.usd --overlay hits.usda --report hits.html
+  warp-bsc replay shot.usd --between '/World/Coat' '/World/Body*' --no-self
+  warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
+  warp-bsc replay cloth.usd --device cpu --method conservative
+  warp-bsc replay cloth.usd --json > collisions.json
+  warp-bsc replay cloth.usd --fail-on-collision || echo "it collides"
+
+  a recording of one of Newton's examples:
+  python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
+      --output-path twist.usd
+  warp-bsc replay twist.usd
+
+exit status:
+  0  done, whether or not anything collides
+  1  collisions found, with --fail-on-collision
+{ERROR_STATUS}
+  3  --validate found a wrong answer
+  4  done, but parts of the scene could not be read and were left out; --strict
+     ends with 2 instead
+{SIGNAL_STATUS}
+If several apply, a signal comes before 2, then 3, 1 and 4."""
 
 _COLLIDES = 1
 _DISAGREES = 3
 _LEFT_OUT = 4
 
 
-def add_replay_options(command: argparse.ArgumentParser) -> None:
-    """Add the options that only this command has."""
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands,
+        "replay",
+        _run,
+        summary="find the collisions in a USD scene",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )
     command.add_argument("scene", metavar="SCENE", nargs="?", help="a .usd, .usda, .usdc or .usdz file")
 
-    which = command.add_argument_group("what is checked")
+    which = command.add_argument_group("selection")
     patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
     which.add_argument(
         "--prims",
         **patterns,
-        help="only meshes at or below these prims or instances, as the report names them; * stands for anything",
+        help="only meshes at or below these prims or instances, named as in the report; * matches any text",
     )
     which.add_argument("--exclude", **patterns, help="no meshes at or below these prims")
     which.add_argument(
@@ -46,7 +102,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         dest="self_collisions",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="whether a mesh is checked with itself (default: it is, if more than its transform moves it)",
+        help="check each mesh with itself (default: yes, unless only its transform moves it)",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
@@ -63,44 +119,56 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "--frames",
         type=_frames,
         metavar="START:END:STEP",
-        help="part of the time, as time codes; each may be left out, and without STEP all samples between are taken",
+        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
     )
     which.add_argument(
         "--subdivide",
-        type=_at_least_one,
+        type=positive,
         default=1,
         metavar="N",
-        help="check N steps from each time to the next, for motion that is not linear, as of what turns, for "
-        "which every whole time code is taken anyway (default: 1)",
+        help="divide the time from each sample to the next into N intervals, for motion that is not linear, such as "
+        "rotations (default: 1)",
     )
     which.add_argument(
-        "--strict", action="store_true", help="leave nothing out: what cannot be read is an error, with status 2"
+        "--strict",
+        action="store_true",
+        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
     )
     which.add_argument(
         "--validate",
         type=_validate,
         default=0,
         metavar="all|N",
-        help="ask the exact checker again: about all answers, or N hits and N other pairs of each interval",
+        help="compare answers with the exact checker: all, or N hits and N other pairs of each interval",
     )
 
-    out = command.add_argument_group("what comes out")
-    out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, that shows the collisions")
+    out = command.add_argument_group("output")
+    out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, which shows the collisions")
     file = {"type": _output, "metavar": "FILE"}
     out.add_argument("--report", **file, help="a page with charts and the worst interval in 3D, .html")
     printed = {"nargs": "?", "const": STDOUT, **file}
-    out.add_argument("--json", **printed, help="every collision as JSON; only that, without FILE")
-    out.add_argument("--csv", **printed, help="every collision as CSV; only that, without FILE")
+    out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
+    out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
+    add_detection_options(command, method="exact")
+    add_fail_on_collision(command)
 
 
-def open_scene(arguments) -> Scene:
-    """The scene that the options ask for.
+def _run(arguments: argparse.Namespace) -> int:
+    scene = open_scene(arguments)
+    device = find_device(arguments.device)
+    with loading_kernels(device):
+        load_detector(arguments.method, scene.dtype, device)
+    return run_replay(scene, arguments, device)
+
+
+def open_scene(arguments: argparse.Namespace) -> Scene:
+    """Opens the scene that the options name.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the options do not fit together, or the file is broken.
     """
-    # The file of these options may be left out: what follows is the scene then.
+    # The file of these options is optional: without it, argparse takes the scene that follows for it.
     for option in ("json", "csv"):
         if arguments.scene is None and getattr(arguments, option) not in (None, STDOUT):
             arguments.scene = getattr(arguments, option)
@@ -121,7 +189,7 @@ def open_scene(arguments) -> Scene:
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
     )
-    with INTERRUPTS.held():  # USD's modules catch what is raised while they are loaded, and are broken then
+    with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         importlib.import_module("warp_bsc.usd.meshes")
     INTERRUPTS.check()
     try:
@@ -138,23 +206,20 @@ def open_scene(arguments) -> Scene:
         raise ValueError(f"{arguments.scene}: {describe(error)}") from error
     for file in outputs:
         if file in scene.files:
-            raise ValueError(f"{file}: the scene is read from this file, what is written must be another")
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
     return scene
 
 
-def run_replay(scene: Scene, arguments, device) -> int:
-    """Replay a scene and write all that was asked for.
+def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> int:
+    """Replays a scene, writes the files that the options name, and returns the exit status.
 
     Args:
         scene: The scene.
         arguments: The options.
         device: The Warp device.
 
-    Returns:
-        The exit status.
-
     Raises:
-        ValueError: If the scene turns out to be broken, or a file could not be written. What was finished is on the
+        ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
             disk, as far as there is room.
     """
     settings = {"method": arguments.method, "device": str(device)}
@@ -174,12 +239,12 @@ def run_replay(scene: Scene, arguments, device) -> int:
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
             except Exception as error:
-                interrupt = INTERRUPTS.came  # of which a library may have made another error
+                interrupt = INTERRUPTS.came  # which a library may have turned into another error
                 problems += [] if interrupt else [_explain(error, scene)]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             outcome = Outcome(scene, intervals=intervals, stopped=stopped, **settings)
-            finished = outputs if intervals else []  # what was there before is better than nothing
-            # Nothing disturbs the files. Whoever reads the other ones may never come to the end.
+            finished = outputs if intervals else []  # an earlier file is better than an empty one
+            # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
             problems += _finish([output for output in finished if not output.is_stream], outcome)
             with INTERRUPTS.raised():
                 problems += _finish([output for output in finished if output.is_stream], outcome)
@@ -202,8 +267,8 @@ def run_replay(scene: Scene, arguments, device) -> int:
     return _LEFT_OUT if scene.left_out else 0
 
 
-def _explain(error, scene) -> str:
-    """What stopped a replay: that the scene is another now, if it is, which may show in any way."""
+def _explain(error: Exception, scene: Scene) -> str:
+    """Describes what stopped a replay: a change of the scene's files, which may cause any error, or the error."""
     try:
         scene.files.check()
     except ValueError as changed:
@@ -214,9 +279,9 @@ def _explain(error, scene) -> str:
 
 
 def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
-    """Put files in their places, without the last intervals where there is no room for all, and say what is missing.
+    """Puts files in their places, without the last intervals if there is no room for all; returns what is missing.
 
-    On a full disk all of them shrink for one another's sake, but not below half: tables are worth more than a page.
+    On a full disk all files shrink, to make room for one another, but not below half: tables matter more than a page.
     """
     problems, shortages = [], {}
     shared = 5  # times an eighth is a half
@@ -241,8 +306,10 @@ def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
     return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]
 
 
-def _open_outputs(stack, scene, arguments, settings) -> list[ReplayOutput]:
-    """The files to write."""
+def _open_outputs(
+    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, settings: dict[str, str]
+) -> list[ReplayOutput]:
+    """Opens the files to write; the stack discards those that are not finished."""
     makers = (
         (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
         (arguments.csv, HitsCsv),
@@ -257,8 +324,10 @@ def _open_outputs(stack, scene, arguments, settings) -> list[ReplayOutput]:
     return outputs
 
 
-def _track(scene, arguments, device):
-    """The intervals as they are found, with progress, rate and time left on a terminal."""
+def _track(
+    scene: Scene, arguments: argparse.Namespace, device: wp.Device
+) -> Generator[tuple[Interval, Contacts], None, None]:
+    """Yields the intervals as they are found, and shows progress, rate and time left on a terminal."""
     progress = Progress(
         TextColumn("Replaying"),
         BarColumn(bar_width=None),
@@ -302,12 +371,5 @@ def _frames(text: str) -> FrameRange:
     return FrameRange(start, end, step)
 
 
-def _at_least_one(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
-    return number
-
-
 def _validate(text: str) -> int | None:
-    return None if text == "all" else _at_least_one(text)
+    return None if text == "all" else positive(text)

@@ -1,8 +1,11 @@
-"""Shows what a replay found, on the terminal."""
+"""Shows the results of a replay on the terminal."""
+
+from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
+from ..replay.intervals import Interval
 from ..replay.summary import CERTIFIED_FOR, Outcome
 from .tables import LONGEST, count, make_table, say
 
@@ -10,11 +13,11 @@ __all__ = ["print_replay"]
 
 
 def print_replay(console: Console, outcome: Outcome) -> None:
-    """Print a table of the worst intervals and a summary.
+    """Prints a table of the worst intervals and a summary.
 
     Args:
-        console: Where to.
-        outcome: What was found.
+        console: The terminal or file to print to.
+        outcome: The results.
     """
     scene, intervals = outcome.scene, outcome.intervals
     say(
@@ -58,8 +61,8 @@ def print_replay(console: Console, outcome: Outcome) -> None:
         unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
         say(
             console,
-            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that could not be told apart from "
-            f"collisions: {unsure:,}.",
+            f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not "
+            f"certify: {unsure:,}.",
         )
     else:
         say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
@@ -74,8 +77,8 @@ def print_replay(console: Console, outcome: Outcome) -> None:
     say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
 
 
-def _print_worst(console, listed):
-    """The intervals with the most collisions first."""
+def _print_worst(console: Console, listed: list[Interval]) -> None:
+    """Prints the intervals, those with the most collisions first."""
     arrow = "->" if console.options.ascii_only else "→"
     stages = list(listed[0].stats.milliseconds)
     while True:
@@ -84,6 +87,7 @@ def _print_worst(console, listed):
         table = make_table("Interval", *headers, caption=caption)
         table.columns[0].no_wrap = True
         for interval in listed:
+            assert interval.earliest  # it collides
             table.add_row(
                 Text(f"{interval.start:g} {arrow} {interval.end:g}"),
                 f"{interval.pairs_tested:,}",
@@ -91,15 +95,15 @@ def _print_worst(console, listed):
                 f"{round(interval.earliest.time, 6):.6g}",
                 *(f"{interval.stats.milliseconds[stage]:,.1f}" for stage in stages),
             )
-        roomy = console.options.update(width=1000)
-        if not stages or console.measure(table, options=roomy).maximum <= console.width:
+        wide = console.options.update(width=1000)
+        if not stages or console.measure(table, options=wide).maximum <= console.width:
             break
-        stages.pop()  # of the least interest where there is no room for all
+        stages.pop()  # the stage of least interest, as the table is too wide
     console.print(table)
 
 
-def _print_collisions(console, outcome):
-    """How many pairs collide, of which meshes, and where it begins."""
+def _print_collisions(console: Console, outcome: Outcome) -> None:
+    """Prints the number of pairs that collide, in all and by meshes, and the first contact."""
     colliding = outcome.colliding
     vertex_face = sum(interval.vertex_face_hits for interval in colliding)
     edge_edge = sum(interval.edge_edge_hits for interval in colliding)
@@ -113,6 +117,7 @@ def _print_collisions(console, outcome):
     if len(outcome.mesh_pairs) > LONGEST:
         say(console, f"  and {len(outcome.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest
+    assert contact  # it collides
     (first, second), (first_element, second_element) = contact.meshes, contact.elements
     other = "its" if first == second else f"{second},"
     say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
@@ -120,8 +125,8 @@ def _print_collisions(console, outcome):
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
 
 
-def _print_validation(console, found):
-    """What the exact checker says."""
+def _print_validation(console: Console, found: dict[str, Any]) -> None:
+    """Prints how the answers compare with the exact checker's."""
     wrong = found["disagreements"]
     say(
         console,
@@ -133,5 +138,8 @@ def _print_validation(console, found):
     if len(wrong) > LONGEST:
         say(console, f"  and {len(wrong) - LONGEST} more; --json has all.")
     if found["false_hits"]:
-        say(console, f"Of the collisions {found['false_hits']:,} are none, as method conservative may have it.")
+        say(
+            console,
+            f"False collisions, which method conservative allows: {found['false_hits']:,}.",
+        )
     say(console, f"Certified by floating point: {found['certified']:,} of {found['answers']:,} answers.")

@@ -1,4 +1,4 @@
-"""What all tables and lines on the terminal have in common."""
+"""What all tables and lines on the terminal share."""
 
 import rich.console
 from rich import box
@@ -7,24 +7,24 @@ from rich.table import Table
 __all__ = ["LONGEST", "Console", "count", "make_table", "say"]
 
 LONGEST = 30
-"""Rows in a table, or lines in a list."""
+"""Largest number of rows in a table, or of lines in a list."""
 
 
 class Console(rich.console.Console):
-    """A terminal or a file, where that nobody reads it is an error like any other."""
+    """A terminal or a file that raises BrokenPipeError if its reader has closed it."""
 
-    def on_broken_pipe(self):
-        """Raises the error again; rich would end the program, with the status 1 of a collision."""
+    def on_broken_pipe(self) -> None:
+        """Raises the error again; rich would end the program with status 1, which means a collision."""
         raise BrokenPipeError
 
 
-def say(console: Console, line: str) -> None:
-    """Print a line as it is."""
+def say(console: rich.console.Console, line: str) -> None:
+    """Prints a line without markup; on a terminal it wraps."""
     console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
 
 
 def make_table(first: str, *others: str, caption: str | None = None) -> Table:
-    """A table whose first column is text and may wrap, the others numbers that may not."""
+    """A table whose first column is text, which may wrap; the others are numbers, which may not."""
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
     table.add_column(first, overflow="fold")
     for header in others:
@@ -33,5 +33,5 @@ def make_table(first: str, *others: str, caption: str | None = None) -> Table:
 
 
 def count(number: int, one: str, many: str = "") -> str:
-    """A number and what it counts."""
+    """A number with the noun that it counts, singular or plural."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"

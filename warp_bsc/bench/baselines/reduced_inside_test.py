@@ -3,9 +3,8 @@
 A test m . n >= 0, of degree four in t, loses two degrees by multiples of the coplanarity cubic Y: t^2 P = k0^2 m . n
 modulo Y (supplement, 1, equations 18 to 23). P is of degree ten in the coordinates, and identically zero where k0 is.
 
-All else, classes of curves, root counts and signs at roots, is what :mod:`warp_bsc.kernels.classification` does, so
-that
-the difference is what the choice of the inside tests makes.
+Everything else, classes of curves, root counts and signs at roots, is :mod:`warp_bsc.kernels.classification`, so that
+results differ by the inside tests alone.
 """
 
 import warp as wp

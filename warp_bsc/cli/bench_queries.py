@@ -1,0 +1,59 @@
+"""The command ``warp-bsc bench queries``: measures how many elementary queries a second are answered."""
+
+import argparse
+import json
+
+from ..bench.queries import KINDS, benchmark_copy, benchmark_queries, check_query_count
+from ..bench.timing import count_threads, limited_threads
+from .bench_queries_tables import print_query_benchmarks, query_benchmarks_to_dict
+from .device import find_device, loading_kernels
+from .options import BENCH_EXIT_STATUS, Commands, add_command, add_device, add_json, add_repeat, add_threads
+from .tables import Console
+
+__all__ = ["add_to"]
+
+_DESCRIPTION = """\
+Measure how many elementary queries a second are answered. The queries are
+random and the same on every device; a third of them survive the culls. Queries
+and answers stay on the device. On a GPU, replays of a CUDA graph are timed by
+events."""
+
+_EPILOG = f"""\
+examples:
+  warp-bsc bench queries
+  warp-bsc bench queries --device cpu --threads 1 --count 1000000
+  warp-bsc bench queries --json > rates.json
+
+{BENCH_EXIT_STATUS}"""
+
+
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands, "queries", _run, summary="measure elementary queries", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    command.add_argument(
+        "--count", type=int, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
+    )
+    add_repeat(command, default=20)
+    add_threads(command)
+    add_device(command)
+    add_json(command)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.count is not None:
+        check_query_count(arguments.count)
+    device = find_device(arguments.device)
+    options = {"device": device, "repeat": arguments.repeat}
+    with limited_threads(arguments.threads):
+        with loading_kernels(device):
+            for kind in KINDS:
+                benchmark_queries(kind, count=1, device=device, repeat=1)
+        benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in KINDS]
+        settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
+    if arguments.json:
+        print(json.dumps(query_benchmarks_to_dict(benchmarks, **settings)))
+    else:
+        print_query_benchmarks(Console(), benchmarks, **settings)
+    return 0

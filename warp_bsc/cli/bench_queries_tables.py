@@ -1,0 +1,104 @@
+"""Shows the measurements of elementary queries: tables for people, plain data for programs."""
+
+from typing import Any
+
+import warp as wp
+from rich.console import Console
+
+from ..bench.queries import MODES, SEED, QueryBenchmark
+from .tables import count, make_table, say
+
+__all__ = ["print_query_benchmarks", "query_benchmarks_to_dict"]
+
+
+def print_query_benchmarks(
+    console: Console,
+    benchmarks: list[QueryBenchmark],
+    *,
+    copy_rate: float,
+    device: wp.Device,
+    threads: int,
+    repeat: int,
+) -> None:
+    """Prints the answers to random queries, and how many a second were answered.
+
+    Args:
+        console: The terminal or file to print to.
+        benchmarks: The measurements of each kind of query.
+        copy_rate: Bytes that a copy on the device reads and writes [1/s].
+        device: The Warp device.
+        threads: Number of CPU cores.
+        repeat: Number of repetitions.
+    """
+    cores = count(threads, "core") if device.is_cpu else device.name
+    say(console, f"Random queries on {device}, {cores}; medians of {count(repeat, 'repetition')}")
+    caption = "Survivors: queries that no cull decides."
+    table = make_table("Kind", "Queries", "Survivors", "Share", "Free", "Hit", "Unsure", caption=caption)
+    for found in benchmarks:
+        numbers = [len(found.status), found.survivors, found.free, found.hits, found.unsure]
+        number, survivors, *answers = (f"{number:,}" for number in numbers)
+        table.add_row(found.kind, number, survivors, f"{found.survivor_share:.1%}", *answers)
+    console.print(table)
+    console.print()
+
+    table = make_table(
+        "Mode",
+        "ms",
+        "Million\nqueries/s",
+        "Bytes\na query",
+        "GB/s",
+        "Share of\ncopying",
+    )
+    for took in benchmarks:
+        for mode, milliseconds in took.milliseconds.items():
+            rate = took.bytes_per_second[mode]
+            table.add_row(
+                f"{took.kind}, {mode}",
+                f"{milliseconds:,.2f}",
+                f"{took.queries_per_second[mode] / 1e6:,.1f}",
+                str(MODES[mode]),
+                f"{rate / 1e9:,.1f}",
+                f"{rate / copy_rate:.1%}",
+            )
+    console.print(table)
+    console.print()
+    say(console, "status: finds the status of each query, in one kernel.")
+    say(console, "impact: finds the time of impact, coordinates and normal as well.")
+    say(console, "queued: finds the status by two kernels: culls, and a decision of the survivors.")
+    say(console, "exact: finds the status in integers, where floating point cannot certify it.")
+    say(console, f"A copy on this device reads and writes {copy_rate / 1e9:,.1f} GB/s.")
+
+
+def query_benchmarks_to_dict(
+    benchmarks: list[QueryBenchmark], *, copy_rate: float, device: wp.Device, threads: int, repeat: int
+) -> dict[str, Any]:
+    """The measurements as plain data for JSON. Arguments: as of :func:`print_query_benchmarks`."""
+    return {
+        "benchmark": "queries",
+        "device": str(device),
+        "device_name": device.name,
+        "threads": threads,
+        "repeat": repeat,
+        "seed": SEED,
+        "copy_bytes_per_second": copy_rate,
+        "kinds": [
+            {
+                "kind": found.kind,
+                "queries": len(found.status),
+                "survivors": found.survivors,
+                "survivor_share": found.survivor_share,
+                "certified": {"free": found.free, "hit": found.hits, "unsure": found.unsure},
+                "modes": {
+                    mode: {
+                        "milliseconds": milliseconds,
+                        "queries_per_second": found.queries_per_second[mode],
+                        "bytes_per_query": MODES[mode],
+                        "bytes_per_second": found.bytes_per_second[mode],
+                        "share_of_copy": found.bytes_per_second[mode] / copy_rate,
+                    }
+                    for mode, milliseconds in found.milliseconds.items()
+                },
+            }
+            for found in benchmarks
+        ],
+    }

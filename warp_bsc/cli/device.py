@@ -1,0 +1,67 @@
+"""Finds the Warp device and loads kernels, with a message if they have to be compiled."""
+
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ..detection.detector import CollisionDetector
+from ..detection.mesh import CollisionMesh
+from .tables import Console
+
+__all__ = ["find_device", "load_detector", "loading_kernels"]
+
+_SILENT_SECONDS = 2.0
+
+
+def find_device(name: str | None) -> wp.Device:
+    """The Warp device of a name, Warp's preferred one for None.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    _start_warp()
+    if name is None:
+        return wp.get_preferred_device()
+    known = [device.alias for device in wp.get_devices()] + ["cuda"] * wp.is_cuda_available()
+    if name not in known:
+        raise ValueError(f"--device {name}: there is no such device here, only {', '.join(known)}")
+    return wp.get_device(name)
+
+
+def _start_warp() -> None:
+    """Initializes Warp without the line that its native library prints to standard error if there is no CUDA driver."""
+    wp.config.log_level = wp.LOG_WARNING
+    sys.stderr.flush()
+    stderr = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+            wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+@contextlib.contextmanager
+def loading_kernels(device: wp.Device) -> Iterator[None]:
+    """Prints on standard error why the block takes long, if it does: kernels are being compiled."""
+    message = f"Compiling kernels for {device}, once for each version: up to a few minutes."
+    timer = threading.Timer(_SILENT_SECONDS, Console(stderr=True).print, [message])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def load_detector(method: str, dtype: npt.DTypeLike, device: wp.Device) -> None:
+    """Loads the detector's kernels for one type of position; compiles them if need be."""
+    triangles = CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+    points = np.zeros((6, 3), dtype)
+    CollisionDetector(triangles, method=method).detect(points, points)

@@ -1,0 +1,133 @@
+"""What several commands share: options, their types, and the parts of the help texts."""
+
+import argparse
+from collections.abc import Callable
+
+from ..detection.narrow_phase import METHODS
+
+__all__ = [
+    "BENCH_EXIT_STATUS",
+    "ERROR_STATUS",
+    "EXIT_STATUS",
+    "SIGNAL_STATUS",
+    "Commands",
+    "add_command",
+    "add_detection_options",
+    "add_device",
+    "add_fail_on_collision",
+    "add_json",
+    "add_repeat",
+    "add_threads",
+    "positive",
+]
+
+Commands = argparse._SubParsersAction
+"""What ``ArgumentParser.add_subparsers`` returns: the commands, to which each module adds its own."""
+
+ERROR_STATUS = """\
+  2  wrong usage, bad input or another error; a line on standard error says what
+     and where"""
+
+SIGNAL_STATUS = """\
+  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM
+  141  the reader of the output has closed it, as head -1 does"""
+
+EXIT_STATUS = f"""\
+exit status:
+  0  done, whether or not anything collides
+  1  collisions found, with --fail-on-collision
+{ERROR_STATUS}
+{SIGNAL_STATUS}"""
+
+BENCH_EXIT_STATUS = f"""\
+exit status:
+  0  done
+{ERROR_STATUS}
+{SIGNAL_STATUS}"""
+
+
+def add_command(
+    commands: Commands,
+    name: str,
+    run: Callable[[argparse.Namespace], int] | None,
+    *,
+    summary: str,
+    description: str,
+    epilog: str,
+) -> argparse.ArgumentParser:
+    """Adds a command and returns its parser.
+
+    Args:
+        commands: The commands to add it to.
+        name: The command's name.
+        run: Runs it with the parsed arguments and returns the exit status; None for a group of commands.
+        summary: One line for the list of commands.
+        description: The help text above the options.
+        epilog: The help text below the options.
+    """
+    command = commands.add_parser(
+        name,
+        help=summary,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(run=run)
+    return command
+
+
+def add_detection_options(command: argparse.ArgumentParser, *, method: str) -> None:
+    """Adds --method, with this default, and --device."""
+    command.add_argument(
+        "--method",
+        choices=METHODS,
+        default=method,
+        help="float: the signs that floating point computes decide; conservative: pairs that floating point cannot "
+        "certify count as collisions; exact: exact arithmetic decides these pairs (default: %(default)s)",
+    )
+    add_device(command)
+
+
+def add_device(command: argparse.ArgumentParser) -> None:
+    """Adds --device."""
+    command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+
+
+def add_json(command: argparse.ArgumentParser) -> None:
+    """Adds --json, without a file."""
+    command.add_argument("--json", action="store_true", help="print all results as JSON instead of tables")
+
+
+def add_fail_on_collision(command: argparse.ArgumentParser) -> None:
+    """Adds --fail-on-collision."""
+    command.add_argument("--fail-on-collision", action="store_true", help="exit with status 1 if anything collides")
+
+
+def add_repeat(command: argparse.ArgumentParser, *, default: int) -> None:
+    """Adds --repeat."""
+    command.add_argument(
+        "--repeat",
+        type=positive,
+        default=default,
+        metavar="N",
+        help="number of repetitions; their median is reported (default: %(default)s)",
+    )
+
+
+def add_threads(command: argparse.ArgumentParser) -> None:
+    """Adds --threads."""
+    command.add_argument(
+        "--threads", type=positive, metavar="N", help="number of CPU cores to use, on Linux only (default: all)"
+    )
+
+
+def positive(text: str) -> int:
+    """The integer that an argument holds.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is less than 1.
+    """
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
+    return number

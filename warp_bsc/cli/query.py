@@ -1,0 +1,70 @@
+"""The command ``warp-bsc query``: answers the elementary queries of CSV files."""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
+from .device import find_device, loading_kernels
+from .options import EXIT_STATUS, Commands, add_command, add_detection_options, add_fail_on_collision, add_json
+from .query_file import KINDS, find_query_files, read_query_file
+from .query_tables import QueryAnswers, print_queries, queries_to_dict
+from .tables import Console
+
+__all__ = ["add_to"]
+
+_DESCRIPTION = """\
+Answer elementary queries and, if the truth is known, compare the answers with
+it. A query is eight rows of a CSV file, one a point; a row holds the numerators
+and denominators of x, y and z and, if known, the true answer, 0 or 1. The true
+answers may also be in NAME_mma_bool.json."""
+
+_EPILOG = f"""\
+examples:
+  warp-bsc query 227vf.csv 227ee.csv
+  warp-bsc query unit-tests --method float
+  warp-bsc query pairs.csv --kind edge-edge --json > answers.json
+
+{EXIT_STATUS}"""
+
+_QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
+
+
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands, "query", _run, summary="answer queries of CSV files", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    command.add_argument(
+        "paths", metavar="FILE", nargs="+", help="a CSV file, or a folder: all CSV files in it and below"
+    )
+    command.add_argument(
+        "--kind",
+        choices=KINDS,
+        help="kind of the queries (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
+    )
+    add_detection_options(command, method="exact")
+    add_json(command)
+    add_fail_on_collision(command)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    files = [read_query_file(path, kind=arguments.kind) for path in find_query_files(arguments.paths)]
+    device = find_device(arguments.device)
+    options = {"method": arguments.method, "toi": arguments.json, "device": device}
+    with loading_kernels(device):
+        for kind in {file.kind for file in files}:
+            _QUERIES[kind](np.zeros((1, 8, 3)), **options)
+    answers = []
+    for file in files:
+        start = time.perf_counter()
+        result = _QUERIES[file.kind](file.points, **options)
+        answers.append(QueryAnswers(file, result, 1e3 * (time.perf_counter() - start)))
+    if arguments.json:
+        print(json.dumps(queries_to_dict(answers, method=arguments.method, device=str(device))))
+    else:
+        print_queries(Console(), answers, method=arguments.method, device=str(device))
+    return 1 if arguments.fail_on_collision and any(answer.hits for answer in answers) else 0

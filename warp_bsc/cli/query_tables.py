@@ -1,0 +1,125 @@
+"""Shows the answers to query files: tables for people, plain data for programs."""
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ..detection.query import QueryResult
+from .query_file import QueryFile
+from .tables import count, make_table, say
+
+__all__ = ["QueryAnswers", "print_queries", "queries_to_dict"]
+
+_STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
+
+
+@dataclass(frozen=True)
+class QueryAnswers:
+    """The answers to the queries of a file.
+
+    Attributes:
+        file: The queries.
+        result: Their answers.
+        milliseconds: Time to answer all of them [ms].
+    """
+
+    file: QueryFile
+    result: QueryResult
+    milliseconds: float
+
+    @property
+    def hits(self) -> int:
+        """Number of queries answered with a collision."""
+        return int(self.result.hit.sum())
+
+    @property
+    def certified(self) -> dict[str, int]:
+        """Number of queries that floating point certified free, certified to be hits, and could not certify."""
+        return {name: int((self.result.status == code).sum()) for code, name in enumerate(_STATUS)}
+
+    @property
+    def confusion(self) -> dict[str, int] | None:
+        """Number of true and false positives and negatives; None if the truth is not known."""
+        hit, truth = self.result.hit, self.file.truth
+        if truth is None:
+            return None
+        return {
+            "true_positives": int((hit & truth).sum()),
+            "false_positives": int((hit & ~truth).sum()),
+            "true_negatives": int((~hit & ~truth).sum()),
+            "false_negatives": int((~hit & truth).sum()),
+        }
+
+
+def print_queries(console: Console, answers: list[QueryAnswers], *, method: str, device: str) -> None:
+    """Prints the answers to query files and, where the truth is known, compares them with it.
+
+    Args:
+        console: The terminal or file to print to.
+        answers: The answers to each file.
+        method: The method.
+        device: The device.
+    """
+    folder = os.path.commonpath([answer.file.path.absolute().parent for answer in answers])
+    say(console, f"{count(len(answers), 'file')} in {folder}; method {method} on {device}")
+    say(console, "Free, hit and unsure: the certificates of floating point, the same for every method.")
+    table = make_table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
+    _add_files(
+        table,
+        folder,
+        [(a.file, [len(a.file.points), a.hits, *a.certified.values(), a.milliseconds]) for a in answers],
+    )
+    console.print(table)
+
+    known = [(answer.file, answer.confusion) for answer in answers if answer.confusion]
+    if known:
+        table = make_table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
+        _add_files(table, folder, [(file, list(confusion.values())) for file, confusion in known])
+        console.print()
+        console.print(table)
+    for file, _ in known:
+        if file.truth_path and file.truth_path != file.path:
+            say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
+
+
+def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) -> dict[str, Any]:
+    """The answers as plain data for JSON. Arguments: as of :func:`print_queries`."""
+    return {
+        "method": method,
+        "device": device,
+        "files": [
+            {
+                "path": str(answer.file.path),
+                "kind": answer.file.kind,
+                "queries": len(answer.file.points),
+                "hits": answer.hits,
+                "certified": answer.certified,
+                "truth_path": str(answer.file.truth_path) if answer.file.truth_path else None,
+                "confusion": answer.confusion,
+                "milliseconds": answer.milliseconds,
+                "hit": answer.result.hit.tolist(),
+                "status": [_STATUS[status] for status in answer.result.status],
+                "toi": None
+                if answer.result.toi is None
+                else [toi if toi <= 1.0 else None for toi in answer.result.toi],
+            }
+            for answer in answers
+        ],
+    }
+
+
+def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int | float]]]) -> None:
+    """Adds a row for each file and, if there are several, one for their sum."""
+
+    def format_all(numbers: Iterable[int | float]) -> list[str]:
+        return [f"{number:,.1f}" if isinstance(number, float) else f"{number:,}" for number in numbers]
+
+    for file, numbers in rows:
+        table.add_row(os.path.relpath(file.path.with_suffix(""), folder), *format_all(numbers))
+    if len(rows) > 1:
+        table.add_section()
+        table.add_row("all", *format_all(map(sum, zip(*(numbers for _, numbers in rows), strict=True))))
