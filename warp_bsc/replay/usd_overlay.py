@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .._atomic_file import ReplayOutput, without_last_eighth
+from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
 from .scene_contacts import KINDS
 from .summary import Outcome
 
@@ -70,13 +71,11 @@ class Overlay(ReplayOutput):
         self._polygon_counts = {}  # of the meshes in the interval before
         self._uncolored = False
         self._opened = set()  # instances that must have prims of their own to be coloured
-        self._root_path = "/Collisions"
-        while scene.stage.GetPrimAtPath(self._root_path):
-            self._root_path += "_"
+        self._root_path = unused_path(scene, "/Collisions")
         self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
         self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
-        self._metadata = _metadata(scene)
+        self._metadata = layer_metadata(scene)
         super().__init__(path)
         self._spool = tempfile.TemporaryFile(buffering=0, dir=self._output.folder)  # noqa: SIM115 (closed when discarded)
 
@@ -147,7 +146,7 @@ class Overlay(ReplayOutput):
         for path in {*self._colored, *lit} & meshes.keys():
             count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
             if path not in self._colored:
-                self._open_instances(path)
+                self._opened.update(find_instances_above(self._scene, path))
                 if self._last_start is not None:
                     self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
             old_count, old_polygons = self._colored.get(path, (None, None))
@@ -157,17 +156,10 @@ class Overlay(ReplayOutput):
         self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
 
     def _sample_colors(self, path, time, count, lit):
-        self._unlit[path] = _unlit_colors(self._scene.stage, path, time)
+        colors = display_colors(self._scene, path, time)
+        self._unlit[path] = np.array([_UNLIT]) if colors is None else colors
         text = _color_text(self._unlit[path], count, lit)
         self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
-
-    def _open_instances(self, path):
-        """Note the instances that a prim is in: below these, only their prototype has colours."""
-        prim = self._scene.stage.GetPrimAtPath(path)
-        while prim.IsInstanceProxy():
-            prim = prim.GetParent()
-            if prim.IsInstance():
-                self._opened.add(str(prim.GetPath()))
 
     def _write(self, outcome):
         """Write the whole layer, of the intervals of an outcome."""
@@ -192,7 +184,7 @@ class Overlay(ReplayOutput):
         asset = source if source.startswith("../") else f"./{source}"
         complete = "true" if outcome.is_complete else "false"
         stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
-        metadata = "\n    ".join(f"{name} = {value}" for name, value in self._metadata.items())
+        metadata = "\n    ".join(f"{name} = {_literal(value)}" for name, value in self._metadata.items())
         return f"""#usda 1.0
 (
     customLayerData = {{
@@ -245,7 +237,7 @@ class Overlay(ReplayOutput):
         for sample, (time, length) in zip_longest(samples, following, fillvalue=(None, 0)):
             self._write_sample(writer, indent, sample.time, sample)
             # USD interpolates if both have values, and would see points on the way from one contact to another.
-            if sample.length and length and (before := _just_before(time)) > sample.time:
+            if sample.length and length and (before := just_before(time)) > sample.time:
                 if interpolation == "vertex":
                     writer.write(f"{indent}    {before!r}: [],\n")
                 else:
@@ -293,43 +285,6 @@ class _Sample:
     lit_count: int
 
 
-def _metadata(scene) -> dict[str, str]:
-    """The scene's metadata, which sublayers do not hand on: text by name."""
-    stage = scene.stage
-    default = stage.GetDefaultPrim()
-    start, end = scene.times[0], scene.times[-1]
-    if stage.HasAuthoredTimeCodeRange():
-        start, end = (float(stage.GetMetadata(name)) for name in ("startTimeCode", "endTimeCode"))
-    root = stage.GetRootLayer().defaultPrim if default else stage.GetPseudoRoot().GetChildren()[0].GetName()
-    return {
-        "defaultPrim": _quote(root),
-        "endTimeCode": repr(end),
-        "framesPerSecond": repr(stage.GetFramesPerSecond()),
-        "metersPerUnit": repr(scene.meters_per_unit),
-        "startTimeCode": repr(start),
-        "timeCodesPerSecond": repr(stage.GetTimeCodesPerSecond()),
-        "upAxis": f'"{scene.up_axis}"',
-    }
-
-
-def _just_before(time) -> float:
-    from pxr import Usd  # noqa: PLC0415 (slow)
-
-    return time - Usd.TimeCode.SafeStep(max(1e6, abs(time)))
-
-
-def _unlit_colors(stage, path, time) -> np.ndarray:
-    """The colours of a mesh's polygons in the scene, or fewer if they are all the same, shape [n, 3]."""
-    from pxr import UsdGeom  # noqa: PLC0415 (slow)
-
-    primvar = UsdGeom.Gprim(stage.GetPrimAtPath(path)).GetDisplayColorPrimvar()
-    values = primvar.ComputeFlattened(time) if primvar and primvar.HasValue() else None
-    if not values:
-        return np.array([_UNLIT])
-    colors = np.array(values, dtype=np.float64)
-    return colors if primvar.GetInterpolation() == UsdGeom.Tokens.uniform else colors.mean(axis=0, keepdims=True)
-
-
 def _color_text(colors, count, lit) -> str:
     """The colours of a mesh's polygons, those lit being :data:`LIT`."""
     if len(colors) != count:
@@ -359,6 +314,11 @@ def _tree(paths) -> dict:
 
 def _tuples(rows) -> str:
     return ", ".join(f"({x:.9g}, {y:.9g}, {z:.9g})" for x, y, z in np.asarray(rows, dtype=np.float32).tolist())
+
+
+def _literal(value: str | float) -> str:
+    """A string or a number as USD's text format has it."""
+    return _quote(value) if isinstance(value, str) else repr(value)
 
 
 def _quote(text: str) -> str:
