@@ -45,11 +45,11 @@ def test_the_scene_of_the_readme_replays_with_its_figures(capsys):
 
 def test_the_collisions_of_the_scene_are_real():
     scene = Scene(ROOT / "assets" / "cloth_twist.usd")
-    segment, _, _ = scene.interval(0)
+    segment = scene.interval(0).segment
     detector = bsc.CollisionDetector(bsc.CollisionMesh(segment.faces, segment.vertex_count))
     confirmed = 0
-    for index in range(len(scene.times) - 1):
-        _, x0, x1 = scene.interval(index)
+    for interval in scene:
+        x0, x1 = interval.x0, interval.x1
         c = detector.detect(x0, x1)
         corners = np.concatenate([c.vertex_face[:, :1], segment.faces[c.vertex_face[:, 1]]], axis=1)
         confirmed += checker.vertex_face(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()

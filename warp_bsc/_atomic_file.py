@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and what is written to them one interval after the other."""
+"""Files that appear complete or not at all."""
 
 import codecs
 import contextlib
@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-__all__ = ["STDOUT", "OutputFile", "ReplayOutput", "StreamedFile", "naming", "without_last_eighth"]
+__all__ = ["STDOUT", "OutputFile", "naming"]
 
 STDOUT = "-"
 """The path of standard output."""
@@ -39,6 +39,7 @@ class OutputFile:
 
     Attributes:
         path: Its place, :data:`STDOUT` for standard output.
+        name: The same in words.
         is_stream: Whether it is no regular file.
         folder: Where it waits until it is complete.
     """
@@ -55,6 +56,7 @@ class OutputFile:
         with naming(path):
             self._stream = _open_stream(path)
         self.is_stream = self._stream is not None
+        self.name = "standard output" if str(path) == STDOUT else str(path)
         self._place = Path(os.path.realpath(path))
         self.folder = tempfile.gettempdir() if self.is_stream else self._place.parent
         if not os.path.isdir(self.folder):
@@ -114,112 +116,6 @@ class OutputFile:
         if self._temporary:
             with contextlib.suppress(FileNotFoundError):
                 self._temporary.unlink()
-
-
-class ReplayOutput:
-    """A file to which the intervals of a replay are written: the base of all formats.
-
-    Attributes:
-        path: Its place.
-        name: The same in words.
-        is_stream: Whether it is no regular file.
-    """
-
-    def __init__(self, path):
-        """Opens the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        self._output = OutputFile(path)
-        self.path, self.is_stream = self._output.path, self._output.is_stream
-        self.name = "standard output" if str(path) == STDOUT else str(path)
-
-    def add(self, interval, contacts):
-        """Take an interval.
-
-        Raises:
-            OSError: If there is no room for it. Only shrinking and finishing the file are possible then.
-        """
-        raise NotImplementedError
-
-    def finish(self, outcome):
-        """Put the file in its place.
-
-        Args:
-            outcome: All that was found, of which the last intervals may be missing in this file.
-
-        Raises:
-            OSError: If there is no room. After shrinking it may be tried again.
-        """
-        raise NotImplementedError
-
-    def shrink(self) -> bool:
-        """Make room: forget the last intervals, an eighth of them.
-
-        Returns:
-            Whether the file will be smaller.
-        """
-        raise NotImplementedError
-
-    def discard(self):
-        """Leave nothing behind, unless the file is finished."""
-        self._output.discard()
-
-
-class StreamedFile(ReplayOutput):
-    """A text of a head, a record for each interval, and a tail: the base of the formats that are such.
-
-    A record is there as a whole or not at all.
-    """
-
-    def __init__(self, path):
-        """Opens the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        super().__init__(path)
-        self._ends = []  # of the head and of each record
-
-    @property
-    def record_count(self) -> int:
-        """How many records there are."""
-        return max(0, len(self._ends) - 1)
-
-    def add(self, interval, contacts):
-        """Append the record of an interval."""
-        if not self._ends:
-            self._append([self.head()])
-        self._append(self.record(interval, contacts))
-
-    def finish(self, outcome):
-        """Append the tail and put the file in its place."""
-        # An interruption may have come, or room may have ended, in the middle of what was written last.
-        del self._ends[len(outcome.intervals) + 1 :]
-        self._output.truncate(self._ends[-1] if self._ends else 0)
-        if not self._ends:
-            self._append([self.head()])
-        self._output.write(self.tail(outcome.first(self.record_count)))
-        self._output.commit()
-
-    def shrink(self):
-        """Forget the last records."""
-        if not self.record_count:
-            return False
-        self._ends[1:] = without_last_eighth(self._ends[1:])
-        self._output.truncate(self._ends[-1])
-        return True
-
-    def _append(self, texts):
-        for text in texts:
-            self._output.write(text)
-        self._ends.append(self._output.tell())
-
-
-def without_last_eighth(items: list) -> list:
-    """The items but the last eighth of them, of which there is at least one."""
-    return items[: len(items) - max(1, len(items) // 8)]
 
 
 class _StandardOutput:

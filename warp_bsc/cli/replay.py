@@ -9,11 +9,12 @@ import os
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .._atomic_file import STDOUT, ReplayOutput, naming
+from .._atomic_file import STDOUT, naming
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
-from ..replay.summary import Outcome
+from ..replay.outputs import ReplayOutput
+from ..replay.summary import Summary
 from ..replay.usd_overlay import Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
@@ -164,12 +165,12 @@ def run_replay(scene: Scene, arguments, device) -> int:
         with INTERRUPTS.held():
             try:
                 with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
-                    for interval, contacts in found:
+                    for result in found:
                         scene.files.check()
                         for output in outputs:
-                            with naming(output.name):
-                                output.add(interval, contacts)
-                        intervals.append(interval)
+                            with naming(output.file.name):
+                                output.add(result)
+                        intervals.append(result.summary)
                         INTERRUPTS.check()
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
@@ -177,12 +178,12 @@ def run_replay(scene: Scene, arguments, device) -> int:
                 interrupt = INTERRUPTS.came  # of which a library may have made another error
                 problems += [] if interrupt else [_explain(error, scene)]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
-            outcome = Outcome(scene, intervals=intervals, stopped=stopped, **settings)
+            outcome = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # what was there before is better than nothing
             # Nothing disturbs the files. Whoever reads the other ones may never come to the end.
-            problems += _finish([output for output in finished if not output.is_stream], outcome)
+            problems += _finish([output for output in finished if not output.file.is_stream], outcome)
             with INTERRUPTS.raised():
-                problems += _finish([output for output in finished if output.is_stream], outcome)
+                problems += _finish([output for output in finished if output.file.is_stream], outcome)
             if problems:
                 raise ValueError("; ".join([str(interrupt)] * bool(interrupt) + problems))
             if not interrupt:
@@ -192,7 +193,7 @@ def run_replay(scene: Scene, arguments, device) -> int:
                 console = Console()
                 print_replay(console, outcome)
                 for output in finished:
-                    say(console, f"Wrote {output.path}.")
+                    say(console, f"Wrote {output.file.path}.")
     if interrupt:
         raise interrupt
     if outcome.validation and outcome.validation["disagreements"]:
@@ -213,7 +214,7 @@ def _explain(error, scene) -> str:
     return f"{scene.path}: {describe(error)}"
 
 
-def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
+def _finish(outputs: list[ReplayOutput], outcome: Summary) -> list[str]:
     """Put files in their places, without the last intervals where there is no room for all, and say what is missing.
 
     On a full disk all of them shrink for one another's sake, but not below half: tables are worth more than a page.
@@ -233,10 +234,10 @@ def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
             if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 smaller = [other for other in sharing if other.shrink()]
             if smaller:
-                shortages |= {other.name: describe(error) for other in smaller}
+                shortages |= {other.file.name: describe(error) for other in smaller}
                 continue
-            shortages.pop(output.name, None)
-            problems.append(f"{output.name}: not written: {describe(error)}")
+            shortages.pop(output.file.name, None)
+            problems.append(f"{output.file.name}: not written: {describe(error)}")
         waiting.pop(0)
     return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]
 
@@ -271,13 +272,11 @@ def _track(scene, arguments, device):
     progress.disable = not progress.console.is_terminal
     with progress:
         task = progress.add_task("", total=len(scene.times) - 1, time=scene.times[0], rate="…/s")
-        for interval, contacts in replay(
-            scene, method=arguments.method, device=device, validate_most=arguments.validate
-        ):
-            yield interval, contacts
+        for result in replay(scene, method=arguments.method, device=device, validate_most=arguments.validate):
+            yield result
             speed = progress.tasks[task].speed
             rate = f"{speed:.1f}/s" if speed else "…/s"
-            progress.update(task, advance=1, time=interval.end, rate=rate)
+            progress.update(task, advance=1, time=result.summary.end, rate=rate)
 
 
 def _output(text: str) -> str:

@@ -3,13 +3,13 @@
 from rich.console import Console
 from rich.text import Text
 
-from ..replay.summary import CERTIFIED_FOR, Outcome
+from ..replay.summary import CERTIFIED_FOR, Summary
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_replay"]
 
 
-def print_replay(console: Console, outcome: Outcome) -> None:
+def print_replay(console: Console, outcome: Summary) -> None:
     """Print a table of the worst intervals and a summary.
 
     Args:

@@ -6,16 +6,17 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from .._atomic_file import StreamedFile
+from .intervals import IntervalResult
+from .outputs import RecordFile
 from .scene_contacts import KINDS
-from .summary import CERTIFIED_FOR, Outcome
+from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["HitsCsv", "HitsJson"]
 
 _FIELDS = ("kind", "meshes", "prims", "elements", "indices", "time", "toi", "position", "normal")
 
 
-class HitsJson(StreamedFile):
+class HitsJson(RecordFile):
     """A JSON file: facts of the scene, each interval with its contacts, then the sums."""
 
     def __init__(self, path, *, scene, method: str, device: str):
@@ -47,8 +48,9 @@ class HitsJson(StreamedFile):
         """The file up to the first interval."""
         return json.dumps(self._facts)[:-1] + ', "intervals": ['
 
-    def record(self, interval, contacts) -> Iterator[str]:
+    def record(self, result: IntervalResult) -> Iterator[str]:
         """An interval with all of its contacts."""
+        interval, contacts = result.summary, result.contacts
         fields = {
             "index": interval.index,
             "start": interval.start,
@@ -70,24 +72,24 @@ class HitsJson(StreamedFile):
             yield (", " if number else "") + chunk[1:-1]
         yield "]}"
 
-    def tail(self, outcome: Outcome) -> str:
+    def tail(self, summary: Summary) -> str:
         """The file from the last interval on."""
         sums = {
-            "complete": outcome.is_complete,
-            "stopped": outcome.stopped,
-            "motion": outcome.motion,
-            "warnings": outcome.scene.warnings,
-            "left_out": outcome.scene.left_out,
-            "hits": outcome.hits,
-            "certified": outcome.certified,
+            "complete": summary.is_complete,
+            "stopped": summary.stopped,
+            "motion": summary.motion,
+            "warnings": summary.scene.warnings,
+            "left_out": summary.scene.left_out,
+            "hits": summary.hits,
+            "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
-            "mesh_pairs": _mesh_pairs_to_list(outcome.mesh_pairs),
-            "validation": outcome.validation,
+            "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
+            "validation": summary.validation,
         }
         return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
 
 
-class HitsCsv(StreamedFile):
+class HitsCsv(RecordFile):
     """A CSV file: a row for each contact, and a last line that begins with # if some are missing."""
 
     _COLUMNS = (
@@ -101,8 +103,9 @@ class HitsCsv(StreamedFile):
         """The names of the columns."""
         return _to_csv([self._COLUMNS])
 
-    def record(self, interval, contacts) -> Iterator[str]:
+    def record(self, result: IntervalResult) -> Iterator[str]:
         """The rows of an interval."""
+        interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
         for rows in contacts.chunks():
             yield _to_csv(
@@ -115,16 +118,16 @@ class HitsCsv(StreamedFile):
                 for kind, names, prims, elements, indices, time, toi, position, normal in _rows(contacts, rows)
             )  # fmt: skip
 
-    def tail(self, outcome: Outcome) -> str:
+    def tail(self, summary: Summary) -> str:
         """What is missing."""
-        if outcome.is_complete:
+        if summary.is_complete:
             return ""
-        return f"# partial: {len(outcome.intervals)} of {outcome.interval_count} intervals; {outcome.stopped}\n"
+        return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
 
 
 def _rows(contacts, rows):
     """Of each of some contacts what :data:`_FIELDS` names."""
-    paths = [mesh.path for mesh in contacts.segment.meshes]
+    paths = [mesh.path for mesh in contacts.interval.segment.meshes]
     columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
     columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]
     for names, elements, kind, pair, indices, *measures in zip(

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import ReplayOutput
-from .summary import CERTIFIED_FOR, Outcome
+from .._atomic_file import OutputFile
+from ..usd.scene import Scene
+from .intervals import IntervalResult
+from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["ReportPage"]
 
@@ -25,7 +27,7 @@ _LONGEST = 10  # rows of a table
 _MOST_LINES = 200  # of disagreements
 
 
-class ReportPage(ReplayOutput):
+class ReportPage:
     """A page with a summary, charts, and the worst interval in 3D."""
 
     def __init__(self, path):
@@ -34,74 +36,78 @@ class ReportPage(ReplayOutput):
         Raises:
             OSError: If it cannot be written.
         """
-        super().__init__(path)
-        self._worst = None
+        self.file = OutputFile(path)
+        self._worst: IntervalResult | None = None
 
-    def add(self, interval, contacts):
-        """Keep the contacts of an interval if there are more than in any before, or none before."""
-        if self._worst is None or len(contacts) > len(self._worst[1]):
-            self._worst = interval, contacts
+    def add(self, result: IntervalResult) -> None:
+        """Keeps an interval if it is the first or has more contacts than all before."""
+        if self._worst is None or len(result.contacts) > len(self._worst.contacts):
+            self._worst = result
 
-    def finish(self, outcome: Outcome):
+    def finish(self, summary: Summary) -> None:
         """Write the page and put it in its place."""
         folder = resources.files(__package__) / "page"
         style = (folder / "page.css").read_text(encoding="utf-8")
         script = "\n".join((folder / name).read_text(encoding="utf-8") for name in ("viewer.js", "page.js"))
         fields = {
-            "title": html.escape(_title(outcome)),
+            "title": html.escape(_title(summary)),
             "style_hash": _policy_hash(style),
             "script_hash": _policy_hash(script),
             "style": style,
             "script": script,
-            "data": _inert(_data(outcome, self._worst)),
+            "data": _inert(_data(summary, self._worst)),
         }
         page = (folder / "page.html").read_text(encoding="utf-8")
         parts = page.replace("{{", "}}").split("}}")  # text, name, text, name, ...
-        self._output.truncate(0)
-        self._output.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
-        self._output.commit()
+        self.file.truncate(0)
+        self.file.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
+        self.file.commit()
 
-    def shrink(self):
-        """Forget nothing: how large the page is does not depend on the number of intervals."""
+    def shrink(self) -> bool:
+        """Drops nothing: the size of the page does not depend on the number of intervals."""
         return False
 
+    def discard(self) -> None:
+        """Removes the temporary file."""
+        self.file.discard()
 
-def _data(outcome: Outcome, worst) -> dict:
+
+def _data(summary: Summary, worst: IntervalResult | None) -> dict:
     """What the page's script shows."""
-    scene = outcome.scene
+    scene = summary.scene
     displayed = scene.display_names
     tiles = [
-        (f"{outcome.hits:,}", "colliding pairs"),
-        (f"{len(outcome.colliding):,} of {len(outcome.intervals):,}", "intervals with collisions"),
+        (f"{summary.hits:,}", "colliding pairs"),
+        (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
-    if outcome.colliding:
-        tiles.append((f"{outcome.colliding[0].earliest.time:.6g}", "time code of the first"))
+    if summary.colliding:
+        tiles.append((f"{summary.colliding[0].earliest.time:.6g}", "time code of the first"))
     tiles += [
         (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
         (f"{scene.face_count:,}", "triangles"),
-        ("yes" if outcome.certified else "no", f"certified for {CERTIFIED_FOR}"),
+        ("yes" if summary.certified else "no", f"certified for {CERTIFIED_FOR}"),
     ]
     data = {
-        "title": _title(outcome),
-        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {outcome.method} on "
-        f"{outcome.device}",
+        "title": _title(summary),
+        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {summary.method} on "
+        f"{summary.device}",
         "partial": "",
         "tiles": tiles,
         "intervals": [
             (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
-            for interval in outcome.intervals
+            for interval in summary.intervals
         ],
-        "toi": outcome.toi_counts,
-        "stages": list(outcome.milliseconds.items()),
+        "toi": summary.toi_counts,
+        "stages": list(summary.milliseconds.items()),
         "pairs": [
             {
                 "text": first if first == second else f"{first} with {second}",
                 "under": "with itself" if first == second else "",
                 "hits": hits,
             }
-            for (first, second), hits in outcome.mesh_pairs[:_LONGEST]
+            for (first, second), hits in summary.mesh_pairs[:_LONGEST]
         ],
-        "more_pairs": max(0, len(outcome.mesh_pairs) - _LONGEST),
+        "more_pairs": max(0, len(summary.mesh_pairs) - _LONGEST),
         "worst": [
             {
                 "start": interval.start,
@@ -110,7 +116,7 @@ def _data(outcome: Outcome, worst) -> dict:
                 "time": interval.earliest.time,
                 "what": _describe(interval.earliest),
             }
-            for interval in outcome.worst[:_LONGEST]
+            for interval in summary.worst[:_LONGEST]
         ],
         "facts": [
             ("File", scene.path),
@@ -121,15 +127,15 @@ def _data(outcome: Outcome, worst) -> dict:
             ("Vertices", f"{scene.vertex_count:,}"),
             *((f"Mesh {name}", displayed[name] or "no display name") for name in scene.names[:_LONGEST]),
         ],
-        "notes": [outcome.motion, *scene.warnings],
+        "notes": [summary.motion, *scene.warnings],
         "validation": None,
-        "view": _view(*worst, scene) if worst and worst[1].segment.meshes else None,
+        "view": _view(worst, scene) if worst and worst.contacts.interval.segment.meshes else None,
     }
-    if not outcome.is_complete:
+    if not summary.is_complete:
         data["partial"] = (
-            f"Partial: {len(outcome.intervals)} of {outcome.interval_count} intervals were checked; {outcome.stopped}."
+            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
         )
-    if found := outcome.validation:
+    if found := summary.validation:
         wrong = len(found["disagreements"])
         text = (
             f"{found['hits']:,} collisions and {found['others']:,} other pairs were asked again of the exact checker: "
@@ -140,10 +146,11 @@ def _data(outcome: Outcome, worst) -> dict:
     return data
 
 
-def _view(interval, contacts, scene) -> dict:
+def _view(result: IntervalResult, scene: Scene) -> dict:
     """The worst interval: triangles at its start and end, and the contacts."""
-    segment = contacts.segment
-    start, end = contacts.x0.astype(np.float64), contacts.x1.astype(np.float64)
+    contacts = result.contacts
+    interval, segment = contacts.interval, contacts.interval.segment
+    start, end = interval.x0.astype(np.float64), interval.x1.astype(np.float64)
     faces = segment.faces
     title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
     lit = contacts.colliding_faces
@@ -190,8 +197,8 @@ def _describe(contact):
     return f"{first}, {first_element}, with {'its' if first == second else second + ','} {second_element}"
 
 
-def _title(outcome):
-    return f"Collisions in {Path(outcome.scene.path).name}"
+def _title(summary):
+    return f"Collisions in {Path(summary.scene.path).name}"
 
 
 def _packed(values, dtype) -> str:

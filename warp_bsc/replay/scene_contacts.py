@@ -4,9 +4,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..usd.segment import Segment
+from ..detection.detector import Collisions
+from ..detection.mesh import CollisionMesh
+from ..usd.interval import Interval
+from ..usd.selection import Selection
 
-__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "Contacts", "find_contacts"]
+__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "SceneContacts", "find_contacts"]
 
 KINDS = ("vertex-face", "edge-edge")
 """The kinds of contact, by their numbers."""
@@ -19,16 +22,14 @@ _WORDS = ("vertex", "face", "edge", "diagonal")
 
 
 @dataclass(frozen=True)
-class Contacts:
-    """What meets in one interval, where and when: arrays with a row for each pair.
+class SceneContacts:
+    """The pairs that collide in one interval, where and when: arrays with a row for each pair.
 
     Attributes:
-        segment: The meshes.
-        x0: Positions of their vertices at the start of the interval, shape [vertex_count, 3].
-        x1: The same at its end.
+        interval: The interval.
         kind: Index in :data:`KINDS`, shape [n].
         elements: What the two are: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape [n, 2].
-        meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
+        meshes: The two meshes, indices in ``interval.segment.meshes``, shape [n, 2].
         indices: The numbers of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the
             polygon and -1 for a face, the points at both ends for the others.
         vertices: The vertices of the segment that the two have: one and -1 for a vertex, both ends for an edge, -1 for
@@ -41,9 +42,7 @@ class Contacts:
         counted: Which of the pairs that the detector found these are, vertex-face before edge-edge, booleans.
     """
 
-    segment: Segment = field(repr=False)
-    x0: np.ndarray = field(repr=False)
-    x1: np.ndarray = field(repr=False)
+    interval: Interval = field(repr=False)
     kind: np.ndarray
     elements: np.ndarray
     meshes: np.ndarray
@@ -65,7 +64,7 @@ class Contacts:
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
         """Names of the two meshes of some pairs."""
-        names = [mesh.name for mesh in self.segment.meshes]
+        names = [mesh.name for mesh in self.interval.segment.meshes]
         return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
 
     def element_names(self, rows: slice) -> list[tuple[str, str]]:
@@ -86,16 +85,18 @@ class Contacts:
     def colliding_faces(self) -> np.ndarray:
         """The faces of the segment that collide, or have an edge that does, ascending."""
         ends = self.vertices[self.elements >= EDGE]
-        return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
+        return np.union1d(self.faces[self.faces >= 0], self.interval.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
         """The polygons that collide, or have an edge or a vertex that does: by the mesh, ascending."""
-        around = self.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
-        meshes, polygons = self.segment.locate_faces(np.union1d(self.colliding_faces, around))
+        around = self.interval.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
+        meshes, polygons = self.interval.segment.locate_faces(np.union1d(self.colliding_faces, around))
         return {int(mesh): np.unique(polygons[meshes == mesh]) for mesh in np.unique(meshes)}
 
 
-def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> Contacts:
+def find_contacts(
+    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
+) -> SceneContacts:
     """Name what a detection found, of the pairs that count.
 
     Pairs of meshes that never move do not, nor do those that the selection leaves out, nor those of a mesh with itself
@@ -104,15 +105,12 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
     circle from one sample to the next, or scales by zero, the straight ways between do meet. The mesh does not.)
 
     Args:
-        segment: The meshes.
-        mesh: Their :class:`~warp_bsc.detection.mesh.CollisionMesh`.
+        interval: The interval.
+        mesh: Its meshes as the detector has them.
         collisions: What the detector found.
-        x0: Positions at the start, shape [vertex_count, 3].
-        x1: Positions at the end, shape [vertex_count, 3].
-        start: Time code of the start.
-        end: Time code of the end.
         selection: Which pairs of meshes count.
     """
+    segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     n_vertex_face, n_edge_edge = len(vertices), len(ends)
@@ -159,11 +157,11 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
         all_vertices,
         all_faces,
         toi,
-        start + toi * (end - start),
+        interval.start + toi * (interval.end - interval.start),
         position,
         normal,
     )
-    return Contacts(segment, x0, x1, *(array[counted] for array in arrays), counted)
+    return SceneContacts(interval, *(array[counted] for array in arrays), counted)
 
 
 def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:

@@ -1,21 +1,21 @@
-"""All that a replay found, in numbers: what every table and file sums up at the end."""
+"""A whole replay in numbers, as every table and file gives it at the end."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, Interval
+from .intervals import TOI_BINS, IntervalSummary
 
-__all__ = ["CERTIFIED_FOR", "Outcome"]
+__all__ = ["CERTIFIED_FOR", "Summary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
 """What a certificate is about."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """All that a replay found.
+class Summary:
+    """A whole replay in numbers.
 
     Attributes:
         scene: The scene.
@@ -28,7 +28,7 @@ class Outcome:
     scene: Scene
     method: str
     device: str
-    intervals: list[Interval]
+    intervals: list[IntervalSummary]
     stopped: str = ""
 
     @property
@@ -39,15 +39,15 @@ class Outcome:
     @property
     def interval_count(self) -> int:
         """How many intervals the scene has."""
-        return len(self.scene.times) - 1
+        return len(self.scene)
 
     @cached_property
-    def colliding(self) -> list[Interval]:
+    def colliding(self) -> list[IntervalSummary]:
         """The intervals with collisions."""
         return [interval for interval in self.intervals if interval.hits]
 
     @cached_property
-    def worst(self) -> list[Interval]:
+    def worst(self) -> list[IntervalSummary]:
         """The same, those with the most collisions first."""
         return sorted(self.colliding, key=lambda interval: -interval.hits)
 
@@ -112,7 +112,7 @@ class Outcome:
             )
         return sentence
 
-    def first(self, count: int) -> "Outcome":
+    def first(self, count: int) -> "Summary":
         """What the first intervals are of it."""
         if count == len(self.intervals):
             return self

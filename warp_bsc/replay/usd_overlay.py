@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import ReplayOutput, without_last_eighth
+from .._atomic_file import OutputFile
 from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
+from .intervals import IntervalResult
+from .outputs import without_last_eighth
 from .scene_contacts import KINDS
-from .summary import Outcome
+from .summary import Summary
 
 __all__ = ["Overlay"]
 
@@ -38,7 +40,7 @@ _CONTACTS = {
 """Attributes of the contact points that have time samples: their types and interpolations."""
 
 
-class Overlay(ReplayOutput):
+class Overlay:
     """A layer in USD's text format whose sublayer is the scene, so that both are seen when it is opened.
 
     Contact points are one ``UsdGeom.Points``, its samples at the start of each interval being what meets in it, and
@@ -76,11 +78,12 @@ class Overlay(ReplayOutput):
         low, high = _bounds(scene)
         self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
         self._metadata = layer_metadata(scene)
-        super().__init__(path)
-        self._spool = tempfile.TemporaryFile(buffering=0, dir=self._output.folder)  # noqa: SIM115 (closed when discarded)
+        self.file = OutputFile(path)
+        self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
-    def add(self, interval, contacts):
-        """Take the contacts of an interval."""
+    def add(self, result: IntervalResult) -> None:
+        """Adds the contacts of an interval."""
+        interval, contacts = result.summary, result.contacts
         prim = self._contacts_path
         size = self._width / 2
         points = contacts.position.astype(np.float32)
@@ -101,25 +104,25 @@ class Overlay(ReplayOutput):
         self._last_start = interval.start
         self._ends.append(self._spool.tell())
 
-    def finish(self, outcome: Outcome):
+    def finish(self, summary: Summary) -> None:
         """Write the layer and put it in its place."""
-        del self._ends[len(outcome.intervals) :]
-        self._output.truncate(0)
-        self._write(outcome.first(len(self._ends)))
-        self._output.commit()
+        del self._ends[len(summary.intervals) :]
+        self.file.truncate(0)
+        self._write(summary.first(len(self._ends)))
+        self.file.commit()
 
-    def shrink(self):
-        """Forget the samples of the last intervals."""
+    def shrink(self) -> bool:
+        """Drops the samples of the last intervals."""
         if not self._ends:
             return False
         self._ends = without_last_eighth(self._ends)
         self._spool.truncate(self._ends[-1] if self._ends else 0)
         return True
 
-    def discard(self):
-        """Leave nothing behind, unless the file is finished."""
+    def discard(self) -> None:
+        """Removes the temporary files."""
         self._spool.close()
-        super().discard()
+        self.file.discard()
 
     def _sample(self, prim, name, time, texts, lit_count=0):
         """Let a sample of an attribute wait in the spool."""
@@ -135,10 +138,10 @@ class Overlay(ReplayOutput):
 
     def _color(self, interval, contacts):
         """Let the colours of all meshes wait that change at the start of an interval."""
-        meshes = {mesh.path: mesh for mesh in contacts.segment.meshes if mesh.path == mesh.name}
+        meshes = {mesh.path: mesh for mesh in contacts.interval.segment.meshes if mesh.path == mesh.name}
         lit = {}
         for number, polygons in contacts.colliding_polygons().items():
-            mesh = contacts.segment.meshes[number]
+            mesh = contacts.interval.segment.meshes[number]
             if mesh.path in meshes:
                 lit[mesh.path] = polygons
             else:
@@ -161,37 +164,37 @@ class Overlay(ReplayOutput):
         text = _color_text(self._unlit[path], count, lit)
         self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
 
-    def _write(self, outcome):
-        """Write the whole layer, of the intervals of an outcome."""
+    def _write(self, summary):
+        """Write the whole layer, of the intervals of an summary."""
         spool_end = self._ends[-1] if self._ends else 0
         parts = {path: [] for path in sorted(self._opened)}
         for (path, name), samples in self._samples.items():
             kept = [sample for sample in samples if sample.place < spool_end]
             if kept:
                 parts.setdefault(path, []).append((name, kept))
-        writer = _Writer(self._output)
-        writer.write(self._head(outcome))
-        end = outcome.intervals[-1].end if outcome.intervals else self._scene.times[0]
+        writer = _Writer(self.file)
+        writer.write(self._head(summary))
+        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
         self._write_prims(writer, "", _tree(parts), parts, end)
         writer.flush()
 
-    def _head(self, outcome) -> str:
+    def _head(self, summary) -> str:
         """The layer's metadata."""
-        doc = f"Collisions found by warp-bsc replay. {outcome.motion}"
+        doc = f"Collisions found by warp-bsc replay. {summary.motion}"
         if self._uncolored:
             doc += " Polygons of point instancers are not coloured: their instances are one prim."
-        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.path.parent.resolve())).as_posix()
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
         asset = source if source.startswith("../") else f"./{source}"
-        complete = "true" if outcome.is_complete else "false"
-        stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
+        complete = "true" if summary.is_complete else "false"
+        stopped = f"\n            string stopped = {_quote(summary.stopped)}" if summary.stopped else ""
         metadata = "\n    ".join(f"{name} = {_literal(value)}" for name, value in self._metadata.items())
         return f"""#usda 1.0
 (
     customLayerData = {{
         dictionary collisions = {{
             bool complete = {complete}
-            int hits = {outcome.hits}
-            int intervals = {len(outcome.intervals)}{stopped}
+            int hits = {summary.hits}
+            int intervals = {len(summary.intervals)}{stopped}
         }}
     }}
     doc = {_quote(doc)}
@@ -258,7 +261,7 @@ class _Writer:
     """Writes many short texts as a few long ones."""
 
     def __init__(self, output):
-        self._output = output
+        self.file = output
         self._waiting, self._length = [], 0
 
     def write(self, text):
@@ -271,7 +274,7 @@ class _Writer:
             self.flush()
 
     def flush(self):
-        self._output.write(b"".join(self._waiting))
+        self.file.write(b"".join(self._waiting))
         self._waiting, self._length = [], 0
 
 
@@ -330,7 +333,8 @@ def _quote(text: str) -> str:
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
     """The lowest and the highest corner of what moves at first, or of all if nothing does yet."""
-    segment, x, _ = scene.interval(0)
+    interval = scene.interval(0)
+    segment, x = interval.segment, interval.x0
     meshes, _ = segment.locate_vertices(np.arange(segment.vertex_count))
     moves = np.array([mesh.moves for mesh in segment.meshes], dtype=bool)[meshes]
     x = x[moves] if moves.any() else x

@@ -42,12 +42,14 @@ named in :attr:`Scene.warnings`, and so is what becomes of the motion.
 
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from .files import SceneFiles
+from .interval import Interval
 from .segment import Segment
 from .selection import Selection
 
@@ -206,41 +208,55 @@ class Scene:
     @property
     def warnings(self) -> list[str]:
         """What is passed over or changed, a sentence each; of what jumps, what has been read so far."""
-        warnings = [f"left out: {reason}" for reason in self.left_out[:_NAMED]]
+        warnings = [*map(_left_out_warning, self.left_out[:_NAMED])]
         if len(self.left_out) > _NAMED:
             warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
-        warnings += [f"OpenUSD says: {message}" for message in self._messages[:_NAMED]]
+        warnings += map(_message_warning, self._messages[:_NAMED])
         warnings += self._warnings
-        for name, times in self._jump_times.items():
-            warnings.append(f"{name} jumps {_times_in_words(sorted(times))}: what it jumps through is not checked")
+        warnings += (_jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
             warnings.append(f"vertices in one place at all times were welded: {self._welded}")
         return warnings
 
-    def interval(self, index: int) -> tuple[Segment, np.ndarray, np.ndarray]:
-        """The motion from one time to the next.
+    def __len__(self) -> int:
+        """Returns the number of intervals, at least 1."""
+        return len(self.times) - 1
+
+    def __iter__(self) -> Iterator[Interval]:
+        """Reads all intervals in order, each when it is reached. Errors are those of :meth:`interval`."""
+        return (self.interval(index) for index in range(len(self)))
+
+    def interval(self, index: int) -> Interval:
+        """Reads the motion from one time to the next.
 
         Args:
-            index: Of the time in :attr:`times`.
-
-        Returns:
-            The meshes that are there, and the positions of their vertices at the start and at the end, in the scene's
-            unit of length, shape [vertex_count, 3].
+            index: Number of the interval, from 0: it starts at that one of :attr:`times`.
 
         Raises:
+            IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
+        left_out, messages = len(self.left_out), len(self._messages)
         with self._collecting(self._messages, self.path):
             while True:
                 segment = self._segment_at(index)
                 try:
-                    interval = segment, segment.positions(start), segment.positions(end, before=True)
+                    x0, x1 = segment.positions(start), segment.positions(end, before=True)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
-        self._note_jumps(index, *interval)
-        return interval
+        jumps = self._find_jumps(index, segment, x0, x1)
+        for name in jumps:
+            self._jump_times.setdefault(name, set()).add(start)
+        warnings = [
+            *map(_left_out_warning, self.left_out[left_out:]),
+            *map(_message_warning, self._messages[messages:]),
+            *(_jump_warning(name, [start]) for name in jumps),
+        ]
+        return Interval(index, start, end, segment, x0, x1, jumps, tuple(warnings))
 
     def _check_meshes(self, is_selection):
         """Sees to it that there are meshes, and that some move."""
@@ -306,20 +322,22 @@ class Scene:
             self._spans[place : place + 1] = [(first, since), (since, last)]
         self._span = self._last = None
 
-    def _note_jumps(self, index, segment, start, end):
-        """Notes which meshes do not start an interval where they ended the one before."""
+    def _find_jumps(self, index, segment, start, end) -> tuple[str, ...]:
+        """Returns the names of the meshes that do not start an interval where they ended the one before."""
         last, self._last = self._last, (index, segment, start, end)
         if last is None or last[:2] != (index - 1, segment) or np.array_equal(start, last[3]):
-            return
+            return ()
         _, _, last_start, last_end = last
         gaps = np.abs(start - last_end).max(axis=1)
         ways = np.maximum(np.abs(last_end - last_start).max(axis=1), np.abs(end - start).max(axis=1))
         rounding = _ROUNDING * np.abs(start).max()
         meshes = segment.vertex_meshes
+        names = []
         for number in np.unique(meshes[gaps > rounding]):
             own = meshes == number
             if gaps[own].max() > _JUMP * ways[own].max() + rounding:
-                self._jump_times.setdefault(segment.meshes[number].name, set()).add(self.times[index])
+                names.append(segment.meshes[number].name)
+        return tuple(names)
 
     def _note_changes(self):
         for mesh in self._usd_meshes:
@@ -331,6 +349,18 @@ class Scene:
             for what, times in times_of.items():
                 at = _times_in_words(times)
                 self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
+
+
+def _left_out_warning(reason) -> str:
+    return f"left out: {reason}"
+
+
+def _message_warning(message) -> str:
+    return f"OpenUSD says: {message}"
+
+
+def _jump_warning(name, times) -> str:
+    return f"{name} jumps {_times_in_words(times)}: what it jumps through is not checked"
 
 
 def _times_in_words(times) -> str:
