@@ -96,7 +96,7 @@ class OutputFile:
                 shutil.copyfileobj(self._file, self._stream)
                 self._stream.flush()
             except OSError as error:
-                raise OSError(error.strerror) from None  # without its number: to keep less would not help
+                raise type(error)(error.strerror) from None  # without its number: to keep less would not help
         else:
             os.fsync(self._file.fileno())
             if self._temporary is None:

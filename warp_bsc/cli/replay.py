@@ -182,8 +182,12 @@ def run_replay(scene: Scene, arguments, device) -> int:
             finished = outputs if intervals else []  # what was there before is better than nothing
             # Nothing disturbs the files. Whoever reads the other ones may never come to the end.
             problems += _finish([output for output in finished if not output.file.is_stream], outcome)
-            with INTERRUPTS.raised():
-                problems += _finish([output for output in finished if output.file.is_stream], outcome)
+            try:
+                with INTERRUPTS.raised():
+                    problems += _finish([output for output in finished if output.file.is_stream], outcome)
+            except BrokenPipeError:
+                if not problems:
+                    raise
             if problems:
                 raise ValueError("; ".join([str(interrupt)] * bool(interrupt) + problems))
             if not interrupt:
@@ -227,6 +231,8 @@ def _finish(outputs: list[ReplayOutput], outcome: Summary) -> list[str]:
         try:
             output.finish(outcome)
         except Exception as error:
+            if isinstance(error, BrokenPipeError) and str(output.file.path) == STDOUT:
+                raise  # nobody reads it any more, which is no error
             number = error.errno if isinstance(error, OSError) else None
             sharing, smaller = [output], []
             if number in (errno.ENOSPC, errno.EDQUOT) and shared:
