@@ -5,6 +5,11 @@ import importlib.util
 import sys
 from pathlib import Path
 
+from . import replay
+
+# Public is the function of that name. The import system binds a package here only when it is first imported: now.
+del replay
+
 __version__ = "0.1.0"
 
 _KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
@@ -31,10 +36,13 @@ _MODULES = {
     "Collisions": "detection.detector",
     "DetectionStats": "detection.detector",
     "QueryResult": "detection.query",
+    "Scene": "usd.scene",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.solver_ccd",
     "query_edge_edge": "detection.query",
+    "query_points": "detection.query_points",
     "query_vertex_face": "detection.query",
+    "replay": "replay.intervals",
 }
 
 __all__ = [
@@ -44,11 +52,14 @@ __all__ = [
     "Collisions",
     "DetectionStats",
     "QueryResult",
+    "Scene",
     "SolverCCD",
     "SolverReport",
     "checker",
     "query_edge_edge",
+    "query_points",
     "query_vertex_face",
+    "replay",
 ]
 
 

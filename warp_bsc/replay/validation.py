@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import checker
+from ..detection.query_points import query_points
 
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 
@@ -57,17 +58,13 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, count
     for kind, first, second in (("vertex_face", vertices, faces), ("edge_edge", edges, edges)):
         found, toi = getattr(collisions, kind), getattr(collisions, f"{kind}_toi")
 
-        def motions(pairs, first=first, second=second):
-            corners = np.concatenate([first[pairs[:, 0]], second[pairs[:, 1]]], axis=1)
-            return np.concatenate([x0[corners], x1[corners]], axis=1)
-
         rows = np.arange(len(found))
         if counted is not None:
             rows, counted = np.flatnonzero(counted[: len(found)]), counted[len(found) :]
         if most is not None and len(rows) > most:
             rows = np.sort(random.choice(rows, most, replace=False))
         asked_hits += len(rows)
-        bounds = getattr(checker, f"{kind}_toi")(motions(found[rows]))
+        bounds = getattr(checker, f"{kind}_toi")(query_points(second, found[rows], x0, x1))
         for row, (earliest, latest) in zip(rows, bounds, strict=True):
             pair = f"{kind.replace('_', '-')} {found[row].tolist()}"
             if np.isnan(earliest) and detector.method == "conservative":
@@ -82,7 +79,7 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, count
         others = _unreported(mesh, kind, first, second, found, x0, x1)
         for pairs in others if most is None else [_choose(others, most, random)]:
             asked_others += len(pairs)
-            collides = getattr(checker, kind)(motions(pairs))
+            collides = getattr(checker, kind)(query_points(second, pairs, x0, x1))
             name = kind.replace("_", "-")
             disagreements += [f"{name} {pair} collides and was not reported" for pair in pairs[collides].tolist()]
 
