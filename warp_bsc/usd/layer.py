@@ -1,4 +1,7 @@
-"""What a layer over a scene needs to know of it: metadata, colours, instances, and times just before others."""
+"""Facts of a scene for a layer over it: metadata, display colours, instances, and time codes just before others."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
 
 import numpy as np
 
