@@ -1,7 +1,5 @@
 """Checks the arrays that users pass in."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,7 +28,7 @@ def checked_shape(array: ArrayLike, shape: tuple[int, ...], name: str) -> np.nda
     return array
 
 
-def check_finite(array: np.ndarray, name: str, rows: Sequence[int] | np.ndarray | None = None) -> None:
+def check_finite(array: np.ndarray, name: str, rows: np.ndarray | None = None) -> None:
     """Raises a ValueError that names the first row that is not finite, of an array or of some of its rows."""
     finite = np.isfinite(array if rows is None else array[rows]).all(axis=tuple(range(1, array.ndim)))
     if not finite.all():

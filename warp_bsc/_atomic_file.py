@@ -175,7 +175,7 @@ def _open_temporary(folder):
 def _give_name(file, folder) -> Path:
     """Links a temporary file without a name into a folder. Returns its path."""
     path = _new_name(folder)
-    # Only given a folder's descriptor, which an absolute path ignores, does Python call the function that follows links.
+    # Python calls the function that follows links only if given a folder's descriptor, which an absolute path ignores.
     os.link(f"/proc/self/fd/{file.fileno()}", path, src_dir_fd=file.fileno())
     return path
 

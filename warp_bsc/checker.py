@@ -139,7 +139,7 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
     edges = checked_coordinates(edges, (2, 3), "edges")
     faces = checked_coordinates(faces, (3, 3), "faces")
     if len(edges) != len(faces):
-        raise ValueError(f"edges and faces must be as many, got {len(edges)} edges and {len(faces)} faces")
+        raise ValueError(f"edges and faces must have the same length, got {len(edges)} edges and {len(faces)} faces")
     points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
     return _collides(points, _VERTEX_FACE)
 

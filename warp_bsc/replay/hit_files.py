@@ -1,11 +1,13 @@
-"""Every collision of a replay as JSON and as CSV, for programs."""
+"""Writes every collision of a replay as JSON or CSV, for programs."""
 
 import csv
 import io
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import asdict
 
+from ..usd.scene import Scene
 from .intervals import IntervalResult
 from .outputs import RecordFile
 from .scene_contacts import KINDS
@@ -17,16 +19,16 @@ _FIELDS = ("kind", "meshes", "prims", "elements", "indices", "time", "toi", "pos
 
 
 class HitsJson(RecordFile):
-    """A JSON file: facts of the scene, each interval with its contacts, then the sums."""
+    """A JSON file: facts of the scene, every interval with its contacts, then the sums."""
 
-    def __init__(self, path, *, scene, method: str, device: str):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene, method: str, device: str):
         """Opens the file.
 
         Args:
-            path: Its place.
+            path: The file's place.
             scene: The scene.
-            method: The method that is used.
-            device: The device that is used.
+            method: Method of detection.
+            device: Name of the Warp device.
 
         Raises:
             OSError: If it cannot be written.
@@ -45,11 +47,11 @@ class HitsJson(RecordFile):
         }
 
     def head(self) -> str:
-        """The file up to the first interval."""
+        """Returns the text before the first interval."""
         return json.dumps(self._facts)[:-1] + ', "intervals": ['
 
     def record(self, result: IntervalResult) -> Iterator[str]:
-        """An interval with all of its contacts."""
+        """Yields the text of an interval with all of its contacts."""
         interval, contacts = result.summary, result.contacts
         fields = {
             "index": interval.index,
@@ -73,7 +75,7 @@ class HitsJson(RecordFile):
         yield "]}"
 
     def tail(self, summary: Summary) -> str:
-        """The file from the last interval on."""
+        """Returns the text after the last interval."""
         sums = {
             "complete": summary.is_complete,
             "stopped": summary.stopped,
@@ -100,11 +102,11 @@ class HitsCsv(RecordFile):
     )  # fmt: skip
 
     def head(self) -> str:
-        """The names of the columns."""
+        """Returns the names of the columns."""
         return _to_csv([self._COLUMNS])
 
     def record(self, result: IntervalResult) -> Iterator[str]:
-        """The rows of an interval."""
+        """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
         for rows in contacts.chunks():
@@ -119,14 +121,14 @@ class HitsCsv(RecordFile):
             )  # fmt: skip
 
     def tail(self, summary: Summary) -> str:
-        """What is missing."""
+        """Returns a line on the missing intervals, empty if there are none."""
         if summary.is_complete:
             return ""
         return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
 
 
 def _rows(contacts, rows):
-    """Of each of some contacts what :data:`_FIELDS` names."""
+    """Yields the values of :data:`_FIELDS` for some contacts."""
     paths = [mesh.path for mesh in contacts.interval.segment.meshes]
     columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
     columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]

@@ -15,16 +15,16 @@ from .validation import Validation, validate
 __all__ = ["TOI_BINS", "Contact", "IntervalResult", "IntervalSummary", "replay"]
 
 TOI_BINS = 20
-"""Parts of an interval that times of impact are counted in."""
+"""Number of equal parts of an interval in which times of impact are counted."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Where and when two meshes, or a mesh and itself, meet.
+    """A collision of two meshes, or of a mesh with itself, in words.
 
     Attributes:
         meshes: Names of the two.
-        elements: What meets, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
+        elements: The two elements, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
         toi: Time of impact, 0 at the start of the interval and 1 at its end.
         time: The same as a time code.
     """
@@ -49,8 +49,9 @@ class IntervalSummary:
         mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
             with itself is there twice.
         earliest: The earliest contact, None if there is none.
-        certified: Whether no collision of vertices that move straight from the start to the end can be missing.
-        stats: Counts and times of the detector's stages, pairs that do not count included.
+        certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
+            move straight from the start to the end.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None if none was asked for.
     """
 
@@ -78,7 +79,7 @@ class IntervalSummary:
 
     @property
     def milliseconds(self) -> float:
-        """Time that the detector took [ms]."""
+        """Time of the detector's stages together [ms]."""
         return sum(self.stats.milliseconds.values())
 
 

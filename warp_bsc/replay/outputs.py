@@ -1,5 +1,6 @@
-"""What the files of a replay have in common: they take one interval after the other, and can shrink."""
+"""The interface of all files that a replay writes, and the base of those that are a list of records."""
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from typing import Protocol, TypeVar
@@ -59,7 +60,7 @@ class RecordFile(ABC):
         file: The file.
     """
 
-    def __init__(self, path: str):
+    def __init__(self, path: str | os.PathLike):
         """Opens the file.
 
         Raises:

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, IntervalSummary
+from .intervals import TOI_BINS, Contact, IntervalSummary
 
 __all__ = ["CERTIFIED_FOR", "Summary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
-"""What a certificate is about."""
+"""The motion that a certificate holds for."""
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class Summary:
 
     Attributes:
         scene: The scene.
-        method: The method that was used.
-        device: The device that was used.
-        intervals: Those that are finished, in order.
-        stopped: Why there are no more; empty if these are all.
+        method: Method of detection.
+        device: Name of the Warp device.
+        intervals: The finished intervals, in order.
+        stopped: Why the replay ended before the scene did; empty if it did not.
     """
 
     scene: Scene
@@ -38,7 +38,7 @@ class Summary:
 
     @property
     def interval_count(self) -> int:
-        """How many intervals the scene has."""
+        """Number of intervals of the scene."""
         return len(self.scene)
 
     @cached_property
@@ -48,8 +48,13 @@ class Summary:
 
     @cached_property
     def worst(self) -> list[IntervalSummary]:
-        """The same, those with the most collisions first."""
+        """The intervals with collisions, those with the most first."""
         return sorted(self.colliding, key=lambda interval: -interval.hits)
+
+    @property
+    def first_contact(self) -> Contact | None:
+        """The earliest contact, None if there is none."""
+        return self.colliding[0].earliest if self.colliding else None
 
     @property
     def hits(self) -> int:
@@ -58,13 +63,13 @@ class Summary:
 
     @property
     def certified(self) -> bool:
-        """Whether no collision of vertices that move straight can be missing in what is finished."""
+        """Whether no collision of vertices that move straight is missing in the finished intervals."""
         return all(interval.certified for interval in self.intervals)
 
     @cached_property
     def mesh_pairs(self) -> list[tuple[tuple[str, str], int]]:
-        """Names of two meshes and the number of their pairs that collide, the most first."""
-        total = Counter()
+        """Names of two meshes and their number of colliding pairs, the largest first."""
+        total: Counter[tuple[str, str]] = Counter()
         for interval in self.intervals:
             total.update(interval.mesh_pairs)
         return total.most_common()
@@ -85,7 +90,7 @@ class Summary:
 
     @property
     def validation(self) -> dict | None:
-        """What the exact checker says of the answers, None if it was not asked."""
+        """The comparison with the exact checker, None if none was asked for."""
         found = [(interval, interval.validation) for interval in self.intervals if interval.validation]
         if not found:
             return None
@@ -102,7 +107,7 @@ class Summary:
 
     @property
     def motion(self) -> str:
-        """A sentence on what is taken for the motion between samples."""
+        """A sentence on the motion that is assumed between samples."""
         sentence = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
@@ -113,7 +118,7 @@ class Summary:
         return sentence
 
     def first(self, count: int) -> "Summary":
-        """What the first intervals are of it."""
+        """Returns the summary of the first intervals alone."""
         if count == len(self.intervals):
             return self
         return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "no room for more")

@@ -1,15 +1,15 @@
-"""A USD layer over the scene, which shows its collisions in usdview and any other program that reads USD."""
+"""Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
 
 import os
 import tempfile
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
 from .._atomic_file import OutputFile
 from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
+from ..usd.scene import Scene
 from .intervals import IntervalResult
 from .outputs import without_last_eighth
 from .scene_contacts import KINDS
@@ -18,12 +18,12 @@ from .summary import Summary
 __all__ = ["Overlay"]
 
 COLORS = {"vertex-face": (0.9, 0.1, 0.1), "edge-edge": (1.0, 0.55, 0.0)}
-"""Of the contact points, by their kind."""
+"""Colours of the contact points by kind."""
 
 LIT = (0.95, 0.25, 0.2)
 """Colour of the polygons that collide."""
 
-_UNLIT = (0.6, 0.6, 0.6)  # of a mesh without a colour
+_UNLIT = (0.6, 0.6, 0.6)  # colour of a mesh that has none
 _DISPLAY_COLOR = "primvars:displayColor"
 _POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
 
@@ -41,38 +41,42 @@ _CONTACTS = {
 
 
 class Overlay:
-    """A layer in USD's text format whose sublayer is the scene, so that both are seen when it is opened.
+    """A layer in USD's text format whose sublayer is the scene, so that opening the layer shows both.
 
-    Contact points are one ``UsdGeom.Points``, its samples at the start of each interval being what meets in it, and
-    have the primvars ``toi``, ``elementA`` and ``elementB``. Polygons that collide are coloured from the start of the
-    interval to that of the next. USD interpolates between samples: each ends with another one just before the next.
+    The contact points are one ``UsdGeom.Points`` with the primvars ``toi``, ``elementA`` and ``elementB``. It has a
+    sample at the start of each interval, with the contacts of that interval. Polygons that collide are coloured from
+    the start of the interval to the start of the next. USD interpolates between samples, so every sample is repeated
+    just before the next.
 
-    USD's own layers hold all that is written to them in memory. Here samples wait in a temporary file, and are sorted
-    by attribute at the end, when the scene, whose file may have become unreadable, is not read again.
+    USD's own layers hold their whole content in memory. This one keeps its samples in a temporary file, the spool, and
+    sorts them by attribute at the end. It does not read the scene then, whose file may have become unreadable.
+
+    Attributes:
+        file: The file.
     """
 
-    def __init__(self, path, *, scene):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene):
         """Opens the file.
 
         Args:
-            path: Its place, a ``.usda`` or ``.usd`` file.
+            path: The file's place, a ``.usda`` or ``.usd`` file.
             scene: The scene.
 
         Raises:
-            OSError: If it cannot be written.
-            ValueError: If it is not such a file.
+            OSError: If the file cannot be written.
+            ValueError: If its name has another suffix.
         """
         if Path(path).suffix not in (".usda", ".usd"):
             raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
         self._scene = scene
-        self._samples = {}  # by prim and attribute
-        self._ends = []  # of each interval that is whole, in the spool
-        self._last_start = None  # of an interval
-        self._colored = {}  # by the prim's path: the number of polygons in the last sample, and which of them are lit
-        self._unlit = {}  # by the prim's path: the scene's colours there
-        self._polygon_counts = {}  # of the meshes in the interval before
+        self._samples: dict[tuple[str, str], list[_Sample]] = {}  # by prim and attribute
+        self._ends = []  # where each complete interval ends in the spool
+        self._last_start: float | None = None  # of the last interval added
+        self._colored = {}  # by path of the prim: the number of polygons in the last sample, and the lit ones
+        self._unlit = {}  # by path of the prim: the colours in the scene
+        self._polygon_counts = {}  # by path: the number of polygons in the last interval added
         self._uncolored = False
-        self._opened = set()  # instances that must have prims of their own to be coloured
+        self._opened = set()  # native instances that must get prims of their own to be coloured
         self._root_path = unused_path(scene, "/Collisions")
         self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
@@ -105,7 +109,7 @@ class Overlay:
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
-        """Write the layer and put it in its place."""
+        """Writes the layer and puts it in its place."""
         del self._ends[len(summary.intervals) :]
         self.file.truncate(0)
         self._write(summary.first(len(self._ends)))
@@ -125,7 +129,7 @@ class Overlay:
         self.file.discard()
 
     def _sample(self, prim, name, time, texts, lit_count=0):
-        """Let a sample of an attribute wait in the spool."""
+        """Adds a sample of an attribute to the spool."""
         place = self._spool.seek(0, os.SEEK_END)
         separator = ""
         for text in texts:
@@ -137,7 +141,7 @@ class Overlay:
         self._samples.setdefault((prim, name), []).append(sample)
 
     def _color(self, interval, contacts):
-        """Let the colours of all meshes wait that change at the start of an interval."""
+        """Adds the colours of all meshes whose colours change at the start of an interval."""
         meshes = {mesh.path: mesh for mesh in contacts.interval.segment.meshes if mesh.path == mesh.name}
         lit = {}
         for number, polygons in contacts.colliding_polygons().items():
@@ -179,7 +183,7 @@ class Overlay:
         writer.flush()
 
     def _head(self, summary) -> str:
-        """The layer's metadata."""
+        """Returns the layer's metadata as text."""
         doc = f"Collisions found by warp-bsc replay. {summary.motion}"
         if self._uncolored:
             doc += " Polygons of point instancers are not coloured: their instances are one prim."
@@ -206,7 +210,7 @@ class Overlay:
 """
 
     def _write_prims(self, writer, path, tree, parts, end):
-        """Write the prims below a path, from a tree of their names."""
+        """Writes the prims below a path, from a tree of their names."""
         indent = "    " * path.count("/")
         for name, children in tree.items():
             below = f"{path}/{name}"
@@ -222,7 +226,7 @@ class Overlay:
             writer.write(f"{indent}}}\n")
 
     def _write_attribute(self, writer, indent, path, name, samples, end):
-        """Write an attribute's samples, and what it is once the last interval has ended."""
+        """Writes an attribute's samples, and its value after the last interval."""
         if path == self._contacts_path:
             value_type, interpolation = _CONTACTS[name]
             after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
@@ -235,11 +239,10 @@ class Overlay:
         if interpolation:
             writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
         writer.write(".timeSamples = {\n")
-        following = [(sample.time, sample.length) for sample in samples[1:]]
-        following += [] if after is None else [(end, len(after))]
-        for sample, (time, length) in zip_longest(samples, following, fillvalue=(None, 0)):
+        following = [*((sample.time, sample.length) for sample in samples[1:]), (end, len(after or ""))]
+        for sample, (time, length) in zip(samples, following, strict=True):
             self._write_sample(writer, indent, sample.time, sample)
-            # USD interpolates if both have values, and would see points on the way from one contact to another.
+            # USD interpolates if both have values, and would show points on the way from one contact to another.
             if sample.length and length and (before := just_before(time)) > sample.time:
                 if interpolation == "vertex":
                     writer.write(f"{indent}    {before!r}: [],\n")
@@ -280,7 +283,7 @@ class _Writer:
 
 @dataclass(frozen=True)
 class _Sample:
-    """A sample that waits in the spool: its time, place and length there; the number of polygons if some are lit."""
+    """A sample in the spool: its time, its place and length there, and the number of polygons if any is lit."""
 
     time: float
     place: int
@@ -289,7 +292,7 @@ class _Sample:
 
 
 def _color_text(colors, count, lit) -> str:
-    """The colours of a mesh's polygons, those lit being :data:`LIT`."""
+    """Returns the colours of a mesh's polygons as text, :data:`LIT` for the lit ones."""
     if len(colors) != count:
         colors = colors.mean(axis=0, keepdims=True)
     table, numbers = np.unique(colors, axis=0, return_inverse=True)
@@ -300,13 +303,13 @@ def _color_text(colors, count, lit) -> str:
 
 
 def _element_texts(contacts, rows, side) -> str:
-    """The first or the second elements of some contacts, with the names of their meshes."""
+    """Returns the first or the second elements of some contacts as text, with the names of their meshes."""
     both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
     return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
 
 
 def _tree(paths) -> dict:
-    """Names of prims by those of their parents."""
+    """Returns the names of prims as a tree of dictionaries."""
     tree = {}
     for path in paths:
         place = tree
@@ -332,7 +335,7 @@ def _quote(text: str) -> str:
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest and the highest corner of what moves at first, or of all if nothing does yet."""
+    """Returns the bounding box of the moving meshes at first, or of all meshes if none moves yet."""
     interval = scene.interval(0)
     segment, x = interval.segment, interval.x0
     meshes, _ = segment.locate_vertices(np.arange(segment.vertex_count))
