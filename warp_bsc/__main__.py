@@ -10,7 +10,7 @@ __all__ = ["main"]
 
 
 def main() -> int:
-    """Run the command line with the arguments of the process, and return its exit status."""
+    """Runs the command line with the arguments of the process, and returns its exit status."""
     status = run_guarded(_load_and_run)
     try:
         sys.stdout.flush()

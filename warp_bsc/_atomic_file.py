@@ -120,7 +120,7 @@ class OutputFile:
 
 
 class _StandardOutput:
-    """Standard output for bytes of UTF-8, which it encodes as the terminal expects."""
+    """Standard output for bytes of UTF-8, which it gets in its own encoding."""
 
     def __init__(self):
         self._decoder = codecs.getincrementaldecoder("utf-8")()

@@ -169,7 +169,7 @@ class Overlay:
         self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
 
     def _write(self, summary):
-        """Write the whole layer, of the intervals of an summary."""
+        """Writes the whole layer for the intervals of a summary."""
         spool_end = self._ends[-1] if self._ends else 0
         parts = {path: [] for path in sorted(self._opened)}
         for (path, name), samples in self._samples.items():
@@ -323,7 +323,7 @@ def _tuples(rows) -> str:
 
 
 def _literal(value: str | float) -> str:
-    """A string or a number as USD's text format has it."""
+    """Returns a string or a number in the syntax of USD's text format."""
     return _quote(value) if isinstance(value, str) else repr(value)
 
 

@@ -136,7 +136,7 @@ def find_instances(
         left_out: Takes instancers that contain themselves, and instances whose prototype is missing.
 
     Raises:
-        UnreadableError: If such may not be left out.
+        UnreadableError: If these may not be left out.
     """
     where = f"{file}: {prim.GetPath()}"
     try:

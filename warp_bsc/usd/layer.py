@@ -18,7 +18,7 @@ def unused_path(scene: Scene, path: str) -> str:
 
 
 def layer_metadata(scene: Scene) -> dict[str, str | float]:
-    """Returns the scene's metadata, which a stage takes from its root layer alone, never from sublayers, by name.
+    """Returns the scene's metadata by name. A stage takes it from its root layer alone, never from sublayers.
 
     If the scene has no default prim, its first prim becomes that; if it has no range of time codes, its times do.
     """

@@ -35,7 +35,7 @@ _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 def find_meshes(
     stage: Usd.Stage, file: str | os.PathLike, selection: Selection, left_out: LeftOut
 ) -> tuple[list["UsdMesh"], list[str]]:
-    """Finds the selected meshes that are visible at some time, and says in a sentence each what is not checked.
+    """Returns the selected meshes that are visible at some time, and sentences on the contents that are not checked.
 
     Args:
         stage: The stage.
