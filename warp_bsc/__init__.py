@@ -5,11 +5,6 @@ import importlib.util
 import sys
 from pathlib import Path
 
-from . import replay
-
-# Public is the function of that name. The import system binds a package here only when it is first imported: now.
-del replay
-
 __version__ = "0.1.0"
 
 _KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
@@ -61,6 +56,11 @@ __all__ = [
     "query_vertex_face",
     "replay",
 ]
+
+
+# The function of this name is public, not the package. The import system binds a package only at its first import: now.
+importlib.import_module(".replay", __name__)
+del globals()["replay"]
 
 
 def __getattr__(name):

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import warp as wp
 
 from ..detection.detector import CollisionDetector, DetectionStats
 from ..detection.mesh import CollisionMesh
@@ -97,7 +97,7 @@ class IntervalResult:
 
 
 def replay(
-    scene: Scene, *, method: str = "exact", device: wp.DeviceLike = None, validate_most: int | None = 0
+    scene: Scene, *, method: str = "exact", device: Any = None, validate_most: int | None = 0
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
@@ -112,7 +112,7 @@ def replay(
     Args:
         scene: The scene; its selection says which pairs count.
         method: ``"float"``, ``"conservative"`` or ``"exact"``.
-        device: Warp device; default: Warp's own.
+        device: Warp device or its name; default: Warp's default.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
