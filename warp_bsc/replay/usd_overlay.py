@@ -150,7 +150,7 @@ class Overlay:
                 lit[mesh.path] = polygons
             else:
                 self._uncolored = True
-        for path in {*self._colored, *lit} & meshes.keys():
+        for path in sorted({*self._colored, *lit} & meshes.keys()):
             count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
             if path not in self._colored:
                 self._opened.update(find_instances_above(self._scene, path))
