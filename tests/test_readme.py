@@ -45,20 +45,20 @@ def test_the_scene_of_the_readme_replays_with_its_figures(capsys):
 
 def test_the_collisions_of_the_scene_are_real():
     scene = Scene(ROOT / "assets" / "cloth_twist.usd")
-    segment, _, _ = scene.interval(0)
+    segment = scene.interval(0).segment
     detector = bsc.CollisionDetector(bsc.CollisionMesh(segment.faces, segment.vertex_count))
     neighbours = np.zeros((segment.vertex_count,) * 2, dtype=bool)
     neighbours[tuple(detector.mesh.edges.T)] = True
     neighbours |= neighbours.T
     confirmed = one_ring_apart = 0
-    for index in range(len(scene.times) - 1):
-        _, x0, x1 = scene.interval(index)
+    for interval in scene:
+        x0, x1 = interval.x0, interval.x1
         c = detector.detect(x0, x1)
+        confirmed += checker.vertex_face(bsc.query_points(detector.mesh.faces, c.vertex_face, x0, x1)).sum()
+        confirmed += checker.edge_edge(bsc.query_points(detector.mesh.edges, c.edge_edge, x0, x1)).sum()
         corners = np.concatenate([c.vertex_face[:, :1], segment.faces[c.vertex_face[:, 1]]], axis=1)
-        confirmed += checker.vertex_face(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
         one_ring_apart += neighbours[corners[:, :1, None], corners[:, None, 1:]].any(axis=(1, 2)).sum()
         corners = detector.mesh.edges[c.edge_edge].reshape(-1, 4)
-        confirmed += checker.edge_edge(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
         one_ring_apart += neighbours[corners[:, :2, None], corners[:, None, 2:]].any(axis=(1, 2)).sum()
         assert len(detector.find_intersections(x0))  # the cloth is through itself at rest, too
     assert confirmed == one_ring_apart == 33

@@ -31,10 +31,13 @@ _MODULES = {
     "Collisions": "detection.detector",
     "DetectionStats": "detection.detector",
     "QueryResult": "detection.query",
+    "Scene": "usd.scene",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.solver_ccd",
     "query_edge_edge": "detection.query",
+    "query_points": "detection.query_points",
     "query_vertex_face": "detection.query",
+    "replay": "replay.intervals",
 }
 
 __all__ = [
@@ -44,12 +47,20 @@ __all__ = [
     "Collisions",
     "DetectionStats",
     "QueryResult",
+    "Scene",
     "SolverCCD",
     "SolverReport",
     "checker",
     "query_edge_edge",
+    "query_points",
     "query_vertex_face",
+    "replay",
 ]
+
+
+# The function of this name is public, not the package. The import system binds a package only at its first import: now.
+importlib.import_module(".replay", __name__)
+del globals()["replay"]
 
 
 def __getattr__(name):

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and what is written to them one interval after the other."""
+"""Writes files that appear complete or not at all."""
 
 import codecs
 import contextlib
@@ -8,17 +8,18 @@ import shutil
 import stat
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["STDOUT", "OutputFile", "ReplayOutput", "StreamedFile", "naming", "without_last_eighth"]
+__all__ = ["STDOUT", "OutputFile", "naming"]
 
 STDOUT = "-"
 """The path of standard output."""
 
 
 @contextlib.contextmanager
-def naming(what):
-    """Put the name of a file before what is wrong with it, as the system has it.
+def naming(what: str | os.PathLike) -> Iterator[None]:
+    """Puts the name of a file before the system's message on what is wrong with it.
 
     Raises:
         OSError: If one is raised in the block.
@@ -32,22 +33,23 @@ def naming(what):
 
 
 class OutputFile:
-    """A file that is written elsewhere, and takes its place when it is complete.
+    """A file that is written elsewhere and takes its place when it is complete.
 
-    A link stays, and the file that it points to is replaced. What is no regular file, such as ``/dev/null``, a named
-    pipe or ``/dev/stdout``, is not replaced: all is written to it at the end.
+    A symbolic link stays, and the file that it points to is replaced. A stream, such as ``/dev/null``, a named pipe or
+    ``/dev/stdout``, is not replaced: the whole content is written to it at the end.
 
     Attributes:
-        path: Its place, :data:`STDOUT` for standard output.
-        is_stream: Whether it is no regular file.
-        folder: Where it waits until it is complete.
+        path: The file's place, :data:`STDOUT` for standard output.
+        name: The same in words.
+        is_stream: Whether the place is a stream, not a regular file.
+        folder: The folder of the temporary file.
     """
 
-    def __init__(self, path):
-        """Opens a temporary file: one without a name, of which nothing is ever left, where the system has such.
+    def __init__(self, path: str | os.PathLike):
+        """Opens a temporary file; one without a name where the system has such, which leaves nothing behind.
 
         Raises:
-            OSError: If that or the place cannot be written.
+            OSError: If the temporary file or the place cannot be written.
         """
         self.path = Path(path)
         if self.path.is_dir():
@@ -55,6 +57,7 @@ class OutputFile:
         with naming(path):
             self._stream = _open_stream(path)
         self.is_stream = self._stream is not None
+        self.name = "standard output" if str(path) == STDOUT else str(path)
         self._place = Path(os.path.realpath(path))
         self.folder = tempfile.gettempdir() if self.is_stream else self._place.parent
         if not os.path.isdir(self.folder):
@@ -63,38 +66,38 @@ class OutputFile:
         with naming(path):
             self._file, self._temporary = _open_temporary(self.folder)
 
-    def write(self, text: str | bytes):
-        """Write all of a text.
+    def write(self, text: str | bytes) -> None:
+        """Writes the whole of a text.
 
         Raises:
-            OSError: If there is no room; some of it may have been written then.
+            OSError: If there is no room. A part of the text may have been written.
         """
         rest = memoryview(text.encode() if isinstance(text, str) else text)
         while rest:
             rest = rest[self._file.write(rest) :]
 
     def tell(self) -> int:
-        """How many bytes have been written."""
+        """Returns the number of bytes that have been written."""
         return self._file.tell()
 
-    def truncate(self, size: int):
-        """Take back what has been written after the first bytes."""
+    def truncate(self, size: int) -> None:
+        """Removes all but the first ``size`` bytes."""
         self._file.seek(size)
         self._file.truncate()
 
-    def commit(self):
-        """Put the file in its place, with the permissions of the file that was there.
+    def commit(self) -> None:
+        """Puts the file in its place, with the permissions of the file that was there.
 
         Raises:
-            OSError: If that cannot be done; what was there before is as it was.
+            OSError: If that fails. A file that was there before is unchanged.
         """
-        if self.is_stream:
+        if self._stream is not None:
             self._file.seek(0)
             try:
                 shutil.copyfileobj(self._file, self._stream)
                 self._stream.flush()
             except OSError as error:
-                raise OSError(error.strerror) from None  # without its number: to keep less would not help
+                raise type(error)(error.strerror) from None  # no number: a shorter file would not help
         else:
             os.fsync(self._file.fileno())
             if self._temporary is None:
@@ -105,141 +108,35 @@ class OutputFile:
             os.replace(self._temporary, self._place)
         self.discard()
 
-    def discard(self):
-        """Leave nothing behind, unless the file is in its place already."""
+    def discard(self) -> None:
+        """Removes the temporary file. A committed file stays."""
         self._file.close()
-        if self.is_stream:
-            with contextlib.suppress(OSError):  # of what could not be written, which was said then
+        if self._stream is not None:
+            with contextlib.suppress(OSError):  # commit has raised it already
                 self._stream.close()
         if self._temporary:
             with contextlib.suppress(FileNotFoundError):
                 self._temporary.unlink()
 
 
-class ReplayOutput:
-    """A file to which the intervals of a replay are written: the base of all formats.
-
-    Attributes:
-        path: Its place.
-        name: The same in words.
-        is_stream: Whether it is no regular file.
-    """
-
-    def __init__(self, path):
-        """Opens the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        self._output = OutputFile(path)
-        self.path, self.is_stream = self._output.path, self._output.is_stream
-        self.name = "standard output" if str(path) == STDOUT else str(path)
-
-    def add(self, interval, contacts):
-        """Take an interval.
-
-        Raises:
-            OSError: If there is no room for it. Only shrinking and finishing the file are possible then.
-        """
-        raise NotImplementedError
-
-    def finish(self, outcome):
-        """Put the file in its place.
-
-        Args:
-            outcome: All that was found, of which the last intervals may be missing in this file.
-
-        Raises:
-            OSError: If there is no room. After shrinking it may be tried again.
-        """
-        raise NotImplementedError
-
-    def shrink(self) -> bool:
-        """Make room: forget the last intervals, an eighth of them.
-
-        Returns:
-            Whether the file will be smaller.
-        """
-        raise NotImplementedError
-
-    def discard(self):
-        """Leave nothing behind, unless the file is finished."""
-        self._output.discard()
-
-
-class StreamedFile(ReplayOutput):
-    """A text of a head, a record for each interval, and a tail: the base of the formats that are such.
-
-    A record is there as a whole or not at all.
-    """
-
-    def __init__(self, path):
-        """Opens the file.
-
-        Raises:
-            OSError: If it cannot be written.
-        """
-        super().__init__(path)
-        self._ends = []  # of the head and of each record
-
-    @property
-    def record_count(self) -> int:
-        """How many records there are."""
-        return max(0, len(self._ends) - 1)
-
-    def add(self, interval, contacts):
-        """Append the record of an interval."""
-        if not self._ends:
-            self._append([self.head()])
-        self._append(self.record(interval, contacts))
-
-    def finish(self, outcome):
-        """Append the tail and put the file in its place."""
-        # An interruption may have come, or room may have ended, in the middle of what was written last.
-        del self._ends[len(outcome.intervals) + 1 :]
-        self._output.truncate(self._ends[-1] if self._ends else 0)
-        if not self._ends:
-            self._append([self.head()])
-        self._output.write(self.tail(outcome.first(self.record_count)))
-        self._output.commit()
-
-    def shrink(self):
-        """Forget the last records."""
-        if not self.record_count:
-            return False
-        self._ends[1:] = without_last_eighth(self._ends[1:])
-        self._output.truncate(self._ends[-1])
-        return True
-
-    def _append(self, texts):
-        for text in texts:
-            self._output.write(text)
-        self._ends.append(self._output.tell())
-
-
-def without_last_eighth(items: list) -> list:
-    """The items but the last eighth of them, of which there is at least one."""
-    return items[: len(items) - max(1, len(items) // 8)]
-
-
 class _StandardOutput:
-    """Standard output for bytes of UTF-8, to which it may give another encoding."""
+    """Standard output for bytes of UTF-8, which it gets in its own encoding."""
 
     def __init__(self):
         self._decoder = codecs.getincrementaldecoder("utf-8")()
 
-    def write(self, data):
+    def write(self, data: bytes) -> None:
         sys.stdout.write(self._decoder.decode(data))
 
-    def flush(self):
+    def flush(self) -> None:
         sys.stdout.flush()
 
-    def close(self):
+    def close(self) -> None:
         pass
 
 
 def _open_stream(path):
-    """What to write to if a path names no regular file, None if it does or could."""
+    """Opens the stream that a path names; returns None for a regular file or where there is none yet."""
     if str(path) == STDOUT:
         return _StandardOutput()
     try:
@@ -253,7 +150,7 @@ def _open_stream(path):
 
 
 def _find_descriptor(path) -> int | None:
-    """The open file of this process that a path names, as ``/dev/stderr`` does, even if that is a regular one."""
+    """Returns the descriptor of this process that a path such as ``/dev/stderr`` names, None for other paths."""
     while True:
         folder, name = os.path.realpath(os.path.dirname(path)), os.path.basename(path)
         if folder in ("/dev/fd", f"/proc/{os.getpid()}/fd"):
@@ -264,9 +161,9 @@ def _find_descriptor(path) -> int | None:
 
 
 def _open_temporary(folder):
-    """A temporary file, and its path, None if it has no name: the system then removes it as soon as it is closed."""
+    """Opens a temporary file. Returns it and its path, None for a file without a name, which closing removes."""
     if hasattr(os, "O_TMPFILE"):
-        with contextlib.suppress(OSError):  # where the file system has no such files, or gives them no names
+        with contextlib.suppress(OSError):  # the file system has no such files, or cannot name them later
             flags = os.O_TMPFILE | os.O_RDWR
             with open(os.open(folder, flags, 0o666), "wb", buffering=0) as trial:
                 _give_name(trial, folder).unlink()
@@ -276,9 +173,9 @@ def _open_temporary(folder):
 
 
 def _give_name(file, folder) -> Path:
-    """A new name in a folder for a temporary file without one."""
+    """Links a temporary file without a name into a folder. Returns its path."""
     path = _new_name(folder)
-    # Given a folder's descriptor, of which an absolute path makes no use, Python calls the function that follows links.
+    # Python calls the function that follows links only if given a folder's descriptor, which an absolute path ignores.
     os.link(f"/proc/self/fd/{file.fileno()}", path, src_dir_fd=file.fileno())
     return path
 

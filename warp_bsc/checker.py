@@ -1,4 +1,4 @@
-"""The true answer of any query, in exact rational arithmetic: Python integers and NumPy, no Warp, no Bernstein signs.
+"""Decides queries exactly in rational arithmetic: Python integers and NumPy, no Warp, no Bernstein signs.
 
 What counts as a collision
 --------------------------
@@ -47,6 +47,7 @@ import itertools
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ._arrays import checked_coordinates
 
@@ -61,8 +62,8 @@ _PIECES = 8  # into which the filter cuts the step
 _MARGIN = 1e-10  # more than the error of any value in the filter, see _may_touch
 
 
-def vertex_face(points):
-    """Says which vertex-face queries collide.
+def vertex_face(points: ArrayLike) -> np.ndarray:
+    """Returns which vertex-face queries collide.
 
     Args:
         points: Positions, float32 or float64 array of shape (n, 8, 3), rows p0 a0 b0 c0 p1 a1 b1 c1.
@@ -71,13 +72,13 @@ def vertex_face(points):
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If the shape or the type is another one, or a coordinate is not finite.
+        ValueError: If the shape or the type is wrong, or a coordinate is not finite.
     """
     return _collides(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
 
 
-def edge_edge(points):
-    """Says which edge-edge queries collide.
+def edge_edge(points: ArrayLike) -> np.ndarray:
+    """Returns which edge-edge queries collide.
 
     Args:
         points: Positions, float32 or float64 array of shape (n, 8, 3), rows a0 b0 c0 d0 a1 b1 c1 d1; edges ab and cd.
@@ -86,13 +87,13 @@ def edge_edge(points):
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If the shape or the type is another one, or a coordinate is not finite.
+        ValueError: If the shape or the type is wrong, or a coordinate is not finite.
     """
     return _collides(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
 
 
-def vertex_face_toi(points):
-    """Encloses the earliest contact time of vertex-face queries.
+def vertex_face_toi(points: ArrayLike) -> np.ndarray:
+    """Returns bounds of the earliest contact time of vertex-face queries.
 
     Args:
         points: As in :func:`vertex_face`.
@@ -107,8 +108,8 @@ def vertex_face_toi(points):
     return _earliest(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
 
 
-def edge_edge_toi(points):
-    """Encloses the earliest contact time of edge-edge queries.
+def edge_edge_toi(points: ArrayLike) -> np.ndarray:
+    """Returns bounds of the earliest contact time of edge-edge queries.
 
     Args:
         points: As in :func:`edge_edge`.
@@ -122,8 +123,8 @@ def edge_edge_toi(points):
     return _earliest(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
 
 
-def edge_face_crossings(edges, faces):
-    """Says which edges meet which faces, pair by pair, in one configuration: closed segments, closed triangles.
+def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
+    """Returns which edges meet which faces, pair by pair, at one moment: closed segments, closed triangles.
 
     Args:
         edges: End points, float32 or float64 array of shape (n, 2, 3).
@@ -133,12 +134,12 @@ def edge_face_crossings(edges, faces):
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If a shape or a type is another one, the lengths differ, or a coordinate is not finite.
+        ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
     edges = checked_coordinates(edges, (2, 3), "edges")
     faces = checked_coordinates(faces, (3, 3), "faces")
     if len(edges) != len(faces):
-        raise ValueError(f"edges and faces must be as many, got {len(edges)} edges and {len(faces)} faces")
+        raise ValueError(f"edges and faces must have the same length, got {len(edges)} edges and {len(faces)} faces")
     points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
     return _collides(points, _VERTEX_FACE)
 
@@ -201,7 +202,7 @@ def _integers(points):
 
 
 def _may_touch(points, pairs):
-    """Says which triangles of which queries need exact arithmetic, bool (n, triangles): False is proven to be free.
+    """Returns which triangles of which queries need exact arithmetic, bool (n, triangles): False is proven to be free.
 
     A triangle stays clear of the origin when along some axis its corners have one strict sign at both ends, thus
     always; or when in each piece of the step its volume has one strict sign, or one of n.X, n.Y and n.Z is negative.
@@ -406,7 +407,7 @@ class _Triangle:
         ]
 
     def touches(self, sign):
-        """Says whether the origin is in the triangle at the time at which sign(polynomial) gives the signs."""
+        """Returns whether the origin is in the triangle at the time at which sign(polynomial) gives the signs."""
         if sign(self.volume) != 0:
             return False
         signs = [sign(weight) for weight in self.weights]

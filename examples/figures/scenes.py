@@ -153,7 +153,8 @@ def parts(faces, vertex_count):
 
 def picture_of(scene, view):
     """Returns the picture of a scene, whose mesh named "triangles" deforms and whose other meshes are rigid."""
-    segment, x, _ = scene.interval(view.interval)
+    interval = scene.interval(view.interval)
+    segment, x = interval.segment, interval.x0
     x, faces = x.astype(float), segment.faces
     soft = np.zeros(len(faces), dtype=bool)
     soft[next(mesh.faces for mesh in segment.meshes if mesh.name.endswith("triangles"))] = True

@@ -22,15 +22,15 @@ def test_size_and_motion(name):
     scene = Scene(path, sample_turns=False)
     assert not any("topology" in warning for warning in scene.warnings)
     assert 15 <= len(scene.times) <= 40
-    segment, x0, _ = scene.interval(0)
+    segment, x0 = scene.interval(0).segment, scene.interval(0).x0
     deforming = next(mesh for mesh in segment.meshes if mesh.name == "/root/model/triangles")
     assert deforming.faces.stop - deforming.faces.start == SCENES[name]
     assert len(segment.meshes) > 1
     faces = segment.faces[deforming.faces]
     first = np.linalg.norm(x0[faces[:, 1]] - x0[faces[:, 0]], axis=1)
-    for index in range(len(scene.times) - 1):
-        same, _, x1 = scene.interval(index)
-        assert same is segment
+    for interval in scene:
+        x1 = interval.x1
+        assert interval.segment is segment
         assert np.abs(x1).max() < 5.0  # m
         # nearly all edges are about as long as at first
         low, high = np.quantile(np.linalg.norm(x1[faces[:, 1]] - x1[faces[:, 0]], axis=1) / first, [0.02, 0.98])
@@ -40,9 +40,9 @@ def test_size_and_motion(name):
 @each_scene
 def test_collisions(name):
     hits, pairs = 0, set()
-    for interval, _ in replay(Scene(ASSETS / f"{name}.usd")):
-        assert interval.certified
-        hits += interval.hits
-        pairs |= set(interval.mesh_pairs)
+    for interval in replay(Scene(ASSETS / f"{name}.usd")):
+        assert interval.summary.certified
+        hits += interval.summary.hits
+        pairs |= set(interval.summary.mesh_pairs)
     assert hits >= 100
     assert ("/root/model/triangles", "/root/model/triangles") in pairs

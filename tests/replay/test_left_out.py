@@ -1,7 +1,7 @@
 """Scenes of which parts cannot be read: these are named and left out, and the rest is checked."""
 
 import random
-from itertools import pairwise
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -236,9 +236,13 @@ def test_what_breaks_later_is_checked_until_then(tmp_path):
     add_mesh(stage, "/World/Sheet", {0: moved(FALLING, (0, 0, -2)), 5: moved(FALLING, (0, 0, -1.5))})
     add_breaking(stage, {3: [(0, 0, 0), (np.inf, 0, 0), (0, 0, 0)]})
     scene = Scene(save(stage))
-    names = [[mesh.name for mesh in scene.interval(index)[0].meshes] for index in range(5)]
+    intervals = [scene.interval(index) for index in range(5)]
+    names = [[mesh.name for mesh in interval.segment.meshes] for interval in intervals]
     assert ["/World/Breaking" in present for present in names] == [True, True, False, False, False]
     assert all({"/World/Floor", "/World/Falling", "/World/Sheet"} <= set(present) for present in names)
+    (warning,) = intervals[2].warnings
+    assert warning.startswith("left out: from time 2 on: /World/Breaking: ")
+    assert all(not interval.warnings for interval in intervals if interval.index != 2)
 
 
 def test_a_replay_ends_where_nothing_that_moves_is_left(tmp_path, capsys):
@@ -411,10 +415,10 @@ def test_damaged_scenes_are_read_or_refused_in_one_line(tmp_path, part):
                 file.truncate(lots.randrange(file.seek(0, 2)))
         try:
             scene = Scene(path)
-            for index, (start, end) in enumerate(pairwise(scene.times[:20])):
-                assert start < end
-                segment, *positions = scene.interval(index)
-                assert all(np.isfinite(x).all() and len(x) == segment.vertex_count for x in positions), done
+            for interval in islice(scene, 19):
+                assert interval.start < interval.end
+                positions = interval.x0, interval.x1
+                assert all(np.isfinite(x).all() and len(x) == interval.segment.vertex_count for x in positions), done
             outcomes["left out" if scene.left_out else "read"] += 1
         except ValueError as error:
             assert path in str(error) and "\n" not in str(error), done

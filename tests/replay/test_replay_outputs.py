@@ -110,6 +110,17 @@ def test_overlay_colours_the_polygons_that_collide(stage, tmp_path):
     assert floor_colors(overlay, 2, "/World/Falling") == [pytest.approx(LIT)]
 
 
+def test_overlay_names_prims_in_the_same_order_every_time(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    names = [f"Falling{number}" for number in range(8)]
+    for name in names:
+        add_mesh(stage, f"/World/{name}", falling())
+    replay(stage)
+    lines = (tmp_path / "overlay.usda").read_text().splitlines()
+    assert [line.split('"')[1] for line in lines if 'over "Falling' in line] == names
+
+
 def test_overlay_blocks_the_indices_of_the_scenes_colours(stage, tmp_path):
     primvar = UsdGeom.Gprim(stage.GetPrimAtPath("/World/Floor")).CreateDisplayColorPrimvar("uniform")
     primvar.Set([(0, 1, 0)])

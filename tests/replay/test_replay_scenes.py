@@ -339,12 +339,11 @@ def test_skinning_is_what_usd_bakes(stage, tmp_path):
     baked.SetEditTarget(baked.GetSessionLayer())
     assert UsdSkel.BakeSkinning(Usd.PrimRange.Stage(baked), Gf.Interval(0, 4))
     mesh = UsdGeom.Mesh(baked.GetPrimAtPath("/World/Model/Mesh"))
-    for index, time in enumerate(scene.times[:-1]):
-        segment, x0, _ = scene.interval(index)
-        (part,) = (part for part in segment.meshes if part.path == "/World/Model/Mesh")
-        transform = np.array(mesh.ComputeLocalToWorldTransform(time))
-        expected = np.array(mesh.GetPointsAttr().Get(time)) @ transform[:3, :3] + transform[3, :3]
-        np.testing.assert_allclose(x0[part.vertices], expected, atol=2e-6)
+    for interval in scene:
+        (part,) = (part for part in interval.segment.meshes if part.path == "/World/Model/Mesh")
+        transform = np.array(mesh.ComputeLocalToWorldTransform(interval.start))
+        expected = np.array(mesh.GetPointsAttr().Get(interval.start)) @ transform[:3, :3] + transform[3, :3]
+        np.testing.assert_allclose(interval.x0[part.vertices], expected, atol=2e-6)
 
 
 def test_usdz(stage, tmp_path):
@@ -546,9 +545,10 @@ def test_instances_are_where_usd_has_them(stage):
     leaf = add_mesh(stage, "/World/Leaves/Leaf/Mesh", FALLING)
     UsdGeom.Xform.Define(stage, "/World/Leaves/Leaf").AddRotateXOp().Set(33)
     leaf.AddTranslateOp().Set((7, 8, 9))
-    segment, x0, _ = Scene(save(stage), subdivide=2).interval(1)
+    interval = Scene(save(stage), subdivide=2).interval(1)
     expected = instancer.ComputeInstanceTransformsAtTime(1, 1)
     world = instancer.ComputeLocalToWorldTransform(1)
-    for part, transform in zip(segment.meshes, expected, strict=True):
+    for part, transform in zip(interval.segment.meshes, expected, strict=True):
         matrix = np.array(leaf.GetLocalTransformation() * transform * world)
-        np.testing.assert_allclose(x0[part.vertices], np.array(FALLING) @ matrix[:3, :3] + matrix[3, :3], atol=1e-5)
+        world_points = np.array(FALLING) @ matrix[:3, :3] + matrix[3, :3]
+        np.testing.assert_allclose(interval.x0[part.vertices], world_points, atol=1e-5)

@@ -38,15 +38,14 @@ def read(stage, **options):
 
 
 def first_segment(scene):
-    segment, _, _ = scene.interval(0)
-    return segment
+    return scene.interval(0).segment
 
 
 def error_of(stage):
     with pytest.raises(ValueError) as error:
         scene = read(stage, strict=True)
-        for index in range(len(scene.times) - 1):
-            scene.interval(index)
+        for _ in scene:
+            pass
     message = str(error.value)
     assert message.startswith(stage.GetRootLayer().realPath + ": ")
     assert "\n" not in message

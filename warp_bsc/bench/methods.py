@@ -31,6 +31,7 @@ import warp as wp
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.narrow_phase import METHODS as NARROW_PHASE_METHODS
 from ..detection.narrow_phase import TOLERANCE, Count, NarrowPhase
+from ..detection.query_points import query_points
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
@@ -250,10 +251,7 @@ class Queries:
 
     def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
         """Points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
-        pairs = self.pairs[which]
-        first = pairs[:, :1] if self.kind == "vertex_face" else self.elements[pairs[:, 0]]
-        corners = np.concatenate([first, self.elements[pairs[:, 1]]], axis=1)
-        return np.concatenate([self.x0[corners], self.x1[corners]], axis=1)
+        return query_points(self.elements, self.pairs[which], self.x0, self.x1)
 
     def __len__(self) -> int:
         """The number of queries."""

@@ -68,10 +68,10 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
     if "," in name:
         return _load_pair(name)
     scene = Scene(name, sample_turns=False)  # what was recorded
-    if not 0 <= interval < len(scene.times) - 1:
-        raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene.times) - 2}")
-    segment, x0, x1 = scene.interval(interval)
-    return BenchmarkScene(name, segment.faces, x0, x1)
+    if not 0 <= interval < len(scene):
+        raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene) - 1}")
+    motion = scene.interval(interval)
+    return BenchmarkScene(name, motion.segment.faces, motion.x0, motion.x1)
 
 
 def paper_scenes() -> list[str]:
@@ -101,15 +101,15 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
         return [(0, load_scene(name))]
     scene = Scene(name, sample_turns=False)  # what was recorded
-    count = len(scene.times) - 1
+    count = len(scene)
     if count < 1:
         raise ValueError(f"{name}: there is no interval, its meshes never move")
     # the middles of equal parts
     chosen = sorted({(2 * i + 1) * count // (2 * min(most, count)) for i in range(min(most, count))})
     intervals = []
     for index in chosen:
-        segment, x0, x1 = scene.interval(index)
-        intervals.append((index, BenchmarkScene(name, segment.faces, x0, x1)))
+        motion = scene.interval(index)
+        intervals.append((index, BenchmarkScene(name, motion.segment.faces, motion.x0, motion.x1)))
     return intervals
 
 

@@ -11,12 +11,12 @@ from collections.abc import Generator
 import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .._atomic_file import STDOUT, ReplayOutput, naming
+from .._atomic_file import STDOUT, naming
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
-from ..replay.intervals import Interval, replay
-from ..replay.scene_contacts import Contacts
-from ..replay.summary import Outcome
+from ..replay.intervals import IntervalResult, replay
+from ..replay.outputs import ReplayOutput
+from ..replay.summary import Summary
 from ..replay.usd_overlay import Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
@@ -229,12 +229,12 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
         with INTERRUPTS.held():
             try:
                 with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
-                    for interval, contacts in found:
+                    for result in found:
                         scene.files.check()
                         for output in outputs:
-                            with naming(output.name):
-                                output.add(interval, contacts)
-                        intervals.append(interval)
+                            with naming(output.file.name):
+                                output.add(result)
+                        intervals.append(result.summary)
                         INTERRUPTS.check()
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
@@ -242,12 +242,16 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
                 interrupt = INTERRUPTS.came  # which a library may have turned into another error
                 problems += [] if interrupt else [_explain(error, scene)]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
-            outcome = Outcome(scene, intervals=intervals, stopped=stopped, **settings)
+            summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
             # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
-            problems += _finish([output for output in finished if not output.is_stream], outcome)
-            with INTERRUPTS.raised():
-                problems += _finish([output for output in finished if output.is_stream], outcome)
+            problems += _finish([output for output in finished if not output.file.is_stream], summary)
+            try:
+                with INTERRUPTS.raised():
+                    problems += _finish([output for output in finished if output.file.is_stream], summary)
+            except BrokenPipeError:
+                if not problems:
+                    raise
             if problems:
                 raise ValueError("; ".join([str(interrupt)] * bool(interrupt) + problems))
             if not interrupt:
@@ -255,14 +259,14 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
         if STDOUT not in (arguments.json, arguments.csv, arguments.report):
             with naming("standard output"):
                 console = Console()
-                print_replay(console, outcome)
+                print_replay(console, summary)
                 for output in finished:
-                    say(console, f"Wrote {output.path}.")
+                    say(console, f"Wrote {output.file.path}.")
     if interrupt:
         raise interrupt
-    if outcome.validation and outcome.validation["disagreements"]:
+    if summary.validation and summary.validation["disagreements"]:
         return _DISAGREES
-    if arguments.fail_on_collision and outcome.hits:
+    if arguments.fail_on_collision and summary.hits:
         return _COLLIDES
     return _LEFT_OUT if scene.left_out else 0
 
@@ -278,7 +282,7 @@ def _explain(error: Exception, scene: Scene) -> str:
     return f"{scene.path}: {describe(error)}"
 
 
-def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
+def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
     """Puts files in their places, without the last intervals if there is no room for all; returns what is missing.
 
     On a full disk all files shrink, to make room for one another, but not below half: tables matter more than a page.
@@ -289,8 +293,10 @@ def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
     while waiting:
         output = waiting[0]
         try:
-            output.finish(outcome)
+            output.finish(summary)
         except Exception as error:
+            if isinstance(error, BrokenPipeError) and str(output.file.path) == STDOUT:
+                raise  # nobody reads it any more, which is no error
             number = error.errno if isinstance(error, OSError) else None
             sharing, smaller = [output], []
             if number in (errno.ENOSPC, errno.EDQUOT) and shared:
@@ -298,10 +304,10 @@ def _finish(outputs: list[ReplayOutput], outcome: Outcome) -> list[str]:
             if number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 smaller = [other for other in sharing if other.shrink()]
             if smaller:
-                shortages |= {other.name: describe(error) for other in smaller}
+                shortages |= {other.file.name: describe(error) for other in smaller}
                 continue
-            shortages.pop(output.name, None)
-            problems.append(f"{output.name}: not written: {describe(error)}")
+            shortages.pop(output.file.name, None)
+            problems.append(f"{output.file.name}: not written: {describe(error)}")
         waiting.pop(0)
     return problems + [f"{name}: not all of it is written: {shortage}" for name, shortage in shortages.items()]
 
@@ -324,9 +330,7 @@ def _open_outputs(
     return outputs
 
 
-def _track(
-    scene: Scene, arguments: argparse.Namespace, device: wp.Device
-) -> Generator[tuple[Interval, Contacts], None, None]:
+def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Generator[IntervalResult, None, None]:
     """Yields the intervals as they are found, and shows progress, rate and time left on a terminal."""
     progress = Progress(
         TextColumn("Replaying"),
@@ -340,13 +344,11 @@ def _track(
     progress.disable = not progress.console.is_terminal
     with progress:
         task = progress.add_task("", total=len(scene.times) - 1, time=scene.times[0], rate="…/s")
-        for interval, contacts in replay(
-            scene, method=arguments.method, device=device, validate_most=arguments.validate
-        ):
-            yield interval, contacts
+        for result in replay(scene, method=arguments.method, device=device, validate_most=arguments.validate):
+            yield result
             speed = progress.tasks[task].speed
             rate = f"{speed:.1f}/s" if speed else "…/s"
-            progress.update(task, advance=1, time=interval.end, rate=rate)
+            progress.update(task, advance=1, time=result.summary.end, rate=rate)
 
 
 def _output(text: str) -> str:

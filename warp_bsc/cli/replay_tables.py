@@ -5,49 +5,49 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from ..replay.intervals import Interval
-from ..replay.summary import CERTIFIED_FOR, Outcome
+from ..replay.intervals import IntervalSummary
+from ..replay.summary import CERTIFIED_FOR, Summary
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_replay"]
 
 
-def print_replay(console: Console, outcome: Outcome) -> None:
+def print_replay(console: Console, summary: Summary) -> None:
     """Prints a table of the worst intervals and a summary.
 
     Args:
         console: The terminal or file to print to.
-        outcome: The results.
+        summary: The results.
     """
-    scene, intervals = outcome.scene, outcome.intervals
+    scene, intervals = summary.scene, summary.intervals
     say(
         console,
         f"{scene.path}: {count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
-        f"{scene.face_count:,} faces, {count(outcome.interval_count, 'interval')}; method {outcome.method} on "
-        f"{outcome.device}",
+        f"{scene.face_count:,} faces, {count(summary.interval_count, 'interval')}; method {summary.method} on "
+        f"{summary.device}",
     )
     for warning in scene.warnings:
         say(console, f"note: {warning}")
-    say(console, f"note: {outcome.motion}")
-    if not outcome.is_complete:
+    say(console, f"note: {summary.motion}")
+    if not summary.is_complete:
         say(
             console,
-            f"Partial: {len(intervals)} of {count(outcome.interval_count, 'interval')} were checked; "
-            f"{outcome.stopped}.",
+            f"Partial: {len(intervals)} of {count(summary.interval_count, 'interval')} were checked; "
+            f"{summary.stopped}.",
         )
 
-    listed = outcome.worst[:LONGEST]
+    listed = summary.worst[:LONGEST]
     if listed:
         _print_worst(console, listed)
     if listed and len(listed) < len(intervals):
         say(
             console,
             f"{count(len(intervals) - len(listed), 'interval')} not listed, "
-            f"{len(outcome.colliding) - len(listed)} with collisions; --json has all.",
+            f"{len(summary.colliding) - len(listed)} with collisions; --json has all.",
         )
 
-    if outcome.colliding:
-        _print_collisions(console, outcome)
+    if summary.colliding:
+        _print_collisions(console, summary)
     else:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
 
@@ -57,7 +57,7 @@ def print_replay(console: Console, outcome: Outcome) -> None:
             f"Not certified even for {CERTIFIED_FOR}, collisions may be missing: {uncertain} of "
             f"{count(len(intervals), 'interval')}.",
         )
-    elif outcome.method == "conservative":
+    elif summary.method == "conservative":
         unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
         say(
             console,
@@ -71,13 +71,13 @@ def print_replay(console: Console, outcome: Outcome) -> None:
             console,
             f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
         )
-    if outcome.validation:
-        _print_validation(console, outcome.validation)
-    total = sum(outcome.milliseconds.values())
+    if summary.validation:
+        _print_validation(console, summary.validation)
+    total = sum(summary.milliseconds.values())
     say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
 
 
-def _print_worst(console: Console, listed: list[Interval]) -> None:
+def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
     """Prints the intervals, those with the most collisions first."""
     arrow = "->" if console.options.ascii_only else "→"
     stages = list(listed[0].stats.milliseconds)
@@ -102,26 +102,26 @@ def _print_worst(console: Console, listed: list[Interval]) -> None:
     console.print(table)
 
 
-def _print_collisions(console: Console, outcome: Outcome) -> None:
+def _print_collisions(console: Console, summary: Summary) -> None:
     """Prints the number of pairs that collide, in all and by meshes, and the first contact."""
-    colliding = outcome.colliding
+    colliding = summary.colliding
     vertex_face = sum(interval.vertex_face_hits for interval in colliding)
     edge_edge = sum(interval.edge_edge_hits for interval in colliding)
     say(
         console,
-        f"Collisions in {len(colliding)} of {count(len(outcome.intervals), 'interval')}: "
+        f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
         f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
     )
-    for (first, second), hits in outcome.mesh_pairs[:LONGEST]:
+    for (first, second), hits in summary.mesh_pairs[:LONGEST]:
         say(console, f"  {hits:,} of {first} with {'itself' if first == second else second}")
-    if len(outcome.mesh_pairs) > LONGEST:
-        say(console, f"  and {len(outcome.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
+    if len(summary.mesh_pairs) > LONGEST:
+        say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest
     assert contact  # it collides
     (first, second), (first_element, second_element) = contact.meshes, contact.elements
     other = "its" if first == second else f"{second},"
     say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
-    worst = outcome.worst[0]
+    worst = summary.worst[0]
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
 
 

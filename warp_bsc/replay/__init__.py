@@ -1,1 +1,1 @@
-"""The intervals of a scene: their contacts, what they sum up to, and the files that tell of them."""
+"""Finds the contacts in the intervals of a scene, sums them up, and writes them to files."""

@@ -1,31 +1,34 @@
-"""Every collision of a replay as JSON and as CSV, for programs."""
+"""Writes every collision of a replay as JSON or CSV, for programs."""
 
 import csv
 import io
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from .._atomic_file import StreamedFile
+from ..usd.scene import Scene
+from .intervals import IntervalResult
+from .outputs import RecordFile
 from .scene_contacts import KINDS
-from .summary import CERTIFIED_FOR, Outcome
+from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["HitsCsv", "HitsJson"]
 
 _FIELDS = ("kind", "meshes", "prims", "elements", "indices", "time", "toi", "position", "normal")
 
 
-class HitsJson(StreamedFile):
-    """A JSON file: facts of the scene, each interval with its contacts, then the sums."""
+class HitsJson(RecordFile):
+    """A JSON file: facts of the scene, every interval with its contacts, then the sums."""
 
-    def __init__(self, path, *, scene, method: str, device: str):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene, method: str, device: str):
         """Opens the file.
 
         Args:
-            path: Its place.
+            path: The file's place.
             scene: The scene.
-            method: The method that is used.
-            device: The device that is used.
+            method: Method of detection.
+            device: Name of the Warp device.
 
         Raises:
             OSError: If it cannot be written.
@@ -44,11 +47,12 @@ class HitsJson(StreamedFile):
         }
 
     def head(self) -> str:
-        """The file up to the first interval."""
+        """Returns the text before the first interval."""
         return json.dumps(self._facts)[:-1] + ', "intervals": ['
 
-    def record(self, interval, contacts) -> Iterator[str]:
-        """An interval with all of its contacts."""
+    def record(self, result: IntervalResult) -> Iterator[str]:
+        """Yields the text of an interval with all of its contacts."""
+        interval, contacts = result.summary, result.contacts
         fields = {
             "index": interval.index,
             "start": interval.start,
@@ -70,24 +74,24 @@ class HitsJson(StreamedFile):
             yield (", " if number else "") + chunk[1:-1]
         yield "]}"
 
-    def tail(self, outcome: Outcome) -> str:
-        """The file from the last interval on."""
+    def tail(self, summary: Summary) -> str:
+        """Returns the text after the last interval."""
         sums = {
-            "complete": outcome.is_complete,
-            "stopped": outcome.stopped,
-            "motion": outcome.motion,
-            "warnings": outcome.scene.warnings,
-            "left_out": outcome.scene.left_out,
-            "hits": outcome.hits,
-            "certified": outcome.certified,
+            "complete": summary.is_complete,
+            "stopped": summary.stopped,
+            "motion": summary.motion,
+            "warnings": summary.scene.warnings,
+            "left_out": summary.scene.left_out,
+            "hits": summary.hits,
+            "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
-            "mesh_pairs": _mesh_pairs_to_list(outcome.mesh_pairs),
-            "validation": outcome.validation,
+            "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
+            "validation": summary.validation,
         }
         return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
 
 
-class HitsCsv(StreamedFile):
+class HitsCsv(RecordFile):
     """A CSV file: a row for each contact, and a last line that begins with # if some are missing."""
 
     _COLUMNS = (
@@ -98,11 +102,12 @@ class HitsCsv(StreamedFile):
     )  # fmt: skip
 
     def head(self) -> str:
-        """The names of the columns."""
+        """Returns the names of the columns."""
         return _to_csv([self._COLUMNS])
 
-    def record(self, interval, contacts) -> Iterator[str]:
-        """The rows of an interval."""
+    def record(self, result: IntervalResult) -> Iterator[str]:
+        """Yields the rows of an interval."""
+        interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
         for rows in contacts.chunks():
             yield _to_csv(
@@ -115,16 +120,16 @@ class HitsCsv(StreamedFile):
                 for kind, names, prims, elements, indices, time, toi, position, normal in _rows(contacts, rows)
             )  # fmt: skip
 
-    def tail(self, outcome: Outcome) -> str:
-        """What is missing."""
-        if outcome.is_complete:
+    def tail(self, summary: Summary) -> str:
+        """Returns a line on the missing intervals, empty if there are none."""
+        if summary.is_complete:
             return ""
-        return f"# partial: {len(outcome.intervals)} of {outcome.interval_count} intervals; {outcome.stopped}\n"
+        return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
 
 
 def _rows(contacts, rows):
-    """Of each of some contacts what :data:`_FIELDS` names."""
-    paths = [mesh.path for mesh in contacts.segment.meshes]
+    """Yields the values of :data:`_FIELDS` for some contacts."""
+    paths = [mesh.path for mesh in contacts.interval.segment.meshes]
     columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
     columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]
     for names, elements, kind, pair, indices, *measures in zip(

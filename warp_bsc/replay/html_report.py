@@ -1,116 +1,124 @@
-"""A page that shows what a replay found, in one file that needs no network.
+"""Writes a page that shows the collisions of a replay, in one file that needs no network.
 
-The page's parts are in the folder ``page``. What comes from the scene's file goes into the page as JSON, in which no
-markup can begin, and the page's script sets it as text. Its content security policy lets nothing else run: no other
-script, no handler in an attribute, no address.
+The page's parts are in the folder ``page``. Text from the scene's file enters the page as JSON, in which no markup can
+begin, and the page's script sets it as text. The content security policy of the page blocks everything else: other
+scripts, handlers in attributes, addresses.
 """
 
 import base64
 import hashlib
 import html
 import json
+import os
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import ReplayOutput
-from .summary import CERTIFIED_FOR, Outcome
+from .._atomic_file import OutputFile
+from ..usd.scene import Scene
+from .intervals import IntervalResult
+from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["ReportPage"]
 
-_MOST_FACES = 150_000  # in the view in 3D
-_MOST_CONTACTS = 20_000
-_LONGEST = 10  # rows of a table
-_MOST_LINES = 200  # of disagreements
+_MAX_FACES = 150_000  # in the view in 3D
+_MAX_CONTACTS = 20_000
+_MAX_ROWS = 10  # of a table
+_MAX_DISAGREEMENTS = 200
 
 
-class ReportPage(ReplayOutput):
+class ReportPage:
     """A page with a summary, charts, and the worst interval in 3D."""
 
-    def __init__(self, path):
+    def __init__(self, path: str | os.PathLike):
         """Opens the file.
 
         Raises:
             OSError: If it cannot be written.
         """
-        super().__init__(path)
-        self._worst = None
+        self.file = OutputFile(path)
+        self._worst: IntervalResult | None = None
 
-    def add(self, interval, contacts):
-        """Keep the contacts of an interval if there are more than in any before, or none before."""
-        if self._worst is None or len(contacts) > len(self._worst[1]):
-            self._worst = interval, contacts
+    def add(self, result: IntervalResult) -> None:
+        """Keeps an interval if it is the first or has more contacts than all before."""
+        if self._worst is None or len(result.contacts) > len(self._worst.contacts):
+            self._worst = result
 
-    def finish(self, outcome: Outcome):
-        """Write the page and put it in its place."""
-        folder = resources.files(__package__) / "page"
+    def finish(self, summary: Summary) -> None:
+        """Writes the page and puts it in its place."""
+        folder = resources.files("warp_bsc.replay") / "page"
         style = (folder / "page.css").read_text(encoding="utf-8")
         script = "\n".join((folder / name).read_text(encoding="utf-8") for name in ("viewer.js", "page.js"))
         fields = {
-            "title": html.escape(_title(outcome)),
+            "title": html.escape(_title(summary)),
             "style_hash": _policy_hash(style),
             "script_hash": _policy_hash(script),
             "style": style,
             "script": script,
-            "data": _inert(_data(outcome, self._worst)),
+            "data": _inert(_data(summary, self._worst)),
         }
         page = (folder / "page.html").read_text(encoding="utf-8")
         parts = page.replace("{{", "}}").split("}}")  # text, name, text, name, ...
-        self._output.truncate(0)
-        self._output.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
-        self._output.commit()
+        self.file.truncate(0)
+        self.file.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
+        self.file.commit()
 
-    def shrink(self):
-        """Forget nothing: how large the page is does not depend on the number of intervals."""
+    def shrink(self) -> bool:
+        """Drops nothing: the size of the page does not depend on the number of intervals."""
         return False
 
+    def discard(self) -> None:
+        """Removes the temporary file."""
+        self.file.discard()
 
-def _data(outcome: Outcome, worst) -> dict:
-    """What the page's script shows."""
-    scene = outcome.scene
+
+def _data(summary: Summary, worst: IntervalResult | None) -> dict:
+    """Returns the data that the page's script shows."""
+    scene = summary.scene
     displayed = scene.display_names
     tiles = [
-        (f"{outcome.hits:,}", "colliding pairs"),
-        (f"{len(outcome.colliding):,} of {len(outcome.intervals):,}", "intervals with collisions"),
+        (f"{summary.hits:,}", "colliding pairs"),
+        (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
-    if outcome.colliding:
-        tiles.append((f"{outcome.colliding[0].earliest.time:.6g}", "time code of the first"))
+    if first := summary.first_contact:
+        tiles.append((f"{first.time:.6g}", "time code of the first"))
     tiles += [
         (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
         (f"{scene.face_count:,}", "triangles"),
-        ("yes" if outcome.certified else "no", f"certified for {CERTIFIED_FOR}"),
+        ("yes" if summary.certified else "no", f"certified for {CERTIFIED_FOR}"),
     ]
     data = {
-        "title": _title(outcome),
-        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {outcome.method} on "
-        f"{outcome.device}",
+        "title": _title(summary),
+        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {summary.method} on "
+        f"{summary.device}",
         "partial": "",
         "tiles": tiles,
         "intervals": [
             (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
-            for interval in outcome.intervals
+            for interval in summary.intervals
         ],
-        "toi": outcome.toi_counts,
-        "stages": list(outcome.milliseconds.items()),
+        "toi": summary.toi_counts,
+        "stages": list(summary.milliseconds.items()),
         "pairs": [
             {
                 "text": first if first == second else f"{first} with {second}",
                 "under": "with itself" if first == second else "",
                 "hits": hits,
             }
-            for (first, second), hits in outcome.mesh_pairs[:_LONGEST]
+            for (first, second), hits in summary.mesh_pairs[:_MAX_ROWS]
         ],
-        "more_pairs": max(0, len(outcome.mesh_pairs) - _LONGEST),
+        "more_pairs": max(0, len(summary.mesh_pairs) - _MAX_ROWS),
         "worst": [
             {
                 "start": interval.start,
                 "end": interval.end,
                 "hits": interval.hits,
-                "time": interval.earliest.time,
-                "what": _describe(interval.earliest),
+                "time": earliest.time,
+                "what": _describe(earliest),
             }
-            for interval in outcome.worst[:_LONGEST]
+            for interval in summary.worst[:_MAX_ROWS]
+            if (earliest := interval.earliest)
         ],
         "facts": [
             ("File", scene.path),
@@ -119,52 +127,53 @@ def _data(outcome: Outcome, worst) -> dict:
             ("Metres per unit", f"{scene.meters_per_unit:g}"),
             ("Time codes per second", f"{scene.time_codes_per_second:g}"),
             ("Vertices", f"{scene.vertex_count:,}"),
-            *((f"Mesh {name}", displayed[name] or "no display name") for name in scene.names[:_LONGEST]),
+            *((f"Mesh {name}", displayed[name] or "no display name") for name in scene.names[:_MAX_ROWS]),
         ],
-        "notes": [outcome.motion, *scene.warnings],
+        "notes": [summary.motion, *scene.warnings],
         "validation": None,
-        "view": _view(*worst, scene) if worst and worst[1].segment.meshes else None,
+        "view": _view(worst, scene) if worst and worst.contacts.interval.segment.meshes else None,
     }
-    if not outcome.is_complete:
+    if not summary.is_complete:
         data["partial"] = (
-            f"Partial: {len(outcome.intervals)} of {outcome.interval_count} intervals were checked; {outcome.stopped}."
+            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
         )
-    if found := outcome.validation:
+    if found := summary.validation:
         wrong = len(found["disagreements"])
         text = (
             f"{found['hits']:,} collisions and {found['others']:,} other pairs were asked again of the exact checker: "
             f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
             f"{found['certified']:,} of all {found['answers']:,} answers."
         )
-        data["validation"] = {"text": text, "disagreements": found["disagreements"][:_MOST_LINES]}
+        data["validation"] = {"text": text, "disagreements": found["disagreements"][:_MAX_DISAGREEMENTS]}
     return data
 
 
-def _view(interval, contacts, scene) -> dict:
-    """The worst interval: triangles at its start and end, and the contacts."""
-    segment = contacts.segment
-    start, end = contacts.x0.astype(np.float64), contacts.x1.astype(np.float64)
+def _view(result: IntervalResult, scene: Scene) -> dict:
+    """Returns the worst interval for the view in 3D: triangles at its start and end, and the contacts."""
+    contacts = result.contacts
+    interval, segment = contacts.interval, contacts.interval.segment
+    start, end = interval.x0.astype(np.float64), interval.x1.astype(np.float64)
     faces = segment.faces
     title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
     lit = contacts.colliding_faces
     shown = np.arange(len(faces))
     rows = np.arange(len(contacts))
-    if len(faces) > _MOST_FACES:
-        # Those around one contact in the middle of all.
+    if len(faces) > _MAX_FACES:
+        # Show the faces around the contact nearest to the middle of all.
         places = contacts.position if len(contacts) else start[faces[:, 0]]
         middle = places[np.argmin(np.abs(places - np.median(places, axis=0)).max(axis=1))]
         distance = np.abs(start[faces].mean(axis=1) - middle).max(axis=1)
-        shown = np.sort(np.argpartition(distance, _MOST_FACES)[:_MOST_FACES])
+        shown = np.sort(np.argpartition(distance, _MAX_FACES)[:_MAX_FACES])
         rows = np.flatnonzero(np.abs(contacts.position - middle).max(axis=1) <= distance[shown].max())
-        title += f"; the {_MOST_FACES:,} of {len(faces):,} triangles around one place are shown"
+        title += f"; the {_MAX_FACES:,} of {len(faces):,} triangles around one place are shown"
     lit = np.intersect1d(lit, shown)
     vertices, corners = np.unique(faces[shown], return_inverse=True)
     number = np.full(len(faces), -1)
     number[shown] = np.arange(len(shown))
     corners = corners.reshape(-1, 3)
-    if len(rows) > _MOST_CONTACTS:
-        rows = rows[np.linspace(0, len(rows) - 1, _MOST_CONTACTS).astype(int)]
-        title += f"; {_MOST_CONTACTS:,} contacts are shown"
+    if len(rows) > _MAX_CONTACTS:
+        rows = rows[np.linspace(0, len(rows) - 1, _MAX_CONTACTS).astype(int)]
+        title += f"; {_MAX_CONTACTS:,} contacts are shown"
     center = (start[vertices].min(axis=0) + start[vertices].max(axis=0)) / 2
     mesh_of_vertex, _ = segment.locate_vertices(vertices)
     return {
@@ -190,8 +199,8 @@ def _describe(contact):
     return f"{first}, {first_element}, with {'its' if first == second else second + ','} {second_element}"
 
 
-def _title(outcome):
-    return f"Collisions in {Path(outcome.scene.path).name}"
+def _title(summary):
+    return f"Collisions in {Path(summary.scene.path).name}"
 
 
 def _packed(values, dtype) -> str:
@@ -199,7 +208,7 @@ def _packed(values, dtype) -> str:
 
 
 def _inert(data) -> str:
-    """JSON in which no tag and no comment can begin or end."""
+    """Returns JSON in which no tag and no comment can begin or end."""
     text = json.dumps(data, allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")

@@ -2,28 +2,29 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..detection.detector import CollisionDetector, DetectionStats
 from ..detection.mesh import CollisionMesh
 from ..usd.scene import Scene
-from .scene_contacts import Contacts, find_contacts
+from .scene_contacts import SceneContacts, find_contacts
 from .validation import Validation, validate
 
-__all__ = ["Contact", "Interval", "replay"]
+__all__ = ["TOI_BINS", "Contact", "IntervalResult", "IntervalSummary", "replay"]
 
 TOI_BINS = 20
-"""Parts of an interval that times of impact are counted in."""
+"""Number of equal parts of an interval in which times of impact are counted."""
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Where and when two meshes, or a mesh and itself, meet.
+    """A collision of two meshes, or of a mesh with itself, in words.
 
     Attributes:
         meshes: Names of the two.
-        elements: What meets, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
+        elements: The two elements, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
         toi: Time of impact, 0 at the start of the interval and 1 at its end.
         time: The same as a time code.
     """
@@ -35,8 +36,8 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Interval:
-    """What was found between two consecutive times of a scene, in numbers.
+class IntervalSummary:
+    """The collisions between two consecutive times of a scene, in numbers.
 
     Attributes:
         index: Number of the interval, from 0.
@@ -48,9 +49,10 @@ class Interval:
         mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
             with itself is there twice.
         earliest: The earliest contact, None if there is none.
-        certified: Whether no collision of vertices that move straight from the start to the end can be missing.
-        stats: Counts and times of the detector's stages, pairs that do not count included.
-        validation: What the exact checker says of the answers, None if it was not asked.
+        certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
+            move straight from the start to the end.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        validation: The comparison with the exact checker, None if none was asked for.
     """
 
     index: int
@@ -77,49 +79,74 @@ class Interval:
 
     @property
     def milliseconds(self) -> float:
-        """Time that the detector took [ms]."""
+        """Time of the detector's stages together [ms]."""
         return sum(self.stats.milliseconds.values())
 
 
-def replay(
-    scene: Scene, *, method: str = "exact", device=None, validate_most: int | None = 0
-) -> Iterator[tuple[Interval, Contacts]]:
-    """Find the collisions in every interval between two consecutive times of a scene, one interval at a time.
+@dataclass(frozen=True)
+class IntervalResult:
+    """The collisions between two consecutive times of a scene.
 
-    Meshes that never move are obstacles: where these touch one another is not counted. Nor is where a mesh touches
-    itself that only its transform moves.
+    Attributes:
+        summary: The numbers, which are small and can be kept for all intervals.
+        contacts: Every pair that collides, and the positions of all vertices.
+    """
+
+    summary: IntervalSummary
+    contacts: SceneContacts
+
+
+def replay(
+    scene: Scene, *, method: str = "exact", device: Any = None, validate_most: int | None = 0
+) -> Iterator[IntervalResult]:
+    """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
+
+    Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
+    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end::
+
+        import warp_bsc as bsc
+
+        for interval in bsc.replay(bsc.Scene("scene.usd")):
+            print(interval.summary.start, interval.summary.hits, interval.contacts.position)
 
     Args:
-        scene: The scene, whose selection says which pairs count.
+        scene: The scene; its selection says which pairs count.
         method: ``"float"``, ``"conservative"`` or ``"exact"``.
-        device: Warp device.
-        validate_most: How many hits, and how many other answers, of each interval are asked again of the exact
-            checker; None for all.
+        device: Warp device or its name; default: Warp's default.
+        validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
+            for all.
+
+    Yields:
+        IntervalResult: The collisions of one interval. Only what the caller keeps stays in memory.
 
     Raises:
-        ValueError: If the positions at some time are broken.
+        ValueError: If the positions at some time are broken, or there is no such method.
     """
     detector = segment = None
-    for index, (start, end) in enumerate(zip(scene.times[:-1], scene.times[1:], strict=True)):
-        last_segment = segment
-        segment, x0, x1 = scene.interval(index)
-        if segment is not last_segment:
-            detector = None  # before the next is made, for the sake of memory
-            detector = CollisionDetector(
-                CollisionMesh(segment.faces, segment.vertex_count, device=device), method=method
-            )
-        collisions = detector.detect(x0, x1)
-        contacts = find_contacts(segment, detector.mesh, collisions, x0, x1, start, end, scene.selection)
+    for interval in scene:
+        if detector is None or interval.segment is not segment:
+            detector = None  # before the next is made, to free its memory
+            segment = interval.segment
+            mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
+            detector = CollisionDetector(mesh, method=method)
+        collisions = detector.detect(interval.x0, interval.x1)
+        contacts = find_contacts(interval, detector.mesh, collisions, scene.selection)
         validation = None
         if validate_most != 0:
             validation = validate(
-                detector, collisions, x0, x1, most=validate_most, seed=index, counted=contacts.counted
+                detector,
+                collisions,
+                interval.x0,
+                interval.x1,
+                most=validate_most,
+                seed=interval.index,
+                counted=contacts.counted,
             )
-        yield _summarize(index, start, end, collisions, contacts, validation), contacts
+        yield IntervalResult(_summarize(contacts, collisions, validation), contacts)
 
 
-def _summarize(index, start, end, collisions, contacts, validation) -> Interval:
-    earliest = None
+def _summarize(contacts, collisions, validation) -> IntervalSummary:
+    interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
         row = slice(first, first + 1)
@@ -130,12 +157,12 @@ def _summarize(index, start, end, collisions, contacts, validation) -> Interval:
             float(contacts.time[first]),
         )
     pairs, counts = np.unique(np.sort(contacts.meshes, axis=1), axis=0, return_counts=True)
-    names = [mesh.name for mesh in contacts.segment.meshes]
+    names = [mesh.name for mesh in interval.segment.meshes]
     edge_edge = int(contacts.kind.sum())
-    return Interval(
-        index=index,
-        start=start,
-        end=end,
+    return IntervalSummary(
+        index=interval.index,
+        start=interval.start,
+        end=interval.end,
         vertex_face_hits=len(contacts) - edge_edge,
         edge_edge_hits=edge_edge,
         toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),

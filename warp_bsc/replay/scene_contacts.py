@@ -1,49 +1,49 @@
-"""The collisions of one interval as the artist knows them: prims, their own elements, places in world space."""
+"""Names the collisions of one interval as the artist knows them: prims, their own elements, places in world space."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..usd.segment import Segment
+from ..detection.detector import Collisions
+from ..detection.mesh import CollisionMesh
+from ..usd.interval import Interval
+from ..usd.selection import Selection
 
-__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "Contacts", "find_contacts"]
+__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "SceneContacts", "find_contacts"]
 
 KINDS = ("vertex-face", "edge-edge")
-"""The kinds of contact, by their numbers."""
+"""Labels of the kinds of contact, by their numbers."""
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
-"""The kinds of element; a diagonal is an edge of triangles that a polygon is cut into, and none of the prim's."""
+"""The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
 
 _CHUNK = 4096
 _WORDS = ("vertex", "face", "edge", "diagonal")
 
 
 @dataclass(frozen=True)
-class Contacts:
-    """What meets in one interval, where and when: arrays with a row for each pair.
+class SceneContacts:
+    """The pairs that collide in one interval, where and when: arrays with a row for each pair.
 
     Attributes:
-        segment: The meshes.
-        x0: Positions of their vertices at the start of the interval, shape [vertex_count, 3].
-        x1: The same at its end.
+        interval: The interval.
         kind: Index in :data:`KINDS`, shape [n].
-        elements: What the two are: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape [n, 2].
-        meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
-        indices: The numbers of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the
-            polygon and -1 for a face, the points at both ends for the others.
-        vertices: The vertices of the segment that the two have: one and -1 for a vertex, both ends for an edge, -1 for
-            a face, shape [n, 2, 2].
-        faces: The faces of the segment that the two are, else -1, shape [n, 2].
+        elements: Kinds of the two elements: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape
+            [n, 2].
+        meshes: The two meshes, indices in ``interval.segment.meshes``, shape [n, 2].
+        indices: Indices of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the polygon
+            and -1 for a face, the points at both ends for an edge or a diagonal.
+        vertices: Vertices of the segment at the two elements, shape [n, 2, 2]: the vertex and -1 for a vertex, both
+            ends for an edge or a diagonal, -1 twice for a face.
+        faces: Face of the segment for a face, else -1, shape [n, 2].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
-        position: Where they meet, in world space and the scene's unit of length, shape [n, 3].
-        normal: Unit normals, against the velocity of the first relative to the second, shape [n, 3].
-        counted: Which of the pairs that the detector found these are, vertex-face before edge-edge, booleans.
+        position: Points of contact, in world space and the scene's unit of length, shape [n, 3].
+        normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
+        counted: Which of the pairs that the detector found are among these, vertex-face before edge-edge, bool.
     """
 
-    segment: Segment = field(repr=False)
-    x0: np.ndarray = field(repr=False)
-    x1: np.ndarray = field(repr=False)
+    interval: Interval = field(repr=False)
     kind: np.ndarray
     elements: np.ndarray
     meshes: np.ndarray
@@ -56,20 +56,20 @@ class Contacts:
     normal: np.ndarray
     counted: np.ndarray = field(repr=False)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.kind)
 
     def chunks(self) -> list[slice]:
-        """All rows, some at a time: text of them takes many times the room that they do."""
+        """Returns all rows as slices of limited length: their text takes many times their memory."""
         return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
-        """Names of the two meshes of some pairs."""
-        names = [mesh.name for mesh in self.segment.meshes]
+        """Returns the names of the two meshes of some pairs."""
+        names = [mesh.name for mesh in self.interval.segment.meshes]
         return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
 
     def element_names(self, rows: slice) -> list[tuple[str, str]]:
-        """The two elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
+        """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
 
         def name(element, indices):
             first, second = indices
@@ -84,35 +84,34 @@ class Contacts:
 
     @property
     def colliding_faces(self) -> np.ndarray:
-        """The faces of the segment that collide, or have an edge that does, ascending."""
+        """Faces of the segment that collide or have an edge that collides, ascending."""
         ends = self.vertices[self.elements >= EDGE]
-        return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
+        return np.union1d(self.faces[self.faces >= 0], self.interval.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
-        """The polygons that collide, or have an edge or a vertex that does: by the mesh, ascending."""
-        around = self.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
-        meshes, polygons = self.segment.locate_faces(np.union1d(self.colliding_faces, around))
+        """Returns the polygons that collide, or have an edge or a vertex that collides, ascending, by mesh."""
+        around = self.interval.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
+        meshes, polygons = self.interval.segment.locate_faces(np.union1d(self.colliding_faces, around))
         return {int(mesh): np.unique(polygons[meshes == mesh]) for mesh in np.unique(meshes)}
 
 
-def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> Contacts:
-    """Name what a detection found, of the pairs that count.
+def find_contacts(
+    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
+) -> SceneContacts:
+    """Names the pairs that a detection found and that count.
 
-    Pairs of meshes that never move do not, nor do those that the selection leaves out, nor those of a mesh with itself
-    that only its transform moves: whatever that does, what is apart in the mesh stays apart, and what touches there, at
-    T-junctions or in coplanar faces, is taken to collide by nothing but rounding. (Where a transform turns by half a
-    circle from one sample to the next, or scales by zero, the straight ways between do meet. The mesh does not.)
+    Excluded are pairs of meshes that never move, pairs that the selection excludes, and pairs of a mesh with itself if
+    only its transform moves it. Elements that are apart in such a mesh stay apart, and elements that touch, at
+    T-junctions or in coplanar faces, would collide by rounding alone. (If a transform turns by half a circle from one
+    sample to the next, or scales by zero, the straight ways of the vertices meet although the mesh does not.)
 
     Args:
-        segment: The meshes.
-        mesh: Their :class:`~warp_bsc.detection.mesh.CollisionMesh`.
-        collisions: What the detector found.
-        x0: Positions at the start, shape [vertex_count, 3].
-        x1: Positions at the end, shape [vertex_count, 3].
-        start: Time code of the start.
-        end: Time code of the end.
+        interval: The interval.
+        mesh: The detector's mesh, made of the interval's segment.
+        collisions: Collisions of that mesh in the interval.
         selection: Which pairs of meshes count.
     """
+    segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     n_vertex_face, n_edge_edge = len(vertices), len(ends)
@@ -151,25 +150,25 @@ def find_contacts(segment, mesh, collisions, x0, x1, start, end, selection) -> C
     moves = np.array([part.moves for part in segment.meshes])
     counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
     counted &= ~_are_stiff(segment, vertices, meshes[:n_vertex_face, 1], ends)
-    arrays = (
-        kind,
-        elements,
-        meshes,
-        indices,
-        all_vertices,
-        all_faces,
-        toi,
-        start + toi * (end - start),
-        position,
-        normal,
-    )
-    return Contacts(segment, x0, x1, *(array[counted] for array in arrays), counted)
+    arrays = {
+        "kind": kind,
+        "elements": elements,
+        "meshes": meshes,
+        "indices": indices,
+        "vertices": all_vertices,
+        "faces": all_faces,
+        "toi": toi,
+        "time": interval.start + toi * (interval.end - interval.start),
+        "position": position,
+        "normal": normal,
+    }
+    return SceneContacts(interval, **{name: array[counted] for name, array in arrays.items()}, counted=counted)
 
 
 def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:
-    """Which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges.
+    """Returns which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges.
 
-    Vertices of it may be welded to others' and so may its edges: all meshes that they are of count.
+    Vertices and edges may be welded to those of other meshes: they belong to all of these.
     """
     are_stiff = np.zeros(len(vertices) + len(ends), dtype=bool)
     stiff = np.array([mesh.moves and not mesh.deforms for mesh in segment.meshes], dtype=bool)

@@ -1,34 +1,34 @@
-"""All that a replay found, in numbers: what every table and file sums up at the end."""
+"""A whole replay in numbers, as every table and file gives it at the end."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, Interval
+from .intervals import TOI_BINS, Contact, IntervalSummary
 
-__all__ = ["CERTIFIED_FOR", "Outcome"]
+__all__ = ["CERTIFIED_FOR", "Summary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
-"""What a certificate is about."""
+"""The motion that a certificate holds for."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """All that a replay found.
+class Summary:
+    """A whole replay in numbers.
 
     Attributes:
         scene: The scene.
-        method: The method that was used.
-        device: The device that was used.
-        intervals: Those that are finished, in order.
-        stopped: Why there are no more; empty if these are all.
+        method: Method of detection.
+        device: Name of the Warp device.
+        intervals: The finished intervals, in order.
+        stopped: Why the replay ended before the scene did; empty if it did not.
     """
 
     scene: Scene
     method: str
     device: str
-    intervals: list[Interval]
+    intervals: list[IntervalSummary]
     stopped: str = ""
 
     @property
@@ -38,18 +38,23 @@ class Outcome:
 
     @property
     def interval_count(self) -> int:
-        """How many intervals the scene has."""
-        return len(self.scene.times) - 1
+        """Number of intervals of the scene."""
+        return len(self.scene)
 
     @cached_property
-    def colliding(self) -> list[Interval]:
+    def colliding(self) -> list[IntervalSummary]:
         """The intervals with collisions."""
         return [interval for interval in self.intervals if interval.hits]
 
     @cached_property
-    def worst(self) -> list[Interval]:
-        """The same, those with the most collisions first."""
+    def worst(self) -> list[IntervalSummary]:
+        """The intervals with collisions, those with the most first."""
         return sorted(self.colliding, key=lambda interval: -interval.hits)
+
+    @property
+    def first_contact(self) -> Contact | None:
+        """The earliest contact, None if there is none."""
+        return self.colliding[0].earliest if self.colliding else None
 
     @property
     def hits(self) -> int:
@@ -58,13 +63,13 @@ class Outcome:
 
     @property
     def certified(self) -> bool:
-        """Whether no collision of vertices that move straight can be missing in what is finished."""
+        """Whether no collision of vertices that move straight is missing in the finished intervals."""
         return all(interval.certified for interval in self.intervals)
 
     @cached_property
     def mesh_pairs(self) -> list[tuple[tuple[str, str], int]]:
-        """Names of two meshes and the number of their pairs that collide, the most first."""
-        total = Counter()
+        """Names of two meshes and their number of colliding pairs, the largest first."""
+        total: Counter[tuple[str, str]] = Counter()
         for interval in self.intervals:
             total.update(interval.mesh_pairs)
         return total.most_common()
@@ -85,7 +90,7 @@ class Outcome:
 
     @property
     def validation(self) -> dict | None:
-        """What the exact checker says of the answers, None if it was not asked."""
+        """The comparison with the exact checker, None if none was asked for."""
         found = [(interval, interval.validation) for interval in self.intervals if interval.validation]
         if not found:
             return None
@@ -102,7 +107,7 @@ class Outcome:
 
     @property
     def motion(self) -> str:
-        """A sentence on what is taken for the motion between samples."""
+        """A sentence on the motion that is assumed between samples."""
         sentence = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
@@ -112,8 +117,8 @@ class Outcome:
             )
         return sentence
 
-    def first(self, count: int) -> "Outcome":
-        """What the first intervals are of it."""
+    def first(self, count: int) -> "Summary":
+        """Returns the summary of the first intervals alone."""
         if count == len(self.intervals):
             return self
         return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "no room for more")

@@ -1,26 +1,29 @@
-"""A USD layer over the scene, which shows its collisions in usdview and any other program that reads USD."""
+"""Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
 
 import os
 import tempfile
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from .._atomic_file import ReplayOutput, without_last_eighth
+from .._atomic_file import OutputFile
+from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
+from ..usd.scene import Scene
+from .intervals import IntervalResult
+from .outputs import without_last_eighth
 from .scene_contacts import KINDS
-from .summary import Outcome
+from .summary import Summary
 
 __all__ = ["Overlay"]
 
 COLORS = {"vertex-face": (0.9, 0.1, 0.1), "edge-edge": (1.0, 0.55, 0.0)}
-"""Of the contact points, by their kind."""
+"""Colours of the contact points by kind."""
 
 LIT = (0.95, 0.25, 0.2)
 """Colour of the polygons that collide."""
 
-_UNLIT = (0.6, 0.6, 0.6)  # of a mesh without a colour
+_UNLIT = (0.6, 0.6, 0.6)  # colour of a mesh that has none
 _DISPLAY_COLOR = "primvars:displayColor"
 _POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
 
@@ -37,51 +40,54 @@ _CONTACTS = {
 """Attributes of the contact points that have time samples: their types and interpolations."""
 
 
-class Overlay(ReplayOutput):
-    """A layer in USD's text format whose sublayer is the scene, so that both are seen when it is opened.
+class Overlay:
+    """A layer in USD's text format whose sublayer is the scene, so that opening the layer shows both.
 
-    Contact points are one ``UsdGeom.Points``, its samples at the start of each interval being what meets in it, and
-    have the primvars ``toi``, ``elementA`` and ``elementB``. Polygons that collide are coloured from the start of the
-    interval to that of the next. USD interpolates between samples: each ends with another one just before the next.
+    The contact points are one ``UsdGeom.Points`` with the primvars ``toi``, ``elementA`` and ``elementB``. It has a
+    sample at the start of each interval, with the contacts of that interval. Polygons that collide are coloured from
+    the start of the interval to the start of the next. USD interpolates between samples, so every sample is repeated
+    just before the next.
 
-    USD's own layers hold all that is written to them in memory. Here samples wait in a temporary file, and are sorted
-    by attribute at the end, when the scene, whose file may have become unreadable, is not read again.
+    USD's own layers hold their whole content in memory. This one keeps its samples in a temporary file, the spool, and
+    sorts them by attribute at the end. It does not read the scene then, whose file may have become unreadable.
+
+    Attributes:
+        file: The file.
     """
 
-    def __init__(self, path, *, scene):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene):
         """Opens the file.
 
         Args:
-            path: Its place, a ``.usda`` or ``.usd`` file.
+            path: The file's place, a ``.usda`` or ``.usd`` file.
             scene: The scene.
 
         Raises:
-            OSError: If it cannot be written.
-            ValueError: If it is not such a file.
+            OSError: If the file cannot be written.
+            ValueError: If its name has another suffix.
         """
         if Path(path).suffix not in (".usda", ".usd"):
             raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
         self._scene = scene
-        self._samples = {}  # by prim and attribute
-        self._ends = []  # of each interval that is whole, in the spool
-        self._last_start = None  # of an interval
-        self._colored = {}  # by the prim's path: the number of polygons in the last sample, and which of them are lit
-        self._unlit = {}  # by the prim's path: the scene's colours there
-        self._polygon_counts = {}  # of the meshes in the interval before
+        self._samples: dict[tuple[str, str], list[_Sample]] = {}  # by prim and attribute
+        self._ends = []  # where each complete interval ends in the spool
+        self._last_start: float | None = None  # of the last interval added
+        self._colored = {}  # by path of the prim: the number of polygons in the last sample, and the lit ones
+        self._unlit = {}  # by path of the prim: the colours in the scene
+        self._polygon_counts = {}  # by path: the number of polygons in the last interval added
         self._uncolored = False
-        self._opened = set()  # instances that must have prims of their own to be coloured
-        self._root_path = "/Collisions"
-        while scene.stage.GetPrimAtPath(self._root_path):
-            self._root_path += "_"
+        self._opened = set()  # native instances that must get prims of their own to be coloured
+        self._root_path = unused_path(scene, "/Collisions")
         self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
         self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
-        self._metadata = _metadata(scene)
-        super().__init__(path)
-        self._spool = tempfile.TemporaryFile(buffering=0, dir=self._output.folder)  # noqa: SIM115 (closed when discarded)
+        self._metadata = layer_metadata(scene)
+        self.file = OutputFile(path)
+        self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
-    def add(self, interval, contacts):
-        """Take the contacts of an interval."""
+    def add(self, result: IntervalResult) -> None:
+        """Adds the contacts of an interval."""
+        interval, contacts = result.summary, result.contacts
         prim = self._contacts_path
         size = self._width / 2
         points = contacts.position.astype(np.float32)
@@ -102,28 +108,28 @@ class Overlay(ReplayOutput):
         self._last_start = interval.start
         self._ends.append(self._spool.tell())
 
-    def finish(self, outcome: Outcome):
-        """Write the layer and put it in its place."""
-        del self._ends[len(outcome.intervals) :]
-        self._output.truncate(0)
-        self._write(outcome.first(len(self._ends)))
-        self._output.commit()
+    def finish(self, summary: Summary) -> None:
+        """Writes the layer and puts it in its place."""
+        del self._ends[len(summary.intervals) :]
+        self.file.truncate(0)
+        self._write(summary.first(len(self._ends)))
+        self.file.commit()
 
-    def shrink(self):
-        """Forget the samples of the last intervals."""
+    def shrink(self) -> bool:
+        """Drops the samples of the last intervals."""
         if not self._ends:
             return False
         self._ends = without_last_eighth(self._ends)
         self._spool.truncate(self._ends[-1] if self._ends else 0)
         return True
 
-    def discard(self):
-        """Leave nothing behind, unless the file is finished."""
+    def discard(self) -> None:
+        """Removes the temporary files."""
         self._spool.close()
-        super().discard()
+        self.file.discard()
 
     def _sample(self, prim, name, time, texts, lit_count=0):
-        """Let a sample of an attribute wait in the spool."""
+        """Adds a sample of an attribute to the spool."""
         place = self._spool.seek(0, os.SEEK_END)
         separator = ""
         for text in texts:
@@ -135,19 +141,19 @@ class Overlay(ReplayOutput):
         self._samples.setdefault((prim, name), []).append(sample)
 
     def _color(self, interval, contacts):
-        """Let the colours of all meshes wait that change at the start of an interval."""
-        meshes = {mesh.path: mesh for mesh in contacts.segment.meshes if mesh.path == mesh.name}
+        """Adds the colours of all meshes whose colours change at the start of an interval."""
+        meshes = {mesh.path: mesh for mesh in contacts.interval.segment.meshes if mesh.path == mesh.name}
         lit = {}
         for number, polygons in contacts.colliding_polygons().items():
-            mesh = contacts.segment.meshes[number]
+            mesh = contacts.interval.segment.meshes[number]
             if mesh.path in meshes:
                 lit[mesh.path] = polygons
             else:
                 self._uncolored = True
-        for path in {*self._colored, *lit} & meshes.keys():
+        for path in sorted({*self._colored, *lit} & meshes.keys()):
             count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
             if path not in self._colored:
-                self._open_instances(path)
+                self._opened.update(find_instances_above(self._scene, path))
                 if self._last_start is not None:
                     self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
             old_count, old_polygons = self._colored.get(path, (None, None))
@@ -157,49 +163,42 @@ class Overlay(ReplayOutput):
         self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
 
     def _sample_colors(self, path, time, count, lit):
-        self._unlit[path] = _unlit_colors(self._scene.stage, path, time)
+        colors = display_colors(self._scene, path, time)
+        self._unlit[path] = np.array([_UNLIT]) if colors is None else colors
         text = _color_text(self._unlit[path], count, lit)
         self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
 
-    def _open_instances(self, path):
-        """Note the instances that a prim is in: below these, only their prototype has colours."""
-        prim = self._scene.stage.GetPrimAtPath(path)
-        while prim.IsInstanceProxy():
-            prim = prim.GetParent()
-            if prim.IsInstance():
-                self._opened.add(str(prim.GetPath()))
-
-    def _write(self, outcome):
-        """Write the whole layer, of the intervals of an outcome."""
+    def _write(self, summary):
+        """Writes the whole layer for the intervals of a summary."""
         spool_end = self._ends[-1] if self._ends else 0
         parts = {path: [] for path in sorted(self._opened)}
         for (path, name), samples in self._samples.items():
             kept = [sample for sample in samples if sample.place < spool_end]
             if kept:
                 parts.setdefault(path, []).append((name, kept))
-        writer = _Writer(self._output)
-        writer.write(self._head(outcome))
-        end = outcome.intervals[-1].end if outcome.intervals else self._scene.times[0]
+        writer = _Writer(self.file)
+        writer.write(self._head(summary))
+        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
         self._write_prims(writer, "", _tree(parts), parts, end)
         writer.flush()
 
-    def _head(self, outcome) -> str:
-        """The layer's metadata."""
-        doc = f"Collisions found by warp-bsc replay. {outcome.motion}"
+    def _head(self, summary) -> str:
+        """Returns the layer's metadata as text."""
+        doc = f"Collisions found by warp-bsc replay. {summary.motion}"
         if self._uncolored:
             doc += " Polygons of point instancers are not coloured: their instances are one prim."
-        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.path.parent.resolve())).as_posix()
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
         asset = source if source.startswith("../") else f"./{source}"
-        complete = "true" if outcome.is_complete else "false"
-        stopped = f"\n            string stopped = {_quote(outcome.stopped)}" if outcome.stopped else ""
-        metadata = "\n    ".join(f"{name} = {value}" for name, value in self._metadata.items())
+        complete = "true" if summary.is_complete else "false"
+        stopped = f"\n            string stopped = {_quote(summary.stopped)}" if summary.stopped else ""
+        metadata = "\n    ".join(f"{name} = {_literal(value)}" for name, value in self._metadata.items())
         return f"""#usda 1.0
 (
     customLayerData = {{
         dictionary collisions = {{
             bool complete = {complete}
-            int hits = {outcome.hits}
-            int intervals = {len(outcome.intervals)}{stopped}
+            int hits = {summary.hits}
+            int intervals = {len(summary.intervals)}{stopped}
         }}
     }}
     doc = {_quote(doc)}
@@ -211,7 +210,7 @@ class Overlay(ReplayOutput):
 """
 
     def _write_prims(self, writer, path, tree, parts, end):
-        """Write the prims below a path, from a tree of their names."""
+        """Writes the prims below a path, from a tree of their names."""
         indent = "    " * path.count("/")
         for name, children in tree.items():
             below = f"{path}/{name}"
@@ -227,7 +226,7 @@ class Overlay(ReplayOutput):
             writer.write(f"{indent}}}\n")
 
     def _write_attribute(self, writer, indent, path, name, samples, end):
-        """Write an attribute's samples, and what it is once the last interval has ended."""
+        """Writes an attribute's samples, and its value after the last interval."""
         if path == self._contacts_path:
             value_type, interpolation = _CONTACTS[name]
             after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
@@ -240,12 +239,11 @@ class Overlay(ReplayOutput):
         if interpolation:
             writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
         writer.write(".timeSamples = {\n")
-        following = [(sample.time, sample.length) for sample in samples[1:]]
-        following += [] if after is None else [(end, len(after))]
-        for sample, (time, length) in zip_longest(samples, following, fillvalue=(None, 0)):
+        following = [*((sample.time, sample.length) for sample in samples[1:]), (end, len(after or ""))]
+        for sample, (time, length) in zip(samples, following, strict=True):
             self._write_sample(writer, indent, sample.time, sample)
-            # USD interpolates if both have values, and would see points on the way from one contact to another.
-            if sample.length and length and (before := _just_before(time)) > sample.time:
+            # USD interpolates if both have values, and would show points on the way from one contact to another.
+            if sample.length and length and (before := just_before(time)) > sample.time:
                 if interpolation == "vertex":
                     writer.write(f"{indent}    {before!r}: [],\n")
                 else:
@@ -266,7 +264,7 @@ class _Writer:
     """Writes many short texts as a few long ones."""
 
     def __init__(self, output):
-        self._output = output
+        self.file = output
         self._waiting, self._length = [], 0
 
     def write(self, text):
@@ -279,13 +277,13 @@ class _Writer:
             self.flush()
 
     def flush(self):
-        self._output.write(b"".join(self._waiting))
+        self.file.write(b"".join(self._waiting))
         self._waiting, self._length = [], 0
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """A sample that waits in the spool: its time, place and length there; the number of polygons if some are lit."""
+    """A sample in the spool: its time, its place and length there, and the number of polygons if any is lit."""
 
     time: float
     place: int
@@ -293,45 +291,8 @@ class _Sample:
     lit_count: int
 
 
-def _metadata(scene) -> dict[str, str]:
-    """The scene's metadata, which sublayers do not hand on: text by name."""
-    stage = scene.stage
-    default = stage.GetDefaultPrim()
-    start, end = scene.times[0], scene.times[-1]
-    if stage.HasAuthoredTimeCodeRange():
-        start, end = (float(stage.GetMetadata(name)) for name in ("startTimeCode", "endTimeCode"))
-    root = stage.GetRootLayer().defaultPrim if default else stage.GetPseudoRoot().GetChildren()[0].GetName()
-    return {
-        "defaultPrim": _quote(root),
-        "endTimeCode": repr(end),
-        "framesPerSecond": repr(stage.GetFramesPerSecond()),
-        "metersPerUnit": repr(scene.meters_per_unit),
-        "startTimeCode": repr(start),
-        "timeCodesPerSecond": repr(stage.GetTimeCodesPerSecond()),
-        "upAxis": f'"{scene.up_axis}"',
-    }
-
-
-def _just_before(time) -> float:
-    from pxr import Usd  # noqa: PLC0415 (slow)
-
-    return time - Usd.TimeCode.SafeStep(max(1e6, abs(time)))
-
-
-def _unlit_colors(stage, path, time) -> np.ndarray:
-    """The colours of a mesh's polygons in the scene, or fewer if they are all the same, shape [n, 3]."""
-    from pxr import UsdGeom  # noqa: PLC0415 (slow)
-
-    primvar = UsdGeom.Gprim(stage.GetPrimAtPath(path)).GetDisplayColorPrimvar()
-    values = primvar.ComputeFlattened(time) if primvar and primvar.HasValue() else None
-    if not values:
-        return np.array([_UNLIT])
-    colors = np.array(values, dtype=np.float64)
-    return colors if primvar.GetInterpolation() == UsdGeom.Tokens.uniform else colors.mean(axis=0, keepdims=True)
-
-
 def _color_text(colors, count, lit) -> str:
-    """The colours of a mesh's polygons, those lit being :data:`LIT`."""
+    """Returns the colours of a mesh's polygons as text, :data:`LIT` for the lit ones."""
     if len(colors) != count:
         colors = colors.mean(axis=0, keepdims=True)
     table, numbers = np.unique(colors, axis=0, return_inverse=True)
@@ -342,13 +303,13 @@ def _color_text(colors, count, lit) -> str:
 
 
 def _element_texts(contacts, rows, side) -> str:
-    """The first or the second elements of some contacts, with the names of their meshes."""
+    """Returns the first or the second elements of some contacts as text, with the names of their meshes."""
     both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
     return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
 
 
 def _tree(paths) -> dict:
-    """Names of prims by those of their parents."""
+    """Returns the names of prims as a tree of dictionaries."""
     tree = {}
     for path in paths:
         place = tree
@@ -361,6 +322,11 @@ def _tuples(rows) -> str:
     return ", ".join(f"({x:.9g}, {y:.9g}, {z:.9g})" for x, y, z in np.asarray(rows, dtype=np.float32).tolist())
 
 
+def _literal(value: str | float) -> str:
+    """Returns a string or a number in the syntax of USD's text format."""
+    return _quote(value) if isinstance(value, str) else repr(value)
+
+
 def _quote(text: str) -> str:
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     if escaped.isprintable():
@@ -369,8 +335,9 @@ def _quote(text: str) -> str:
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
-    """The lowest and the highest corner of what moves at first, or of all if nothing does yet."""
-    segment, x, _ = scene.interval(0)
+    """Returns the bounding box of the moving meshes at first, or of all meshes if none moves yet."""
+    interval = scene.interval(0)
+    segment, x = interval.segment, interval.x0
     meshes, _ = segment.locate_vertices(np.arange(segment.vertex_count))
     moves = np.array([mesh.moves for mesh in segment.meshes], dtype=bool)[meshes]
     x = x[moves] if moves.any() else x

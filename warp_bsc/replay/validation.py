@@ -1,4 +1,4 @@
-"""Asks the answers of a detection again: of the exact checker, about pairs that it finds by itself."""
+"""Compares a detection with the exact checker, on pairs found independently of the detector."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,24 +6,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import checker
+from ..detection.detector import CollisionDetector, Collisions
+from ..detection.query_points import query_points
 
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 
-_CHUNK = 1 << 18  # pairs that are looked at together
+_CHUNK = 1 << 18  # pairs in memory at a time
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What the exact checker says of the answers for one interval.
+    """Comparison of a detection with the exact checker.
 
     Attributes:
-        hits: How many reported collisions were asked again.
-        others: How many pairs were that were not reported and whose swept boxes overlap.
-        answers: How many answers the detector gave.
-        certified: How many of them floating point had certified.
-        disagreements: Those that the checker answers otherwise, a sentence each.
-        false_hits: How many reported pairs of method "conservative", which may do so, do not collide.
+        hits: Number of reported collisions that the checker decided.
+        others: Number of unreported pairs with overlapping swept boxes that the checker decided.
+        answers: Number of pairs that the detector decided.
+        certified: Number of these that floating point certified.
+        disagreements: The pairs that the checker decides differently, a sentence each.
+        false_hits: Number of reported pairs of method "conservative" that do not collide, as that method permits.
     """
 
     hits: int
@@ -34,40 +36,45 @@ class Validation:
     false_hits: int
 
 
-def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, counted=None) -> Validation:
-    """Ask the answers of a detection again.
+def validate(
+    detector: CollisionDetector,
+    collisions: Collisions,
+    x0: np.ndarray,
+    x1: np.ndarray,
+    *,
+    most: int | None,
+    seed: int,
+    counted: np.ndarray | None = None,
+) -> Validation:
+    """Compares a detection with the exact checker.
 
-    Reported collisions must collide, and do so at the time that was reported. Pairs that were not reported, of all
-    whose swept boxes overlap, must not. These are found by a grid that has nothing in common with the detector.
+    Reported pairs must collide, at the reported time. Unreported pairs whose swept boxes overlap must not collide; a
+    grid that shares nothing with the detector finds them.
 
     Args:
-        detector: The :class:`~warp_bsc.detection.detector.CollisionDetector`.
-        collisions: What it found.
+        detector: The detector.
+        collisions: Its collisions.
         x0: Positions at the start, shape [vertex_count, 3].
         x1: Positions at the end, shape [vertex_count, 3].
-        most: How many collisions and how many other pairs are asked, taken at random; None for all.
-        seed: Of the random choice.
-        counted: Which of the reported pairs are asked, vertex-face before edge-edge, booleans; default: all.
+        most: Number of reported pairs, and of others, that the checker decides, chosen at random; None for all.
+        seed: Seed of the random choice.
+        counted: Which of the reported pairs may be chosen, vertex-face before edge-edge, bool; default: all.
     """
     mesh = detector.mesh
     random = np.random.default_rng(seed)
     disagreements = []
-    asked_hits = asked_others = false_hits = 0
+    decided_hits = decided_others = false_hits = 0
     vertices, faces, edges = np.arange(mesh.vertex_count)[:, None], mesh.faces, mesh.edges
     for kind, first, second in (("vertex_face", vertices, faces), ("edge_edge", edges, edges)):
         found, toi = getattr(collisions, kind), getattr(collisions, f"{kind}_toi")
-
-        def motions(pairs, first=first, second=second):
-            corners = np.concatenate([first[pairs[:, 0]], second[pairs[:, 1]]], axis=1)
-            return np.concatenate([x0[corners], x1[corners]], axis=1)
 
         rows = np.arange(len(found))
         if counted is not None:
             rows, counted = np.flatnonzero(counted[: len(found)]), counted[len(found) :]
         if most is not None and len(rows) > most:
             rows = np.sort(random.choice(rows, most, replace=False))
-        asked_hits += len(rows)
-        bounds = getattr(checker, f"{kind}_toi")(motions(found[rows]))
+        decided_hits += len(rows)
+        bounds = getattr(checker, f"{kind}_toi")(query_points(second, found[rows], x0, x1))
         for row, (earliest, latest) in zip(rows, bounds, strict=True):
             pair = f"{kind.replace('_', '-')} {found[row].tolist()}"
             if np.isnan(earliest) and detector.method == "conservative":
@@ -81,16 +88,16 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, count
 
         others = _unreported(mesh, kind, first, second, found, x0, x1)
         for pairs in others if most is None else [_choose(others, most, random)]:
-            asked_others += len(pairs)
-            collides = getattr(checker, kind)(motions(pairs))
+            decided_others += len(pairs)
+            collides = getattr(checker, kind)(query_points(second, pairs, x0, x1))
             name = kind.replace("_", "-")
             disagreements += [f"{name} {pair} collides and was not reported" for pair in pairs[collides].tolist()]
 
     counts = collisions.stats.vertex_face, collisions.stats.edge_edge
     answers = sum(count.candidates for count in counts)
     return Validation(
-        hits=asked_hits,
-        others=asked_others,
+        hits=decided_hits,
+        others=decided_others,
         answers=answers,
         certified=answers - sum(count.unsure for count in counts),
         disagreements=tuple(disagreements),
@@ -99,7 +106,7 @@ def validate(detector, collisions, x0, x1, *, most: int | None, seed: int, count
 
 
 def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray]:
-    """Pairs of elements that share no vertex, whose swept boxes overlap and that are not among those found."""
+    """Yields the unreported pairs of elements that share no vertex and whose swept boxes overlap."""
     used = mesh.vertices if kind == "vertex_face" else np.arange(len(first))
 
     def boxes(elements):
@@ -116,11 +123,13 @@ def _unreported(mesh, kind, first, second, found, x0, x1) -> Iterator[np.ndarray
         yield pairs[~np.isin(pairs @ np.array([len(second), 1]), reported)]
 
 
-def overlapping_boxes(first, second) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Find all pairs of boxes that overlap or touch, some at a time.
+def overlapping_boxes(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Finds all pairs of boxes that overlap or touch, a chunk at a time.
 
-    Boxes are sorted by size. Those of two sizes are put into a grid whose cells are as large as the larger ones, each
-    by its lowest corner: what overlaps is then in the same cell or in neighbours.
+    Boxes are grouped by size. For two groups, each box is put into a grid by its lowest corner; the cells are as large
+    as the larger boxes, so that overlapping boxes are in the same cell or in neighbours.
 
     Args:
         first: Lowest and highest corners of the boxes, two arrays of shape [n, 3].
@@ -164,7 +173,7 @@ def _cell_keys(cells):
 
 
 def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Rows and the places from begin to end of each, about a chunk at a time."""
+    """Yields rows and the places from begin to end of each, about a chunk at a time."""
     (rows,) = np.nonzero(end > begin)
     counts = (end - begin)[rows]
     totals = np.cumsum(counts)
@@ -180,7 +189,7 @@ def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def _choose(chunks, most, random) -> np.ndarray:
-    """Some of all pairs, each as likely as any other."""
+    """Returns some of all pairs, each with the same probability."""
     chosen, lots = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
     for pairs in chunks:
         chosen = np.concatenate([chosen, pairs])

@@ -1,1 +1,1 @@
-"""From a USD file to moving meshes. OpenUSD is imported here, Warp is not."""
+"""Reads moving meshes from USD files. OpenUSD is imported only here; Warp is not imported."""

@@ -1,6 +1,13 @@
-"""The files that a USD stage is read from: none may be written to, and none may change meanwhile."""
+"""Tracks the files that a USD stage is read from: they must not be overwritten or change during a replay."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
 
 import os
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 __all__ = ["SceneFiles"]
 
@@ -8,22 +15,23 @@ __all__ = ["SceneFiles"]
 class SceneFiles:
     """The files of all layers that a stage has opened so far, value clips included."""
 
-    def __init__(self, stage):
+    def __init__(self, stage: "Usd.Stage"):
+        """Records the versions of all files opened so far."""
         self._stage = stage
         self._stamps = {}
         self._find()
 
-    def __contains__(self, path) -> bool:
-        """Whether a path names one of them."""
+    def __contains__(self, path: str | os.PathLike) -> bool:
+        """Returns whether a path names one of the files."""
         self._find()
         files = [path, *self._stamps] if os.path.exists(path) else []
         return any(os.path.exists(file) and os.path.samefile(path, file) for file in files[1:])
 
-    def check(self):
-        """See to it that all are what they were: crate files are read bit by bit, and two versions would be mixed.
+    def check(self) -> None:
+        """Checks that no file has changed: crate files are read piece by piece, and two versions would be mixed.
 
         Raises:
-            ValueError: If one has changed since it was first seen here.
+            ValueError: If a file has changed since this object first saw it.
         """
         self._find()
         for path, stamp in self._stamps.items():
@@ -40,7 +48,7 @@ class SceneFiles:
 
 
 def _stamp(path):
-    """What tells a version of a file from another, None if there is no such file."""
+    """Returns a value that differs between versions of a file, None if there is no such file."""
     try:
         status = os.stat(path)
     except OSError:

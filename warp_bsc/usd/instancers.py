@@ -1,17 +1,23 @@
-"""The instances of point instancers. Imports pxr: to be imported where it is used."""
+"""Finds and places the instances of point instancers. Imports pxr, which is slow: import this where it is used."""
 
-from pxr import Gf, Usd, UsdGeom
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import os
+from collections.abc import Iterator
+
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from .stage import LeftOut, UnreadableError, reading, sample_times
 
 __all__ = ["Instance", "find_instances", "is_shown", "transform_attributes", "transform_times", "visibility_times"]
 
-# Prototypes are often kept under a class or an over, lest they be drawn where they stand.
+# Prototypes are often kept under a class or an over, so that they are not drawn where they stand.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 
 
 class Instance:
-    """An instance of a prototype, and thus a place where the prims of the prototype stand.
+    """An instance of a prototype: a place where the prims of the prototype stand.
 
     Attributes:
         name: The instancer and the number of the instance, such as ``"/World/Leaves[3]"``.
@@ -20,8 +26,9 @@ class Instance:
         break_times: Time codes at which it may appear or vanish.
     """
 
-    def __init__(self, instancer, index, prototype, root, parent):
-        self._instancer = instancer  # an _Instancer
+    def __init__(self, instancer: "_Instancer", index: int, prototype: int, root: Usd.Prim, parent: "Instance | None"):
+        """Takes the numbers of the instance and of its prototype, and the instance that the instancer stands in."""
+        self._instancer = instancer
         self._index = index
         self._prototype = prototype
         self._parent = parent
@@ -31,16 +38,16 @@ class Instance:
         self.times = instancer.times | (parent.times if parent else set())
         self.break_times = instancer.break_times | (parent.break_times if parent else set())
 
-    def name_of(self, path) -> str:
-        """The name of a prim of the prototype, by its path, in this instance."""
+    def name_of(self, path: Sdf.Path) -> str:
+        """Returns the name in this instance of a prim of the prototype, given its path."""
         return f"{self.name}/{path.MakeRelativePath(self.root.GetPath().GetParentPath())}"
 
-    def prims(self):
-        """An iterator over the prims of the prototype, the topmost first."""
+    def prims(self) -> Iterator[Usd.Prim]:
+        """Returns an iterator over the prims of the prototype, the topmost first."""
         return iter(Usd.PrimRange(self.root, _PROTOTYPES))
 
     def is_present(self, time: Usd.TimeCode) -> bool:
-        """Whether the instance is there and visible."""
+        """Returns whether the instance is there and visible."""
         numbers, mask = self._instancer.read_presence(time)
         return (
             self._index < len(numbers)
@@ -50,10 +57,10 @@ class Instance:
             and (self._parent is None or self._parent.is_present(time))
         )
 
-    def transform(self, prim, time: Usd.TimeCode):
-        """The matrix that takes points of a prim of the prototype to world space, a ``Gf.Matrix4d``.
+    def transform(self, prim: Usd.Prim, time: Usd.TimeCode) -> Gf.Matrix4d | None:
+        """Returns the matrix that takes points of a prim of the prototype to world space.
 
-        None where the instance is not there, or the instancer's arrays do not fit each other.
+        None where the instance is not there, or the lengths of the instancer's arrays differ.
         """
         placed = self._instancer.read_transform(self._index, time)
         cache = UsdGeom.XformCache(time)
@@ -66,19 +73,19 @@ class Instance:
             local *= root.GetLocalTransformation(time)
         return local * placed * above
 
-    def contains(self, prim) -> bool:
-        """Whether the instance is of, or inside one of, an instancer: such may not contain itself."""
+    def contains(self, prim: Usd.Prim) -> bool:
+        """Returns whether an instancer made this instance or one around it: an instancer may not contain itself."""
         return self._instancer.prim == prim or (self._parent is not None and self._parent.contains(prim))
 
 
 class _Instancer:
-    """A point instancer, and the transforms that it had when last asked."""
+    """A point instancer, and its transforms at the time that was read last."""
 
     def __init__(self, prim, root):
         self.prim = prim
         self._instancer = UsdGeom.PointInstancer(prim)
-        self._last = None, None
-        self._last_presence = None, None
+        self._last: tuple[Usd.TimeCode | None, tuple] = None, ()
+        self._last_presence: tuple[Usd.TimeCode | None, tuple] = None, ()
         self.times = transform_times(prim, root) | sample_times(
             self._instancer.GetPositionsAttr(),
             self._instancer.GetOrientationsAttr(),
@@ -90,9 +97,9 @@ class _Instancer:
         )
 
     def read_transform(self, index, time):
-        """The matrix of an instance, None if it has none.
+        """Returns the matrix of an instance, None if it has none.
 
-        ``PointInstancer.ComputeInstanceTransformsAtTime`` does not know the moment before a time.
+        ``PointInstancer.ComputeInstanceTransformsAtTime`` cannot evaluate the moment just before a time.
         """
         if self._last[0] != time:
             instancer = self._instancer
@@ -110,20 +117,23 @@ class _Instancer:
         return matrix
 
     def read_presence(self, time) -> tuple:
+        """Returns the prototypes of the instances, and the mask of those that are not hidden."""
         if self._last_presence[0] != time:
             numbers = self._instancer.GetProtoIndicesAttr().Get(time) or ()
             self._last_presence = time, (numbers, list(self._instancer.ComputeMaskAtTime(time)))
         return self._last_presence[1]
 
 
-def find_instances(prim, parent: Instance | None, file, left_out: LeftOut) -> list[Instance]:
-    """All instances that a point instancer has at some time.
+def find_instances(
+    prim: Usd.Prim, parent: Instance | None, file: str | os.PathLike, left_out: LeftOut
+) -> list[Instance]:
+    """Finds all instances that a point instancer has at some time.
 
     Args:
         prim: The instancer.
         parent: The instance that it stands in, None if it stands in the scene.
         file: The file, for messages.
-        left_out: An instancer that contains itself is left out, and instances are whose prototype is missing.
+        left_out: Takes instancers that contain themselves, and instances whose prototype is missing.
 
     Raises:
         UnreadableError: If these may not be left out.
@@ -150,8 +160,8 @@ def find_instances(prim, parent: Instance | None, file, left_out: LeftOut) -> li
     return [Instance(instancer, index, number, roots[number], parent) for index, number in present]
 
 
-def transform_attributes(prim, root=None):
-    """The attributes that make the transforms from a prim to the world, or to and with a root's."""
+def transform_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[Usd.Attribute]:
+    """Yields the attributes of the transforms from a prim to the world, or up to a root, its own included."""
     while prim:
         if xformable := UsdGeom.Xformable(prim):
             yield from (op.GetAttr() for op in xformable.GetOrderedXformOps())
@@ -162,21 +172,18 @@ def transform_attributes(prim, root=None):
         prim = prim.GetParent()
 
 
-def transform_times(prim, root=None) -> set[float]:
-    """Times at which the transforms from a prim to the world, or to and with a root's, have samples.
-
-    Of those transforms only that have two or more.
-    """
+def transform_times(prim: Usd.Prim, root: Usd.Prim | None = None) -> set[float]:
+    """Returns the times of the samples of those transforms, where an attribute has two or more."""
     return sample_times(*transform_attributes(prim, root))
 
 
-def visibility_times(prim, root=None) -> set[float]:
-    """Times at which the visibility of a prim, or of what it inherits from up to a root, may change."""
+def visibility_times(prim: Usd.Prim, root: Usd.Prim | None = None) -> set[float]:
+    """Returns the times at which the visibility of a prim, or of one above it up to a root, may change."""
     return sample_times(*(imageable.GetVisibilityAttr() for imageable in _imageables(prim, root)))
 
 
-def is_shown(prim, root, time) -> bool:
-    """Whether neither a prim nor what it inherits from, up to a root or the whole scene, is invisible at a time."""
+def is_shown(prim: Usd.Prim, root: Usd.Prim | None, time: Usd.TimeCode) -> bool:
+    """Returns whether a prim and all above it, up to a root or to the top of the scene, are visible at a time."""
     return all(
         imageable.GetVisibilityAttr().Get(time) != UsdGeom.Tokens.invisible for imageable in _imageables(prim, root)
     )

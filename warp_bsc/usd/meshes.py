@@ -1,7 +1,11 @@
-"""Finds the meshes of a USD stage and reads one at a time. Imports pxr: to be imported where it is used."""
+"""Finds the meshes of a USD stage and reads one at a time. Imports pxr, which is slow: import this where it is used."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
 
 import hashlib
 import math
+import os
 from collections import Counter
 from itertools import pairwise
 
@@ -16,25 +20,28 @@ from .instancers import (
     transform_times,
     visibility_times,
 )
+from .selection import Selection
 from .skinning import Skin, find_bindings
 from .stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
 from .triangulation import triangulate
 
 __all__ = ["UsdMesh", "find_meshes"]
 
-_BETWEEN = 0.382  # where between two samples a transform is looked at: not where a turn by half a circle begins anew
+_BETWEEN = 0.382  # where between two samples a transform is tested for a bend; halfway, two whole turns look like none
 _MOST_TIMES = 1_000_000
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
 
-def find_meshes(stage, file, selection, left_out: LeftOut) -> tuple[list["UsdMesh"], list[str]]:
-    """The meshes of a stage that are selected and visible at some time, and a sentence on each kind of thing left out.
+def find_meshes(
+    stage: Usd.Stage, file: str | os.PathLike, selection: Selection, left_out: LeftOut
+) -> tuple[list["UsdMesh"], list[str]]:
+    """Returns the selected meshes that are visible at some time, and sentences on the contents that are not checked.
 
     Args:
         stage: The stage.
         file: Its file, for messages.
-        selection: What is checked.
-        left_out: Meshes and instances that are broken are left out.
+        selection: Which meshes are checked.
+        left_out: Takes broken meshes and instances.
 
     Raises:
         UnreadableError: If a mesh or a point instancer is broken and may not be left out.
@@ -81,7 +88,7 @@ class _Place:
         path: Its path.
         name: The same, with the number of the instance if a point instancer places it.
         instance: That instance, else None.
-        binding: What it is bound to, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
+        binding: Its binding, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
     """
 
     def __init__(self, prim, instance: Instance | None, binding: tuple | None):
@@ -127,7 +134,7 @@ class _Finder:
                 self.other[prim.GetTypeName()] += 1
 
     def _find_bindings(self, root) -> bool:
-        """Whether what is below a ``SkelRoot`` can be read."""
+        """Returns whether the bindings below a ``SkelRoot`` can be read."""
         path = root.GetPath()
         if path not in self._bindings:
             self._bindings[path] = None
@@ -146,25 +153,25 @@ class UsdMesh:
     Attributes:
         path: The prim's path.
         name: The same, with the number of the instance if a point instancer places it.
-        display_name: What the file says to show instead, empty if nothing.
+        display_name: Display name in the file, empty if there is none.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
-        states: What it is at first, at minus infinity, and from each time on at which that changes: None where it is
-            invisible, not there or empty, else bytes that are others for another topology.
+        states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
+            is invisible, not there or empty, else a digest of its topology.
         turns: Whether a transform or a skeleton moves it, which is not linear between the samples.
         deforms: Whether anything but its transform moves it.
-        may_jump: Whether it may be elsewhere before a time than at that time.
-        is_placed: Whether its points are in world space as they are: its transform is the identity at all times.
+        may_jump: Whether its positions just before a time may differ from those at that time.
+        is_placed: Whether its transform is the identity at all times, so that its points are in world space.
     """
 
-    def __init__(self, place: _Place, file):
-        """Finds when a mesh changes and moves.
+    def __init__(self, place: _Place, file: str | os.PathLike):
+        """Finds the times at which a mesh changes and moves.
 
         Args:
             place: The prim, or the instance.
             file: Its file, for messages.
 
         Raises:
-            UnreadableError: If what is found is not what a mesh has.
+            UnreadableError: If an attribute has a value that a mesh cannot have.
         """
         prim, instance = place.prim, place.instance
         self.path, self.name = place.path, place.name
@@ -172,11 +179,11 @@ class UsdMesh:
         self._where = f"{file}: {self.name}"
         self._mesh = mesh = UsdGeom.Mesh(prim)
         self._instance = instance
-        self._skin = skin = Skin(*place.binding, f"{file}: {self.path}") if place.binding else None
+        self._skin = skin = Skin(*place.binding, where=f"{file}: {self.path}") if place.binding else None
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
-        self._own_times = {}  # the first and the last of its own times that the scene takes for one, by that
+        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that count as that one
 
         breaks = visibility_times(prim, self._root) | sample_times(
             mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
@@ -188,14 +195,14 @@ class UsdMesh:
         self.may_jump = any(attribute.HasSpline() for attribute in transform_attributes(self._frame, self._root))
 
         placed = sorted(transform_times(self._frame, self._root) | (instance.times if instance else set()))
-        # Between samples as well: a whole turn may end where it began.
+        # Between samples as well, because a whole turn ends where it began.
         between = [start + _BETWEEN * (end - start) for start, end in pairwise(placed)]
         codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*placed, *between]))]
         # None where an instance is not there.
         transforms = (transform for code in codes if (transform := self._find_transform(code)) is not None)
         first = next(transforms, np.eye(4))
         self.is_placed = np.array_equal(first, np.eye(4))
-        # Some writers sample a transform at every time that never changes.
+        # Some writers sample a transform at every time although it never changes.
         self._placed_times = []
         if any(not np.array_equal(transform, first) for transform in transforms):
             self._placed_times = placed
@@ -204,7 +211,7 @@ class UsdMesh:
             self.is_placed = False
 
     def turning_times(self, start: float, end: float) -> set[float]:
-        """Whole time codes between its samples at which it is not on the straight way from one to the next.
+        """Returns the whole time codes between samples at which the mesh is off the straight way between them.
 
         Args:
             start: Only after this time.
@@ -228,10 +235,12 @@ class UsdMesh:
         return times
 
     def take_times(self, scene_times: dict[float, float]) -> None:
-        """Take times that are almost one for that one, which is read as the first of them before, and the last after.
+        """Replaces the mesh's times by the scene's, where the scene merged times that are almost one.
+
+        The moment before such a time is read just before the first of the mesh's own times, the rest at the last.
 
         Args:
-            scene_times: The scene's time for each one that it was found to have.
+            scene_times: The scene's time for each time found in any mesh.
         """
         for time in sorted({*self.times, *self.states} - {-math.inf}):
             first, _ = self._own_times.get(scene_times[time], (time, time))
@@ -241,23 +250,23 @@ class UsdMesh:
         self.may_jump |= any(first != last for first, last in self._own_times.values())
 
     def leave_out(self, since: float) -> None:
-        """Take the mesh for gone from a time on, minus infinity for always."""
+        """Removes the mesh from a time on; minus infinity removes it at all times."""
         self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
-        """The points as they are stored, or as a skeleton moves them, shape [point_count, 3].
+        """Reads the points as they are stored, or as a skeleton moves them, shape [point_count, 3].
 
         Args:
             time: Time code.
-            before: Whether the moment before it is meant, where something jumps at that time.
+            before: Whether to read the moment just before that time, which differs where the mesh jumps at it.
 
         Raises:
-            UnreadableError: If there are none.
+            UnreadableError: If there are no points, or the binding to the skeleton is broken.
         """
         with reading(self._where, self, time):
             code = self._time_code(time, before)
             attribute = self._mesh.GetPointsAttr()
-            # Elsewhere another number of points is an error, which the moment before would hide.
+            # Where the topology stays, a changed number of points is an error, which the moment before would hide.
             points = attribute.Get(Usd.TimeCode(code.GetValue()) if before and time not in self.states else code)
             if _is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
@@ -271,20 +280,20 @@ class UsdMesh:
     def read_positions(
         self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
     ) -> np.ndarray:
-        """Positions in world space of some of the points.
+        """Reads the positions of some points in world space.
 
         Args:
             time: Time code.
-            before: Whether the moment before it is meant, where something jumps at that time.
-            used: The points, shape [count].
-            point_count: How many points the mesh must have in all.
+            before: Whether to read the moment just before that time, which differs where the mesh jumps at it.
+            used: Indices of the points, shape [count].
+            point_count: Number of points that the mesh must have.
             dtype: float32 only if :attr:`is_placed`, else float64.
 
         Returns:
             Positions, shape [count, 3].
 
         Raises:
-            UnreadableError: If the number of points is another, or a position is not finite.
+            UnreadableError: If the number of points differs, or a position is not finite.
         """
         points = self.read_points(time, before=before)
         with reading(self._where, self, time):
@@ -304,19 +313,19 @@ class UsdMesh:
                 )
             return positions
 
-    def read_triangles(self, time: float, points) -> tuple[np.ndarray, np.ndarray, int]:
-        """The polygons that are no holes, as triangles that turn to the left seen from outside.
+    def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """Reads the polygons that are no holes, as triangles that turn counterclockwise seen from outside.
 
         Args:
             time: Time code.
-            points: The points at the time that says which polygons are concave, shape [point_count, 3].
+            points: Points by which concave polygons are cut, shape [point_count, 3].
 
         Returns:
             The triangles' points, shape [triangle_count, 3], the polygon that each is a part of, shape
             [triangle_count], and the number of polygons, holes included.
 
         Raises:
-            UnreadableError: If the faces are broken, or none.
+            UnreadableError: If the faces are broken, or there are none.
         """
         with reading(self._where, self, time):
             counts, indices, holes = self._read_topology(self._time_code(time, False))
@@ -350,21 +359,21 @@ class UsdMesh:
             return triangles[solid], polygons[solid], len(counts)
 
     def _time_code(self, time, before) -> Usd.TimeCode:
-        """A time of the scene, or the moment before it, as the mesh has it."""
+        """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
         return as_time_code(first if before else last, before=before)
 
     def _transform(self, time, *, before=False) -> np.ndarray:
-        """The matrix that takes points, as rows, to world space, shape [4, 4]."""
+        """Returns the matrix that takes points, as rows, to world space, shape [4, 4]."""
         transform = self._find_transform(self._time_code(time, before))
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
         return transform
 
     def _bends(self, start, end) -> bool:
-        """Whether the transform goes from one sample to the next in another way than straight."""
+        """Returns whether the transform leaves the straight way from one sample to the next."""
         codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
-        first, between, last = map(self._find_transform, codes)
+        first, between, last = (self._find_transform(code) for code in codes)
         if first is None or between is None or last is None:
             return False
         straight = first + _BETWEEN * (last - first)
@@ -380,7 +389,7 @@ class UsdMesh:
         return None if transform is None else np.array(transform)
 
     def _read_topology(self, time) -> list[np.ndarray]:
-        """Counts, indices and holes at a time."""
+        """Reads counts, indices and holes at a time."""
         mesh = self._mesh
         attributes = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
         return [self._read_integers(attribute, time) for attribute in attributes]
@@ -402,12 +411,12 @@ class UsdMesh:
         return states
 
     def _is_present(self, time) -> bool:
-        """Whether the mesh is there, visible and not empty."""
+        """Returns whether the mesh is there, visible and not empty."""
         if not is_shown(self._mesh.GetPrim(), self._root, time):
             return False
         if self._instance and not self._instance.is_present(time):
             return False
-        # As where a fluid has not begun to flow.
+        # A mesh may be empty for some time, as where a fluid has not begun to flow.
         values = [
             attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())
         ]
@@ -421,5 +430,5 @@ class UsdMesh:
 
 
 def _is_empty(value) -> bool:
-    """Whether there is nothing in a value that should be a list."""
+    """Returns whether a value that should be a list is missing or empty."""
     return value is None or (hasattr(value, "__len__") and len(value) == 0)

@@ -2,64 +2,70 @@
 
 What is read
 ------------
-Every ``UsdGeom.Mesh`` that is loaded and selected, wherever references, payloads, variants, native instances and point
-instancers put it, merged to one list of vertices and one of faces: collisions of a mesh with itself and with others
-are then found alike. A mesh with a subdivision scheme is read as its control cage. Polygons become triangles and stay
-cut that way; holes and points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel
-has it.
+Every ``UsdGeom.Mesh`` that is loaded and selected is read, wherever references, payloads, variants, native instances
+and point instancers put it. All meshes are merged to one list of vertices and one of faces, so that collisions of a
+mesh with itself and with others are found alike. A mesh with a subdivision scheme is read as its control cage. Polygons
+are cut into triangles once; holes and points that no face refers to are left out. Blend shapes and joints move the
+points as UsdSkel computes them.
 
-Vertices that are in one place at every time are welded to one. Such are the two sides of a seam, or of a cloth that was
-written as one mesh for each of its colours: they belong together, and not welded would touch for ever.
+Vertices that are in one place at every time are welded to one. The two sides of a seam are an example, or a cloth that
+was written as one mesh for each of its colours: unwelded, they would touch all the time.
 
 What moves
 ----------
 The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
-meshes together; at a time that is not a mesh's own sample, USD interpolates. What is not straight from one sample to
-the next, as what a transform turns or a skeleton moves, is sampled at every whole time code between as well, and a
-spline as finely as :func:`~warp_bsc.usd.stage.sample_times` says. From one time to the next each vertex is taken to
-move straight, from where USD has it at the first to where USD has it when the second comes: what jumps there, from one
-value clip to the next or because it was held, ends where it was before.
+meshes together; at a time that is not a mesh's own sample, USD interpolates. Rotating transforms and skeletons do not
+move points straight from one sample to the next: they are sampled at every whole time code between as well, and splines
+as finely as :func:`~warp_bsc.usd.stage.sample_times` says. From one time to the next each vertex is taken to move
+straight, from its place at the first time to its place just before the second. A mesh that jumps at the second time,
+from one value clip to the next or because a value was held, therefore ends where it was before the jump.
 
-Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, are
-one: files have them by rounding, and OpenUSD to tell the end of a value clip from the start of the next.
+Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, count
+as one: rounding produces such times in files, and OpenUSD uses them to separate the end of a value clip from the start
+of the next.
 
 Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
 begins.
 
 Precision
 ---------
-USD stores points in single precision, transforms in double. Where every transform is the identity, positions are those
-stored, in single precision; otherwise all are computed and returned in double precision.
+USD stores points in single precision, transforms in double. If every transform is the identity, positions are the
+stored ones, in single precision; otherwise all are computed and returned in double precision.
 
 What cannot be read
 -------------------
-Meshes and instances that are broken and what cannot be opened is left out, from the time on at which it is broken, and
-named in :attr:`Scene.left_out`; the rest is read, if anything is left that moves.
+Broken meshes and instances, and files that cannot be opened, are left out from the time on at which they are broken,
+and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves.
 
-What the file has but this module does not read (spheres and other shapes that are not meshes, what is not selected) is
-named in :attr:`Scene.warnings`, and so is what becomes of the motion.
+:attr:`Scene.warnings` names the contents that this module does not read (spheres and other shapes that are not meshes,
+unselected meshes) and the changes that it makes to the motion.
 """
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
 
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from .files import SceneFiles
+from .interval import Interval
 from .segment import Segment
 from .selection import Selection
 
 __all__ = ["FrameRange", "Scene"]
 
-_JUMP = 1e-4  # more than this share of the way that a mesh goes in an interval; times that were merged make less
-_NAMED = 5  # of what is left out, in the warnings
+_JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
+_NAMED = 5  # most parts left out, and most messages of OpenUSD, that the warnings list
 _ROUNDING = 1e-12
 _SAME_TIME = 1e-6
 
-# Mapped into memory, every page of a crate file that has been read counts as memory of this process, which would then
-# seem to grow with each frame. USD looks at this when it is loaded, and would else say so on standard error.
+# If a crate file is mapped into memory, every page read counts as memory of this process, which then seems to grow with
+# each frame. USD reads these variables when it is loaded; without the second it reports the first on standard error.
 if "USDC_USE_ASSET" not in os.environ:
     os.environ["USDC_USE_ASSET"] = "1"
     os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
@@ -80,21 +86,21 @@ class FrameRange:
     step: float | None = None
 
     def bounds(self, samples: list[float]) -> tuple[float, float]:
-        """The first and the last time, of all times of the scene, ascending."""
+        """Returns the first and the last time, given all times of the scene, ascending."""
         return (
             samples[0] if self.start is None else max(self.start, samples[0]),
             samples[-1] if self.end is None else min(self.end, samples[-1]),
         )
 
     def times(self, samples: list[float], changes: set[float]) -> list[float]:
-        """The times to look at.
+        """Returns the times of this part, ascending.
 
         Args:
             samples: All times of the scene, ascending.
-            changes: Those at which meshes change their topology, appear or vanish, which are not stepped over.
+            changes: Times at which meshes change their topology, appear or vanish: a step never passes over these.
 
         Raises:
-            ValueError: If there are not two of them.
+            ValueError: If there are fewer than two times.
         """
         start = samples[0] if self.start is None else self.start
         end = samples[-1] if self.end is None else self.end
@@ -114,29 +120,33 @@ class FrameRange:
 
 
 class Scene:
-    """The meshes of a USD file. Holds one segment of its motion and reads others when asked for.
+    """The moving meshes of a USD file, as intervals between consecutive times: ``for interval in scene``.
+
+    A scene holds one segment of the motion in memory and reads others when an interval needs them.
 
     Attributes:
         path: The file.
         selection: Which of its meshes are checked.
         stage: The open ``Usd.Stage``.
-        files: The files that it is read from.
+        files: The files that the stage is read from.
         times: Time codes between which motion is straight, ascending, at least two.
-        time_codes_per_second: How many time codes make a second.
-        meters_per_unit: How many metres make the scene's unit of length.
+        time_codes_per_second: Number of time codes in a second.
+        meters_per_unit: The scene's unit of length [m].
         up_axis: "Y" or "Z".
-        dtype: Of the positions, float32 or float64.
-        names: Of all meshes that are checked at some time.
-        display_names: What the file says to show instead, by name, empty if nothing.
-        comments: What the file says of itself, pairs of a title and a text.
+        dtype: Type of the positions, float32 or float64.
+        names: Names of all meshes that are checked at some time.
+        display_names: Display names in the file, by name; empty where there is none.
+        comments: Comment and documentation of the file, pairs of a title and a text.
         vertex_count: Number of vertices of the first segment, welded.
         face_count: Number of triangles of the first segment.
-        turning: How many of them transforms or skeletons move, which is not straight between samples.
+        turning: Number of meshes that transforms or skeletons move, which is not straight between samples.
     """
+
+    times: list[float]
 
     def __init__(
         self,
-        path,
+        path: str | os.PathLike,
         *,
         selection: Selection | None = None,
         frames: FrameRange | None = None,
@@ -150,14 +160,15 @@ class Scene:
             path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
             selection: Which of its meshes are checked; default: those to be rendered.
             frames: The part of its time; default: all.
-            subdivide: Into how many intervals each one between times is divided.
-            sample_turns: Whether what turns is sampled at every whole time code too, if ``frames`` has no step.
-            strict: Whether nothing may be left out.
+            subdivide: Number of intervals, at least 1, into which each step between two times is divided.
+            sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
+                ``frames`` has no step.
+            strict: Whether unreadable parts are an error instead of being left out.
 
         Raises:
             FileNotFoundError: If there is no such file.
             ValueError: If the file is not USD, has no mesh that can be read or none that moves, or a selection selects
-                nothing; if ``strict``, also if something cannot be read. The message names the file, the prim and the
+                nothing; if ``strict``, also if a part cannot be read. The message names the file, the prim and the
                 time.
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
@@ -175,7 +186,7 @@ class Scene:
         self._collecting = usd_stage.collecting
         with self._collecting(self._messages, path):
             self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
-            # As old exporters have it, a number in single precision, which UsdGeom.GetStageMetersPerUnit does not take.
+            # Old exporters store it in single precision, which UsdGeom.GetStageMetersPerUnit rejects.
             self.meters_per_unit = float(self.stage.GetMetadata("metersPerUnit"))
             self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
             texts = {"Comment": "comment", "Documentation": "documentation"}
@@ -187,8 +198,9 @@ class Scene:
             self._note_changes()
             inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
-            self._segment, self._span = None, None
-            self._last = None  # the last interval that was read
+            self._segment: Segment | None = None
+            self._span: tuple[int, int] | None = None
+            self._last = None  # index, segment and positions of the last interval that was read
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
             segment = self._segment_at(0)
@@ -200,50 +212,64 @@ class Scene:
 
     @property
     def left_out(self) -> list[str]:
-        """What could not be read and was left out, and why, a sentence each; so far, as it is read when asked for."""
+        """The parts left out so far because they could not be read, and why, a sentence each."""
         return self._left_out.reasons
 
     @property
     def warnings(self) -> list[str]:
-        """What is passed over or changed, a sentence each; of what jumps, what has been read so far."""
-        warnings = [f"left out: {reason}" for reason in self.left_out[:_NAMED]]
+        """Sentences on unread contents and on changes to the motion; on jumps in the intervals read so far."""
+        warnings = [*map(_left_out_warning, self.left_out[:_NAMED])]
         if len(self.left_out) > _NAMED:
             warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
-        warnings += [f"OpenUSD says: {message}" for message in self._messages[:_NAMED]]
+        warnings += map(_message_warning, self._messages[:_NAMED])
         warnings += self._warnings
-        for name, times in self._jump_times.items():
-            warnings.append(f"{name} jumps {_times_in_words(sorted(times))}: what it jumps through is not checked")
+        warnings += (_jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
             warnings.append(f"vertices in one place at all times were welded: {self._welded}")
         return warnings
 
-    def interval(self, index: int) -> tuple[Segment, np.ndarray, np.ndarray]:
-        """The motion from one time to the next.
+    def __len__(self) -> int:
+        """Returns the number of intervals, at least 1."""
+        return len(self.times) - 1
+
+    def __iter__(self) -> Iterator[Interval]:
+        """Reads all intervals in order, each when it is reached. Errors are those of :meth:`interval`."""
+        return (self.interval(index) for index in range(len(self)))
+
+    def interval(self, index: int) -> Interval:
+        """Reads the motion from one time to the next.
 
         Args:
-            index: Of the time in :attr:`times`.
-
-        Returns:
-            The meshes that are there, and the positions of their vertices at the start and at the end, in the scene's
-            unit of length, shape [vertex_count, 3].
+            index: Number of the interval, from 0: it starts at that one of :attr:`times`.
 
         Raises:
+            IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
+        left_out, messages = len(self.left_out), len(self._messages)
         with self._collecting(self._messages, self.path):
             while True:
                 segment = self._segment_at(index)
                 try:
-                    interval = segment, segment.positions(start), segment.positions(end, before=True)
+                    x0, x1 = segment.positions(start), segment.positions(end, before=True)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
-        self._note_jumps(index, *interval)
-        return interval
+        jumps = self._find_jumps(index, segment, x0, x1)
+        for name in jumps:
+            self._jump_times.setdefault(name, set()).add(start)
+        warnings = [
+            *map(_left_out_warning, self.left_out[left_out:]),
+            *map(_message_warning, self._messages[messages:]),
+            *(_jump_warning(name, [start]) for name in jumps),
+        ]
+        return Interval(index, start, end, segment, x0, x1, jumps, tuple(warnings))
 
     def _check_meshes(self, is_selection):
-        """Sees to it that there are meshes, and that some move."""
+        """Raises a ValueError if there are no meshes, or none moves."""
         reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
         if not self._usd_meshes:
             none_selected = ", or none is selected" * is_selection
@@ -254,7 +280,7 @@ class Scene:
             )
 
     def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
-        """Finds the times to look at. Returns those at which meshes change their topology, appear or vanish."""
+        """Sets :attr:`times`. Returns those at which meshes change their topology, appear or vanish."""
         own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
         whole = set()
         if sample_turns and frames.step is None:
@@ -277,12 +303,12 @@ class Scene:
         return changes
 
     def _segment_at(self, index) -> Segment:
-        """The segment of an interval: the last one, if it is of that."""
-        while self._span is None or not self._span[0] <= index < self._span[1]:
+        """Returns the segment that an interval is in: the one in memory if possible."""
+        while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
             span = next(span for span in self._spans if span[0] <= index < span[1])
             start, stop = span
             present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
-            self._segment = self._span = self._last = None  # before the next is read, for the sake of memory
+            self._segment = self._span = self._last = None  # before the next is read, to free memory
             try:
                 self._segment = Segment(present, self.times[start : stop + 1], self.dtype)
             except self._unreadable as error:
@@ -293,7 +319,7 @@ class Scene:
         return self._segment
 
     def _leave_out(self, error, index):
-        """Leaves out a mesh from the interval on that could not be read, at the earliest an interval given."""
+        """Leaves out the mesh of an error from the interval on in which it breaks, or from ``index`` on if later."""
         ends_at = self.times.index(error.time)
         since = max(index, ends_at - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
@@ -306,22 +332,25 @@ class Scene:
             self._spans[place : place + 1] = [(first, since), (since, last)]
         self._span = self._last = None
 
-    def _note_jumps(self, index, segment, start, end):
-        """Notes which meshes do not start an interval where they ended the one before."""
+    def _find_jumps(self, index, segment, start, end) -> tuple[str, ...]:
+        """Returns the names of the meshes that do not start an interval where they ended the one before."""
         last, self._last = self._last, (index, segment, start, end)
         if last is None or last[:2] != (index - 1, segment) or np.array_equal(start, last[3]):
-            return
+            return ()
         _, _, last_start, last_end = last
         gaps = np.abs(start - last_end).max(axis=1)
         ways = np.maximum(np.abs(last_end - last_start).max(axis=1), np.abs(end - start).max(axis=1))
         rounding = _ROUNDING * np.abs(start).max()
         meshes = segment.vertex_meshes
+        names = []
         for number in np.unique(meshes[gaps > rounding]):
             own = meshes == number
             if gaps[own].max() > _JUMP * ways[own].max() + rounding:
-                self._jump_times.setdefault(segment.meshes[number].name, set()).add(self.times[index])
+                names.append(segment.meshes[number].name)
+        return tuple(names)
 
     def _note_changes(self):
+        """Adds a warning for each way in which a mesh appears, vanishes or changes its topology."""
         for mesh in self._usd_meshes:
             times_of = {}
             for (_, old), (time, new) in pairwise(mesh.states.items()):
@@ -333,12 +362,24 @@ class Scene:
                 self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
 
 
+def _left_out_warning(reason) -> str:
+    return f"left out: {reason}"
+
+
+def _message_warning(message) -> str:
+    return f"OpenUSD says: {message}"
+
+
+def _jump_warning(name, times) -> str:
+    return f"{name} jumps {_times_in_words(times)}: what it jumps through is not checked"
+
+
 def _times_in_words(times) -> str:
     return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
 
 
 def _merge(times) -> dict[float, float]:
-    """For each time the one that stands for all that are the same: of those the nearest to a whole time code."""
+    """Returns for each time the one that represents all that count as one: the nearest of them to a whole time code."""
     times = sorted(times)
     most = _SAME_TIME * min(1.0, times[-1] - times[0])
     groups = []
@@ -351,10 +392,10 @@ def _merge(times) -> dict[float, float]:
 
 
 def _is_there(mesh, time) -> bool:
-    """Whether a mesh is there at a time or later."""
+    """Returns whether a mesh is there at a time or later."""
     return _state_at(mesh, time) is not None or any(state for since, state in mesh.states.items() if since > time)
 
 
 def _state_at(mesh, time):
-    """What a mesh is at a time, see :attr:`UsdMesh.states`."""
+    """Returns the state of a mesh at a time, see :attr:`UsdMesh.states`."""
     return next(state for since, state in reversed(mesh.states.items()) if since <= time)

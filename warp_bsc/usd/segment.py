@@ -2,27 +2,31 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from .meshes import UsdMesh
 
 __all__ = ["SceneMesh", "Segment"]
 
 
 @dataclass(frozen=True)
 class SceneMesh:
-    """A mesh's part of a segment.
+    """The part of a segment that one mesh of the scene is.
 
     Attributes:
         path: The prim's path.
         name: The same, with the number of the instance if a point instancer places it.
-        display_name: What the file says to show instead, empty if nothing.
+        display_name: Display name in the file, empty if there is none.
         moves: Whether its points or its transform change with time.
-        deforms: Whether anything but its transform does, so that it may collide with itself.
+        deforms: Whether its points do, relative to each other, so that it may collide with itself.
         vertices: Its vertices, among those of all meshes before they were welded.
         faces: Its faces, among those of all meshes.
-        points: The prim's point that each vertex is, shape [len(vertices)].
+        points: Index of each vertex among the prim's points, shape [len(vertices)].
         point_count: Number of the prim's points.
-        polygons: The prim's polygon that each face is a part of, ascending, shape [len(faces)].
+        polygons: Index of the prim's polygon that each face is a part of, ascending, shape [len(faces)].
         polygon_count: Number of the prim's polygons, holes included.
     """
 
@@ -46,17 +50,20 @@ class Segment:
         meshes: The meshes, in the order of their vertices.
         faces: Vertices of each face, shape [face_count, 3], int32.
         vertex_count: Number of vertices of all meshes, welded.
-        welded: How many vertices were welded to another.
-        dtype: Of the positions, float32 or float64.
+        welded: Number of vertices that were welded to another.
+        dtype: Type of the positions, float32 or float64.
     """
 
-    def __init__(self, usd_meshes, times: list[float], dtype: np.dtype):
-        """Reads the topology, and finds what to weld.
+    meshes: list[SceneMesh]
+    faces: np.ndarray
+
+    def __init__(self, usd_meshes: "list[UsdMesh]", times: list[float], dtype: np.dtype):
+        """Reads the topology and welds vertices.
 
         Args:
             usd_meshes: The meshes.
             times: The segment's times, its first and its last included.
-            dtype: Of the positions.
+            dtype: Type of the positions.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -101,11 +108,11 @@ class Segment:
         self.welded = vertex_count - self.vertex_count
 
     def positions(self, time: float, *, before: bool = False) -> np.ndarray:
-        """Positions of all vertices in world space.
+        """Reads the positions of all vertices in world space.
 
         Args:
             time: Time code.
-            before: Whether the moment before it is meant, where something jumps at that time.
+            before: Whether to read the moment just before that time, which differs where a mesh jumps at it.
 
         Returns:
             Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`.
@@ -121,30 +128,30 @@ class Segment:
 
     @property
     def vertex_meshes(self) -> np.ndarray:
-        """Of each vertex its mesh, or the first of those welded there, shape [vertex_count]."""
+        """Mesh of each vertex, the first of those welded there, shape [vertex_count]."""
         return np.searchsorted(self._vertex_ends, self._kept, side="right")
 
-    def locate_vertices(self, vertices) -> tuple[np.ndarray, np.ndarray]:
-        """Of each vertex its mesh, or the first of those welded there, and its number among the prim's points."""
+    def locate_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mesh of each vertex, the first of those welded there, and its index among the prim's points."""
         return self._locate(self._kept[vertices])
 
-    def meshes_at_vertices(self, vertices) -> tuple[np.ndarray, np.ndarray]:
-        """All meshes that have some vertices: of each such pair the place in the list, and the mesh."""
+    def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all meshes that have each vertex, welded ones included: rows of the argument, and the meshes."""
         unwelded, order = self._unwelded
         wanted = self._kept[vertices]
         first, last = np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right")
         rows, places = _expand(first, last)
         return rows, np.searchsorted(self._vertex_ends, order[places], side="right")
 
-    def meshes_at_edges(self, ends) -> tuple[np.ndarray, np.ndarray]:
-        """The same of edges, shape [n, 2], smaller vertex first: all meshes with a face of which one is a side."""
+    def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all meshes that have each edge, shape [n, 2], smaller vertex first: rows, and the meshes."""
         keys, sides = self._sides
         wanted = self._side_keys(ends)
         rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
         return rows, np.searchsorted(self._face_ends, sides[places] // 3, side="right")
 
-    def locate_faces(self, faces) -> tuple[np.ndarray, np.ndarray]:
-        """Of each face its mesh, and the number of the prim's polygon that it is a part of."""
+    def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
         faces = np.asarray(faces)
         meshes = np.searchsorted(self._face_ends, faces, side="right")
         polygons = np.zeros(faces.shape, dtype=np.int64)
@@ -153,39 +160,39 @@ class Segment:
             polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
         return meshes, polygons
 
-    def locate_edges(self, ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of each edge its mesh, the numbers of its ends among the prim's points, and whether it is a diagonal.
+    def locate_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the mesh of each edge, the indices of its ends among the prim's points, and which are diagonals.
 
         Args:
             ends: Vertices, the smaller first, shape [n, 2].
 
         Returns:
-            Indices of meshes, shape [n]; numbers of points, the smaller first, shape [n, 2]; and whether the edge is a
-            diagonal, shape [n]: one inside a polygon, where triangles of it meet.
+            Indices of meshes, shape [n]; indices of points, the smaller first, shape [n, 2]; and whether each edge is
+            a diagonal, bool, shape [n]: an edge inside a polygon, where two of its triangles meet.
         """
         keys, sides = self._sides
         wanted = self._side_keys(ends)
         place = np.searchsorted(keys, wanted)
         face, corner = np.divmod(sides[place], 3)
-        # As the face has them: welded ends may be of an earlier mesh.
+        # The face's own corners: the welded ends may belong to an earlier mesh.
         unwelded = self._corners[face[:, None], np.stack([corner, (corner + 1) % 3], axis=1)]
         meshes, points = self._locate(unwelded)
 
-        # Triangles of one polygon follow one another.
+        # Triangles of one polygon are neighbours in the list.
         following = np.minimum(place + 1, max(0, len(keys) - 1))
         other = sides[following] // 3
         same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
         diagonal = (keys[following] == wanted) & (following > place) & same.all(axis=0)
         return meshes[:, 0], np.sort(points, axis=1), diagonal
 
-    def faces_around(self, vertices) -> np.ndarray:
-        """The faces that have one of some vertices as a corner."""
+    def faces_around(self, vertices: np.ndarray) -> np.ndarray:
+        """Returns the faces that have any of the vertices as a corner, ascending."""
         marked = np.zeros(self.vertex_count, dtype=bool)
         marked[vertices] = True
         return np.flatnonzero(marked[self.faces].any(axis=1))
 
-    def faces_at_edges(self, ends) -> np.ndarray:
-        """The faces that have one of some edges, shape [n, 2], smaller vertex first, as a side."""
+    def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
+        """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
         wanted = self._side_keys(ends)
         first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
@@ -196,13 +203,13 @@ class Segment:
 
     @cached_property
     def _unwelded(self):
-        """The vertex that each one was welded to, ascending, and the number of each."""
+        """The vertex that each unwelded vertex was welded to, ascending, and the index of each unwelded vertex."""
         order = np.argsort(self._welded_to, kind="stable")
         return self._welded_to[order], order
 
     @cached_property
     def _sides(self):
-        """Keys of the sides of all faces, ascending, and the number of each: three times its face and its corner."""
+        """Keys of the sides of all faces, ascending, and the number of each side: 3 face + corner."""
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         keys = self._side_keys(sides)
         order = np.argsort(keys, kind="stable")
@@ -226,7 +233,7 @@ class Segment:
         )
 
     def _find_welds(self, times) -> np.ndarray:
-        """The first of the vertices that are in the same place as each one at every time, shape [vertex_count]."""
+        """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
         _, places, counts = np.unique(self._start, axis=0, return_inverse=True, return_counts=True)
         places = places.reshape(-1)  # NumPy 2.0 shapes it otherwise
         (crowded,) = np.nonzero(counts[places] > 1)
@@ -250,7 +257,7 @@ class Segment:
 
 
 def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
-    """Of ranges of places all places, and of which range each is."""
+    """Returns the range that each place of some ranges is in, and all these places."""
     counts = last - first
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)

@@ -1,28 +1,40 @@
-"""Which meshes of a scene are checked, and which pairs of them."""
+"""Selects the meshes of a scene that are checked, and the pairs of them."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Protocol
 
 import numpy as np
 
-__all__ = ["PURPOSES", "Selection"]
+__all__ = ["PURPOSES", "NamedMesh", "Selection"]
 
 PURPOSES = ("default", "render", "proxy", "guide")
-"""The purposes that USD knows."""
+"""The purposes of prims in USD."""
+
+
+class NamedMesh(Protocol):
+    """A mesh as patterns see it: the path of its prim, and a name that contains the number of its instance."""
+
+    @property
+    def path(self) -> str: ...  # noqa: D102
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which meshes of a scene are checked, and which pairs of them.
+    """Selects the meshes of a scene that are checked, and the pairs of them.
 
-    Patterns are those of a shell, ``*`` standing for any part of a path. A pattern stands for the prims that it
-    matches and for all below them. Meshes are known by their paths, and those that point instancers place by their
-    names too, such as ``"/World/Leaves[3]/Leaf"``. What has both is given as an object with ``path`` and ``name``.
+    Patterns are those of a shell: ``*`` matches any part of a path. A pattern selects the prims that it matches and all
+    below them. It is matched with the paths of meshes, and with the names of meshes that point instancers place, such
+    as ``"/World/Leaves[3]/Leaf"``.
 
     Attributes:
-        prims: Patterns of the meshes that are checked; all, if there is none.
-        exclude: Patterns of meshes that are not.
+        prims: Patterns of the meshes that are checked; all if there is no pattern.
+        exclude: Patterns of the meshes that are excluded.
         self_collisions: Whether a mesh is checked with itself.
         between: Two patterns: only pairs of a mesh of the first and a mesh of the second are checked.
         purposes: Purposes of the meshes that are checked.
@@ -34,19 +46,19 @@ class Selection:
     between: tuple[str, str] | None = None
     purposes: tuple[str, ...] = ("default", "render")
 
-    def includes(self, mesh) -> bool:
-        """Whether a mesh is checked at all, its purpose aside."""
+    def includes(self, mesh: NamedMesh) -> bool:
+        """Returns whether a mesh is checked at all, whatever its purpose."""
         return (
             (not self.prims or any(_matches(mesh, pattern) for pattern in self.prims))
             and not any(_matches(mesh, pattern) for pattern in self.exclude)
             and (self.between is None or any(_matches(mesh, pattern) for pattern in self.between))
         )
 
-    def check_patterns(self, meshes):
-        """See to it that every pattern matches one of all meshes.
+    def check_patterns(self, meshes: Sequence[NamedMesh]) -> None:
+        """Checks that every pattern matches one of all meshes.
 
         Raises:
-            ValueError: If one does not.
+            ValueError: If a pattern matches none.
         """
         named = {"--prims": self.prims, "--exclude": self.exclude, "--between": self.between or ()}
         for option, patterns in named.items():
@@ -54,15 +66,15 @@ class Selection:
                 if not any(_matches(mesh, pattern) for mesh in meshes):
                     raise ValueError(f"{option} {pattern}: there is no such mesh")
 
-    def counted_pairs(self, meshes, pairs: np.ndarray) -> np.ndarray:
-        """Which pairs of meshes are checked.
+    def counted_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
+        """Returns which pairs of meshes are checked.
 
         Args:
             meshes: The meshes.
             pairs: Indices of meshes, shape [n, 2].
 
         Returns:
-            Booleans, shape [n].
+            Bool array of shape [n].
         """
         counted = np.ones(len(pairs), dtype=bool)
         if not self.self_collisions:
@@ -74,8 +86,8 @@ class Selection:
         return counted
 
 
-def _matches(mesh, pattern):
-    # No prim's path has brackets: a number in such is that of an instance, or else one of some digits.
+def _matches(mesh, pattern) -> bool:
+    # Paths of prims have no brackets: [12] is the instance 12, and, as in a shell, one of the digits 1 and 2.
     instances = re.sub(r"\[(\d+)\]", r"[[]\1]", pattern)
     return any(
         fnmatchcase(text, form) or fnmatchcase(text, form.rstrip("/") + "/*")

@@ -1,6 +1,9 @@
-"""Meshes that a skeleton deforms, as UsdSkel itself computes them. Imports pxr: to be imported where it is used."""
+"""Deforms meshes by skeletons and blend shapes, with UsdSkel. Imports pxr, which is slow: import this where used."""
 
-from pxr import Usd, UsdSkel
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+from pxr import Sdf, Usd, UsdSkel, Vt
 
 from .stage import UnreadableError, sample_times
 
@@ -8,23 +11,30 @@ __all__ = ["Skin", "find_bindings"]
 
 
 class Skin:
-    """What deforms one mesh: blend shapes, then joints.
+    """The deformation of one mesh: blend shapes, then joints.
 
     Attributes:
-        skeleton: The prim in whose space the points are when joints have moved them, None if only blend shapes do.
+        skeleton: The prim in whose space the joints put the points, None if only blend shapes deform the mesh.
         times: Time codes at which the animation has a sample.
     """
 
-    def __init__(self, skinning, skeleton, skeleton_query, where):
+    def __init__(
+        self,
+        skinning: UsdSkel.SkinningQuery,
+        skeleton: UsdSkel.Skeleton,
+        skeleton_query: UsdSkel.SkeletonQuery,
+        where: str,
+    ):
+        """Finds the animation of a binding; ``where`` is file and prim, for messages."""
         self._where = where
         self._skinning = skinning
         self._query = skeleton_query
         self._animation = skeleton_query.GetAnimQuery()
         prim = skinning.GetPrim()
-        self._blend_shapes = None
+        self._blend_shapes: UsdSkel.BlendShapeQuery | None = None
         if skinning.HasBlendShapes() and self._animation:
             self._blend_shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
-        # Not the query's, which is that of the prototype if the skeleton is in an instance.
+        # The query's own prim is that of the prototype if the skeleton is in an instance.
         self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
         self.times = set()
         if self._animation:
@@ -38,25 +48,24 @@ class Skin:
                 binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr(), binding.GetGeomBindTransformAttr()
             )
 
-    def deform(self, points, time: Usd.TimeCode):
-        """Deform points, a ``Vt.Vec3fArray``, in place.
+    def deform(self, points: Vt.Vec3fArray, time: Usd.TimeCode) -> None:
+        """Deforms points in place.
 
         Raises:
             UnreadableError: If the bindings are broken.
         """
         if self._blend_shapes:
-            self._apply_blend_shapes(points, time)
+            self._apply_blend_shapes(self._blend_shapes, points, time)
         if self.skeleton:
             transforms = self._query.ComputeSkinningTransforms(time)
             if not transforms or not self._skinning.ComputeSkinnedPoints(transforms, points, time):
                 raise UnreadableError(f"{self._where}: the binding to {self.skeleton.GetPath()} is broken")
 
-    def _apply_blend_shapes(self, points, time):
+    def _apply_blend_shapes(self, query, points, time):
         weights = self._animation.ComputeBlendShapeWeights(time)
         mapper = self._skinning.GetBlendShapeMapper()
         if mapper and not mapper.IsNull():
             weights = mapper.Remap(weights)
-        query = self._blend_shapes
         shapes = query.ComputeSubShapeWeights(weights)
         if not query.ComputeDeformedPoints(
             *shapes, query.ComputeBlendShapePointIndices(), query.ComputeSubShapePointOffsets(), points
@@ -68,14 +77,14 @@ class Skin:
             self.times.update(times)
 
 
-def find_bindings(root) -> dict:
-    """What the meshes below a ``SkelRoot`` are bound to, by their paths: the first arguments of :class:`Skin`."""
+def find_bindings(root: Usd.Prim) -> dict[Sdf.Path, tuple]:
+    """Returns the bindings of the meshes below a ``SkelRoot`` by path: the first three arguments of :class:`Skin`."""
     cache = UsdSkel.Cache()
-    root = UsdSkel.Root(root)
+    schema = UsdSkel.Root(root)
     predicate = Usd.TraverseInstanceProxies()
-    cache.Populate(root, predicate)
+    cache.Populate(schema, predicate)
     return {
         skinning.GetPrim().GetPath(): (skinning, binding.GetSkeleton(), cache.GetSkelQuery(binding.GetSkeleton()))
-        for binding in cache.ComputeSkelBindings(root, predicate)
+        for binding in cache.ComputeSkelBindings(schema, predicate)
         for skinning in binding.GetSkinningTargets()
     }

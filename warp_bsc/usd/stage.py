@@ -1,55 +1,66 @@
-"""Opens a USD file with everything that it refers to. Imports pxr: to be imported where it is used."""
+"""Opens a USD file with everything that it refers to. Imports pxr, which is slow: import this where it is used."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
 
 import contextlib
 import math
+import os
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Ar, Gf, Tf, Ts, Usd, UsdUtils
+
+if TYPE_CHECKING:
+    from .meshes import UsdMesh
 
 __all__ = ["LeftOut", "UnreadableError", "as_time_code", "collecting", "open_stage", "reading", "sample_times"]
 
 _DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
 _STILL = (Ts.ExtrapHeld, Ts.ExtrapValueBlock)
-_PROBES = 8  # parts of a piece of a spline at whose ends it is held against the straight line
-_BEND = 0.01  # most that a piece may leave the straight line, as a share of all that the spline goes through
+_PROBES = 8  # parts of a piece of a spline; at their ends the spline is compared with the straight line
+_BEND = 0.01  # largest distance of a piece from the straight line, as a share of the spline's range of values
 _MOST_HALVINGS = 10
 
 
 class UnreadableError(ValueError):
-    """Something in a scene that cannot be read.
+    """A part of a scene cannot be read.
 
     Attributes:
-        mesh: The :class:`~warp_bsc.usd.meshes.UsdMesh` that it is about, None if that is not read at all.
-        time: The scene's time code at which it cannot be read, None if at none.
+        mesh: The :class:`~warp_bsc.usd.meshes.UsdMesh` that cannot be read, None before it is constructed.
+        time: The scene's time code at which it cannot be read, None if it cannot at any time.
     """
 
-    def __init__(self, message, mesh=None, time=None):
+    def __init__(self, message: str, mesh: "UsdMesh | None" = None, time: float | None = None):
+        """Says what cannot be read, and where."""
         super().__init__(message)
         self.mesh = mesh
         self.time = time
 
 
 class LeftOut:
-    """What of a scene cannot be read, and is left out.
+    """The parts of a scene that cannot be read and are left out.
 
     Attributes:
-        is_strict: Whether nothing may be.
-        reasons: What is left out and why, a sentence each.
+        is_strict: Whether leaving out is forbidden.
+        reasons: The parts left out and why, a sentence each.
     """
 
-    def __init__(self, file, is_strict: bool):
+    def __init__(self, file: str | os.PathLike, is_strict: bool):
+        """Starts with nothing left out; sentences do not repeat the file's name."""
         self._prefix = f"{file}: "
         self.is_strict = is_strict
-        self.reasons = []
+        self.reasons: list[str] = []
 
     def add(self, error: UnreadableError, since: str = "") -> None:
-        """Leave out what an error is about.
+        """Leaves out the part that an error is about.
 
         Args:
             error: The error.
-            since: From when on, in words; empty for all of the time.
+            since: From when on, in words; empty for the whole time.
 
         Raises:
             UnreadableError: If nothing may be left out.
@@ -60,20 +71,25 @@ class LeftOut:
 
 
 @contextlib.contextmanager
-def reading(where: str, mesh=None, time: float | None = None, errors=(ValueError, *_DAMAGE)):
-    """Say of errors in damaged data, which OpenUSD raises in many types, where they are.
+def reading(
+    where: str,
+    mesh: "UsdMesh | None" = None,
+    time: float | None = None,
+    errors: tuple[type[Exception], ...] = (ValueError, *_DAMAGE),
+) -> Iterator[None]:
+    """Turns errors in damaged data, for which OpenUSD raises many types, into one that says where the damage is.
 
     Args:
         where: File and prim.
         mesh: The mesh that is read.
         time: The time code.
-        errors: Types of what is raised.
+        errors: Types of the errors that are turned into :class:`UnreadableError`.
 
     Raises:
         UnreadableError: If any of the errors is raised within.
     """
     try:
-        with np.errstate(all="ignore"):  # what is not finite is found where positions are read
+        with np.errstate(all="ignore"):  # positions that are not finite are found where they are read
             yield
     except errors as error:
         what = str(error) if isinstance(error, UnreadableError) else f"{where}: {_describe(error)}"
@@ -81,11 +97,11 @@ def reading(where: str, mesh=None, time: float | None = None, errors=(ValueError
 
 
 @contextlib.contextmanager
-def collecting(messages: list[str], file):
-    """Add to messages what OpenUSD would print on standard error, each once and in one line.
+def collecting(messages: list[str], file: str | os.PathLike) -> Iterator[None]:
+    """Appends the messages that OpenUSD would print on standard error, each once and in one line.
 
     Raises:
-        UnreadableError: If OpenUSD raises anything.
+        UnreadableError: If OpenUSD raises an error.
     """
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
@@ -96,18 +112,18 @@ def collecting(messages: list[str], file):
         messages += dict.fromkeys(text for text in texts if text not in messages)
 
 
-def open_stage(path, left_out: LeftOut) -> Usd.Stage:
-    """Open a USD file with everything that it refers to, found as OpenUSD's asset resolver finds files.
+def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
+    """Opens a USD file with everything that it refers to, found by OpenUSD's asset resolver.
 
     Args:
-        path: Its name, which may be of a file inside a package, such as ``"model.usdz[model.usda]"``, or on the
-            resolver's search path.
-        left_out: What cannot be opened is left out.
+        path: Name of the file. It may be inside a package, such as ``"model.usdz[model.usda]"``, or on the resolver's
+            search path.
+        left_out: Takes the references that cannot be opened.
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is not USD, or has no clock.
-        UnreadableError: If it refers to something that cannot be opened, which may not be left out.
+        ValueError: If it is not USD, or its time codes per second are not a positive number.
+        UnreadableError: If a reference cannot be opened and may not be left out.
     """
     resolved = str(Ar.GetResolver().Resolve(str(path)))
     if not resolved:
@@ -115,26 +131,26 @@ def open_stage(path, left_out: LeftOut) -> Usd.Stage:
     if Path(resolved).is_dir():
         raise ValueError(f"{path}: a folder, not a USD file")
 
-    with collecting([], path):  # what is printed here is among the errors below
+    with collecting([], path):  # OpenUSD prints messages here that are among the errors below
         try:
             stage = Usd.Stage.Open(str(path))
         except RuntimeError as error:
             raise ValueError(f"{path}: not a readable USD file: {_describe(error)}") from None
         for layer in stage.GetUsedLayers():
-            if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD does not come back from asking for samples
+            if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD would search for samples for ever
                 raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
     for error in stage.GetCompositionErrors():
         left_out.add(UnreadableError(f"{path}: {_one_line(str(error))}"))
     return stage
 
 
-def sample_times(*attributes) -> set[float]:
-    """Time codes at which attributes have a sample; of those only that have two or more.
+def sample_times(*attributes: Usd.Attribute) -> set[float]:
+    """Returns the time codes at which attributes have a sample, for attributes that have two or more.
 
-    A spline is sampled at its knots, and between them so that it is straight from one to the next but for a hundredth
-    of all that it goes through; beyond them, if it goes on there, as long as the stage lasts.
+    A spline is sampled at its knots, and between them until it is straight from one time to the next within a hundredth
+    of its range of values. A spline that moves beyond its knots is sampled there until the stage ends.
     """
-    times = set()
+    times: set[float] = set()
     for attribute in attributes:
         if not attribute:
             continue
@@ -145,7 +161,7 @@ def sample_times(*attributes) -> set[float]:
 
 
 def as_time_code(time: float, *, before: bool) -> Usd.TimeCode:
-    """A time, or the moment before it: where a value jumps at that time, it still is what it was."""
+    """Returns a time, or the moment just before it, at which a value that jumps at the time still is the old one."""
     return Usd.TimeCode.PreTime(time) if before else Usd.TimeCode(time)
 
 
@@ -166,7 +182,7 @@ def _spline_times(attribute) -> set[float]:
     def probe(first, last):
         inner = (first + (last - first) * part / _PROBES for part in range(1, _PROBES))
         codes = [Usd.TimeCode(first), *map(Usd.TimeCode, inner), Usd.TimeCode.PreTime(last)]
-        return np.array([attribute.Get(code) for code in codes], dtype=float)  # not a number where there is no value
+        return np.array([attribute.Get(code) for code in codes], dtype=float)  # NaN where there is no value
 
     pieces = [(first, last, probe(first, last), 0) for first, last in pairwise(sorted(times))]
     values = np.array([values for *_, values, _ in pieces])
@@ -176,7 +192,7 @@ def _spline_times(attribute) -> set[float]:
         first, last, values, halvings = pieces.pop()
         bend = np.abs(values - np.linspace(values[0], values[-1], _PROBES + 1)).max()
         if bend > most and halvings < _MOST_HALVINGS:
-            # At a whole time code, if there is one, where others are sampled as well.
+            # Split at a whole time code if there is one: other attributes are sampled there as well.
             middle = round((first + last) / 2)
             middle = float(middle) if first < middle < last else (first + last) / 2
             times.add(middle)
@@ -185,17 +201,17 @@ def _spline_times(attribute) -> set[float]:
 
 
 def _describe(error) -> str:
-    """What an exception says, in one line."""
+    """Returns the message of an exception in one line."""
     if isinstance(error, Tf.ErrorException) and error.args:
         return _commentary(error.args[0])
     return _one_line(str(error)) or type(error).__name__
 
 
 def _commentary(diagnostic) -> str:
-    """What OpenUSD says of something, in one line."""
+    """Returns the text of a diagnostic of OpenUSD in one line."""
     try:
         return _one_line(diagnostic.commentary)
-    except UnicodeError:  # it quotes what is no text
+    except UnicodeError:  # it quotes bytes that are no text
         return "there are bytes that are no text"
 
 

@@ -5,8 +5,8 @@ import numpy as np
 __all__ = ["triangulate"]
 
 
-def triangulate(counts, indices, points) -> tuple[np.ndarray, np.ndarray]:
-    """Cut polygons into triangles: convex ones as a fan from their first corner, concave ones by clipping ears.
+def triangulate(counts: np.ndarray, indices: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cuts polygons into triangles: convex ones as a fan from their first corner, concave ones by clipping ears.
 
     Args:
         counts: Number of corners of each polygon, at least 3, shape [polygon_count].
@@ -14,7 +14,7 @@ def triangulate(counts, indices, points) -> tuple[np.ndarray, np.ndarray]:
         points: Positions, shape [point_count, 3].
 
     Returns:
-        The points at the corners of each triangle, shape [triangle_count, 3], and the polygon that it is a part of,
+        The points at the corners of each triangle, shape [triangle_count, 3], and the polygon that it was cut from,
         shape [triangle_count], ascending.
     """
     starts = np.cumsum(counts) - counts
@@ -40,7 +40,7 @@ def triangulate(counts, indices, points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _clip_ears(corners, normal) -> list[tuple[int, int, int]]:
-    """Cut one concave polygon, corners of shape [size, 3] around the normal, into triangles of corner numbers."""
+    """Cuts one concave polygon, corners of shape [size, 3] around the normal, into triangles of corner indices."""
     axis = int(np.argmax(np.abs(normal)))
     plane = np.roll(corners, -axis - 1, axis=1)[:, :2]  # seen along the axis
     if normal[axis] < 0:
@@ -60,7 +60,7 @@ def _clip_ears(corners, normal) -> list[tuple[int, int, int]]:
     triangles, left = [], list(range(len(corners)))
     at = 0
     while len(left) > 2:
-        # Going on from the last ear keeps the triangles of a large polygon from all meeting in one corner.
+        # The search goes on from the last ear, so that the triangles of a large polygon do not all meet in one corner.
         turns = (number % len(left) for number in range(at, at + len(left)))
         ear = next(filter(is_ear, turns), 1)  # a polygon that crosses itself may have no ear
         triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))

@@ -1,0 +1,125 @@
+"""The interface of all files that a replay writes, and the base of those that are a list of records."""
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from typing import Protocol, TypeVar
+
+from .._atomic_file import OutputFile
+from .intervals import IntervalResult
+from .summary import Summary
+
+__all__ = ["RecordFile", "ReplayOutput", "without_last_eighth"]
+
+_Item = TypeVar("_Item")
+
+
+class ReplayOutput(Protocol):
+    """A file to which the intervals of a replay are written.
+
+    Attributes:
+        file: The file, which appears when the output is finished.
+    """
+
+    file: OutputFile
+
+    def add(self, result: IntervalResult) -> None:
+        """Adds an interval.
+
+        Raises:
+            OSError: If there is no room for it. After that the output can only be shrunk, finished or discarded.
+        """
+        ...
+
+    def finish(self, summary: Summary) -> None:
+        """Puts the file in its place.
+
+        Args:
+            summary: The whole replay. The last of its intervals may be missing in this file.
+
+        Raises:
+            OSError: If there is no room. After shrinking, finishing may be tried again.
+        """
+        ...
+
+    def shrink(self) -> bool:
+        """Makes room: drops the last eighth of the intervals. Returns whether the file becomes smaller."""
+        ...
+
+    def discard(self) -> None:
+        """Removes everything temporary, and the file unless it is finished."""
+        ...
+
+
+class RecordFile(ABC):
+    """A text file of a head, one record for each interval, and a tail: a :class:`ReplayOutput` for such formats.
+
+    Every record is in the file as a whole or not at all.
+
+    Attributes:
+        file: The file.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        """Opens the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        self.file = OutputFile(path)
+        self._ends = []  # offsets at which the head and each record end
+
+    @abstractmethod
+    def head(self) -> str:
+        """Returns the text before the first record."""
+
+    @abstractmethod
+    def record(self, result: IntervalResult) -> Iterator[str]:
+        """Yields the text of an interval in parts."""
+
+    @abstractmethod
+    def tail(self, summary: Summary) -> str:
+        """Returns the text after the last record, given a summary of the intervals that are in the file."""
+
+    @property
+    def record_count(self) -> int:
+        """Number of records in the file."""
+        return max(0, len(self._ends) - 1)
+
+    def add(self, result: IntervalResult) -> None:
+        """Appends the record of an interval."""
+        if not self._ends:
+            self._append([self.head()])
+        self._append(self.record(result))
+
+    def finish(self, summary: Summary) -> None:
+        """Appends the tail and puts the file in its place."""
+        # An interruption or a full disk may have cut what was written last.
+        del self._ends[len(summary.intervals) + 1 :]
+        self.file.truncate(self._ends[-1] if self._ends else 0)
+        if not self._ends:
+            self._append([self.head()])
+        self.file.write(self.tail(summary.first(self.record_count)))
+        self.file.commit()
+
+    def shrink(self) -> bool:
+        """Drops the last records."""
+        if not self.record_count:
+            return False
+        self._ends[1:] = without_last_eighth(self._ends[1:])
+        self.file.truncate(self._ends[-1])
+        return True
+
+    def discard(self) -> None:
+        """Removes the temporary file."""
+        self.file.discard()
+
+    def _append(self, texts: Iterable[str]) -> None:
+        for text in texts:
+            self.file.write(text)
+        self._ends.append(self.file.tell())
+
+
+def without_last_eighth(items: list[_Item]) -> list[_Item]:
+    """Returns the items without the last eighth of them, at least without the last one."""
+    return items[: len(items) - max(1, len(items) // 8)]
