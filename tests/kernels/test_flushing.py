@@ -50,6 +50,7 @@ def kernel(point):
 KERNELS = {np.float32: kernel(wp.vec3), np.float64: kernel(wp.vec3d)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_true(kind, dtype):
