@@ -32,7 +32,7 @@ _MODULES = {
     "DetectionStats": "detection.detector",
     "QueryResult": "detection.query",
     "SolverCCD": "response.solver_ccd",
-    "SolverReport": "response.solver_ccd",
+    "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
     "query_vertex_face": "detection.query",
 }

@@ -424,4 +424,4 @@ def test_a_graph_without_room_stands_still_and_says_so(device):
             break
     report = rollout.solver.report
     assert report.undetected and not report.certified
-    np.testing.assert_array_equal(end.particle_q.numpy(), response.vertices.x0.numpy())
+    np.testing.assert_array_equal(end.particle_q.numpy(), rollout.solver._motion.vertices.x0.numpy())
