@@ -155,20 +155,20 @@ def _restore_multipliers(
     motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
-    progress: Progress,
+    record: StepRecord,
     cursor: Cursor,
     multiplier: wp.array[wp.vec3d],
     sums: wp.array2d[wp.int64],
 ):
     """Restores multipliers as they were before a sweep, and the sums of what they changed."""
-    entry = entry_of(progress.record, cursor.next_sweep[0], wp.tid())
+    entry = entry_of(record, cursor.next_sweep[0], wp.tid())
     if cursor.next_sweep[0] < cursor.first_sweep[0] or entry < 0:
         return
-    i = progress.record.constraint[entry]
-    old = progress.record.multiplier[entry]
+    i = record.constraint[entry]
+    old = record.multiplier[entry]
     add_delta(motion, constraints, i, old - multiplier[i], sums)
     multiplier[i] = old
-    constraints.previous_multiplier[i] = progress.record.previous_multiplier[entry]
+    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     for j in range(4):
         wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
 
@@ -391,7 +391,6 @@ class StepAdjoint:
         self._vertex_changes = wp.empty(n, dtype=wp.vec3, device=device)
         self._progress = Progress()
         self._progress.status = name_elements(SolveStatus, wp.zeros(len(SolveStatus.vars), dtype=int, device=device))
-        self._progress.record = step.record
         self._cursor = name_elements(Cursor, wp.zeros(len(Cursor.vars), dtype=int, device=device))
         self._more_sweeps, self._more_iterations = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
 
@@ -444,7 +443,7 @@ class StepAdjoint:
         self._adjoin(
             change_velocity_multipliers,
             self._constraint_count,
-            [self._motion, self._vertices, constraints, self._progress, self._cursor, self._response.restitution],
+            [self._motion, self._vertices, constraints, self._step.record, self._cursor, self._response.restitution],
             [of_constraints.velocity_multiplier, of_constraints.previous_multiplier, self._gradients.velocity_change],
         )
         self._vertices.active.zero_()
@@ -468,11 +467,11 @@ class StepAdjoint:
         self._launch(_begin_iteration, 1, [self._step.record, self._cursor], [self._more_sweeps])
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_position_sweep)
         self._launch(_to_detection, 1, [self._cursor], [self._progress.status.iteration])
-        of_constraints, separation = self._of_constraints, self._response.separation
+        step, of_constraints, separation = self._step, self._of_constraints, self._response.separation
         self._adjoin(
             make_constraints,
             self._constraint_count,
-            [self._motion, self._vertices, self._step.constraints, self._progress, self._cursor, separation],
+            [self._motion, self._vertices, step.constraints, self._progress, step.record, self._cursor, separation],
             [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.approach],
         )
         self._launch(_end_iteration, 1, [self._cursor], [self._more_iterations])
@@ -485,7 +484,7 @@ class StepAdjoint:
         self._adjoin(
             change_position_multipliers,
             self._constraint_count,
-            [self._motion, self._vertices, constraints, self._progress, self._cursor],
+            [self._motion, self._vertices, constraints, self._progress, self._step.record, self._cursor],
             [of_constraints.position_multiplier, of_constraints.previous_multiplier, self._gradients.x1],
         )
         self._vertices.active.zero_()
@@ -496,7 +495,7 @@ class StepAdjoint:
         truncations = len(step.record.vertex)
         inputs = [vertices, self._gradients, step.record, self._cursor]
         self._launch(_restore_paths, truncations, inputs, self._of_truncations)
-        inputs = [motion, vertices, step.planes, self._progress, self._cursor, step.dt]
+        inputs = [motion, vertices, step.planes, step.record, self._cursor, step.dt]
         self._adjoin(truncate_paths, truncations, inputs, self._of_truncations)
 
     def _restore(self, kernel):
@@ -505,7 +504,7 @@ class StepAdjoint:
         self._launch(kernel, len(self._motion.x0), inputs)
 
     def _restore_multipliers(self, multiplier, sums):
-        inputs = [self._motion, self._vertices, self._constraints, self._progress, self._cursor, multiplier]
+        inputs = [self._motion, self._vertices, self._constraints, self._step.record, self._cursor, multiplier]
         self._launch(_restore_multipliers, self._constraint_count, inputs, [sums])
 
     def _launch(self, kernel, dim, inputs, outputs=()):

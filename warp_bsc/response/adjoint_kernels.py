@@ -105,6 +105,7 @@ def change_position_multipliers(
     vertices: Vertices,
     constraints: Constraints,
     progress: Progress,
+    record: StepRecord,
     cursor: Cursor,
     # out
     multiplier_changes: wp.array[wp.vec3d],
@@ -112,15 +113,15 @@ def change_position_multipliers(
     vertex_changes: wp.array[wp.vec3],
 ):
     """Computes what a sweep on positions changes, see :func:`.projection.project_positions`."""
-    entry = entry_of(progress.record, cursor.current_sweep[0], wp.tid())
+    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
-    i = progress.record.constraint[entry]
+    i = record.constraint[entry]
     multiplier = position_multiplier_after(
         motion, vertices, constraints, i, not is_reversible(constraints, progress, i)
     )
     previous = constraints.previous_multiplier[i]
-    new = with_momentum(multiplier, previous, progress.record.momentum[entry])
+    new = with_momentum(multiplier, previous, record.momentum[entry])
     change = new - constraints.position_multiplier[i]
     multiplier_changes[i] = change
     previous_changes[i] = multiplier - previous
@@ -133,7 +134,7 @@ def change_velocity_multipliers(
     motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
-    progress: Progress,
+    record: StepRecord,
     cursor: Cursor,
     restitution: wp.float64,
     # out
@@ -142,13 +143,13 @@ def change_velocity_multipliers(
     vertex_changes: wp.array[wp.vec3],
 ):
     """Computes what a sweep on velocities changes, see :func:`.projection.project_velocities`."""
-    entry = entry_of(progress.record, cursor.current_sweep[0], wp.tid())
+    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
-    i = progress.record.constraint[entry]
+    i = record.constraint[entry]
     multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
     previous = constraints.previous_multiplier[i]
-    new = with_momentum(multiplier, previous, progress.record.momentum[entry])
+    new = with_momentum(multiplier, previous, record.momentum[entry])
     change = new - constraints.velocity_multiplier[i]
     multiplier_changes[i] = change
     previous_changes[i] = multiplier - previous
@@ -271,6 +272,7 @@ def make_constraints(
     vertices: Vertices,
     constraints: Constraints,
     progress: Progress,
+    record: StepRecord,
     cursor: Cursor,
     least: wp.float64,
     # out
@@ -286,8 +288,8 @@ def make_constraints(
     iteration = cursor.iteration[0]
     i = wp.tid()
     if iteration > 0:
-        i += progress.record.constraint_offsets[iteration - 1]
-    if i >= progress.record.constraint_offsets[iteration]:
+        i += record.constraint_offsets[iteration - 1]
+    if i >= record.constraint_offsets[iteration]:
         return
     corners = constraints.vertices[i]
     kind = constraints.kind[i]
@@ -323,7 +325,7 @@ def truncate_paths(
     motion: Motion,
     vertices: Vertices,
     planes: MovingPlanes,
-    progress: Progress,
+    record: StepRecord,
     cursor: Cursor,
     dt: wp.float64,
     # out
@@ -331,7 +333,6 @@ def truncate_paths(
     velocity: wp.array[wp.vec3],
 ):
     """Computes the ends and velocities of truncated paths, see :func:`.kernels.truncate_vertices`."""
-    record = progress.record
     iteration = cursor.iteration[0]
     entry = record.truncation_offsets[iteration] + wp.tid()
     if entry >= record.truncation_offsets[iteration + 1]:

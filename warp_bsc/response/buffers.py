@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from .step_record import StepRecord
-
 __all__ = [
     "FROZEN",
     "NEVER",
@@ -103,13 +101,12 @@ class SweepStatus:
 
 @wp.struct
 class Progress:
-    """How far the response is, and the record of what it did."""
+    """How far the response to a step is."""
 
     status: SolveStatus
     sweep: SweepStatus
     max_iterations: int  # of detect and project; after them paths are truncated
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
-    record: StepRecord
 
 
 def allocate_vertices(count, device) -> Vertices:

@@ -22,21 +22,21 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.kernel(**_KERNEL)
-def drop_if_full(constraints: Constraints, progress: Progress, needed: int):
+def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
     if constraints.count[0] > constraints.vertices.shape[0] - needed:
         constraints.count[0] = 0
-        if is_recording(progress.record):
-            progress.record.counts.dropped[0] = 1
+        if is_recording(record):
+            record.counts.dropped[0] = 1
 
 
 @wp.kernel(**_KERNEL)
-def record_offsets(constraints: Constraints, progress: Progress, after: int):
+def record_offsets(constraints: Constraints, progress: Progress, record: StepRecord, after: int):
     """Records the offsets of an iteration, or those after the last; iterations that freeze share one offset."""
     last = progress.max_iterations + MAX_TRUNCATIONS + 1
     iteration = progress.status.iteration[0]
     if after == 1 or iteration <= last:
-        begin_iteration(progress.record, wp.min(iteration, last) + after, constraints.count[0])
+        begin_iteration(record, wp.min(iteration, last) + after, constraints.count[0])
 
 
 @wp.kernel(**_KERNEL)
@@ -87,6 +87,7 @@ def truncate_vertices(
     motion: Motion,
     vertices: Vertices,
     progress: Progress,
+    record: StepRecord,
     vertex_face: Contacts,
     edge_edge: Contacts,
     dt: wp.float64,
@@ -101,12 +102,12 @@ def truncate_vertices(
         return
     time = wp.float64(key >> wp.int64(32)) / TIMES
     cuts = progress.status.iteration[0] <= progress.max_iterations + MAX_TRUNCATIONS
-    if is_recording(progress.record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
+    if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
         first = int(key & wp.int64(0xFFFFFFFF))
         if first & 3 == EDGE_EDGE_CONTACT:
-            _record_truncation(vertices, progress.record, vertex, cuts, time, first, edge_edge)
+            _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
         else:
-            _record_truncation(vertices, progress.record, vertex, cuts, time, first, vertex_face)
+            _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
     if cuts:
         x0 = to_double(motion.x0[vertex])
         path = truncated_path(x0, to_double(vertices.x1[vertex]), time)

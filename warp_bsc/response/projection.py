@@ -5,7 +5,7 @@ import warp as wp
 from ..kernels.pipeline.queues import take_slot
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices
 from .constraints import gap, is_projecting, relative, to_double, to_single
-from .step_record import end_sweep, is_recording, record_entry
+from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
     "MAX_SWEEPS",
@@ -167,14 +167,14 @@ def with_momentum(multiplier: wp.vec3d, previous: wp.vec3d, momentum: wp.float64
 
 
 @wp.func
-def _finish_sweep(constraints: Constraints, progress: Progress):
+def _finish_sweep(constraints: Constraints, progress: Progress, record: StepRecord):
     """Empties the active set, and decides whether another batch of sweeps is needed."""
     sweep = progress.sweep.number[0] + 1
     active = constraints.active_count[0] > wp.int64(0)
     progress.sweep.number[0] = sweep
     progress.sweep.another[0] = wp.where(active and sweep < MAX_SWEEPS, 1, 0)
-    if is_recording(progress.record):
-        end_sweep(progress.record, int(constraints.active_count[0]))
+    if is_recording(record):
+        end_sweep(record, int(constraints.active_count[0]))
     constraints.active_count[0] = wp.int64(0)
 
 
@@ -240,7 +240,9 @@ def velocity_multiplier_after(
 
 
 @wp.kernel(**_KERNEL)
-def project_positions(motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress):
+def project_positions(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
     """Updates the position multipliers of the active set, in one Jacobi sweep.
 
     The mass of a vertex is split among its active constraints (Tonge et al. 2012), which converges, and conserves
@@ -257,8 +259,8 @@ def project_positions(motion: Motion, vertices: Vertices, constraints: Constrain
         momentum = wp.min(momentum, _PUSHING_MOMENTUM)
     old = constraints.position_multiplier[i]
     previous = constraints.previous_multiplier[i]
-    if is_recording(progress.record):
-        record_entry(progress.record, place, i, old, previous, momentum)
+    if is_recording(record):
+        record_entry(record, place, i, old, previous, momentum)
     multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
     new = with_momentum(multiplier, previous, momentum)
     constraints.previous_multiplier[i] = multiplier
@@ -267,11 +269,13 @@ def project_positions(motion: Motion, vertices: Vertices, constraints: Constrain
 
 
 @wp.kernel(**_KERNEL)
-def update_positions(motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress):
+def update_positions(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_sweep(constraints, progress)
+        _finish_sweep(constraints, progress, record)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0
@@ -344,7 +348,12 @@ def activate_velocity_constraints(
 
 @wp.kernel(**_KERNEL)
 def project_velocities(
-    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    record: StepRecord,
+    restitution: wp.float64,
 ):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep, see :func:`project_positions`."""
     place = wp.tid()
@@ -354,8 +363,8 @@ def project_velocities(
     momentum = _momentum(constraints, progress, i)
     old = constraints.velocity_multiplier[i]
     previous = constraints.previous_multiplier[i]
-    if is_recording(progress.record):
-        record_entry(progress.record, place, i, old, previous, momentum)
+    if is_recording(record):
+        record_entry(record, place, i, old, previous, momentum)
     multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
     new = with_momentum(multiplier, previous, momentum)
     constraints.previous_multiplier[i] = multiplier
@@ -364,11 +373,13 @@ def project_velocities(
 
 
 @wp.kernel(**_KERNEL)
-def update_velocities(motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress):
+def update_velocities(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_sweep(constraints, progress)
+        _finish_sweep(constraints, progress, record)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0

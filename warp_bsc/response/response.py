@@ -148,13 +148,13 @@ class Response:
         """
         self._motion, self._recorder = motion, record
         wanted, vertices = motion.vertices, self.vertices
-        self._progress.record = StepRecord()
+        self._record = StepRecord()  # which records nothing
         if record is not None:
             if not self.device.is_capturing:
                 record.reserve_entries(_MIN_ENTRIES)
             elif not len(record.record.constraint):
                 raise RuntimeError("step once on a tape before capturing, so that there is room to record steps")
-            self._progress.record = record.begin()
+            self._record = record.begin()
         wp.copy(vertices.x1, wanted.x1)
         wp.copy(vertices.velocity, wanted.velocity)
         self._status_values.zero_()
@@ -206,13 +206,16 @@ class Response:
     def _record_offsets(self, after=0):
         """Records, if the step is recorded, where an iteration begins or where the last ended."""
         if self._recorder is not None:
-            wp.launch(record_offsets, 1, inputs=[self.constraints, self._progress, after], device=self.device)
+            wp.launch(
+                record_offsets, 1, inputs=[self.constraints, self._progress, self._record, after], device=self.device
+            )
 
     def _sweep_positions(self):
         """Sweeps over the constraints on positions once."""
         constraints = self.constraints
         inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
         self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
+        inputs.append(self._record)
         self._launch_over(project_positions, constraints.active_set, constraints.active_count, 0, inputs)
         self._launch_over_particles(update_positions, inputs)
 
@@ -221,12 +224,12 @@ class Response:
         constraints = self.constraints
         inputs = [self._motion.vertices, self.vertices, constraints]
         self._launch_over_constraints(activate_velocity_constraints, [*inputs, self.restitution, self._tolerance, dt])
-        inputs = [*inputs, self._progress, self.restitution]
+        inputs = [*inputs, self._progress, self._record, self.restitution]
         self._launch_over(project_velocities, constraints.active_set, constraints.active_count, 0, inputs)
         self._update_velocities()
 
     def _update_velocities(self):
-        inputs = [self._motion.vertices, self.vertices, self.constraints, self._progress]
+        inputs = [self._motion.vertices, self.vertices, self.constraints, self._progress, self._record]
         self._launch_over_particles(update_velocities, inputs)
 
     def _project(self, sweep, **options):
@@ -244,7 +247,7 @@ class Response:
         """Makes room to record sweeps, if the step is recorded; a CUDA graph keeps the room that it has."""
         if self._recorder is not None and not self.device.is_capturing:
             entries = sweeps * int(self.constraints.count.numpy()[0])
-            self._progress.record = self._recorder.reserve_entries(entries)
+            self._record = self._recorder.reserve_entries(entries)
 
     def _start_sweeps(self):
         self._sweep_values.zero_()
@@ -266,8 +269,8 @@ class Response:
         self._record_offsets()
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
-            self._progress.record = self._recorder.reserve_truncations(self._movable)
-        inputs = [self._motion.vertices, self.vertices, self._progress, *self._contacts(), dt]
+            self._record = self._recorder.reserve_truncations(self._movable)
+        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, *self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._detect(refit=True)
 
@@ -282,13 +285,13 @@ class Response:
                 break
         vertices.changed.zero_()
         self._reserve(self._most_contacts)
-        inputs = [self.constraints, progress, self._most_contacts]
+        inputs = [self.constraints, self._record, self._most_contacts]
         wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
         for contacts in self._contacts():
             inputs = [motion, vertices, contacts, self.constraints, progress, self.separation]
             self._launch_over(collect_contacts, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
             if self._recorder is not None:
-                inputs = [motion, vertices, contacts, progress.record]
+                inputs = [motion, vertices, contacts, self._record]
                 self._launch_over(count_grazing, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
