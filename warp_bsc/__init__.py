@@ -25,6 +25,7 @@ if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
+    "CapturedSteps": "response.captured_steps",
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
@@ -38,6 +39,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "CapturedSteps",
     "CollisionArrays",
     "CollisionDetector",
     "CollisionMesh",

@@ -425,3 +425,31 @@ def test_a_graph_without_room_stands_still_and_says_so(device):
     report = rollout.solver.report
     assert report.undetected and not report.certified
     np.testing.assert_array_equal(end.particle_q.numpy(), rollout.solver._motion.vertices.x0.numpy())
+
+
+def test_captured_steps_make_the_room_that_a_graph_lacks(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
+
+    def frame(rollout):
+        for start, end in (rollout.states, rollout.states[::-1]):
+            start.clear_forces()
+            rollout.solver.step(start, end, rollout.control, None, DT)
+
+    steps = bsc.CapturedSteps(lambda: frame(captured), captured.solver, [captured.states[0]])
+    steps()
+    response = captured.solver._response
+    response.detector._vertex_face._reserve_contacts(1)
+    response.detector.capacities.assign(response.detector._room())
+    steps._capture()
+    frame(plain)
+    for _ in range(5):
+        frame(plain)
+        steps()
+        assert plain.positions.tobytes() == captured.positions.tobytes()
+        assert plain.velocities.tobytes() == captured.velocities.tobytes()
+    assert steps.retaken > 0
+    report = captured.solver.report
+    assert (report.steps, report.undetected_steps, report.uncertified_steps) == (12, 0, 0)
