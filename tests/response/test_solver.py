@@ -169,7 +169,7 @@ def test_without_collisions_nothing_changes(inner, device):
         assert staged.velocities.tobytes() == wanted[1].tobytes()
 
 
-def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
+def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch):
     """Six patches in a pile fall on a box, all at one speed: only the lowest has a contact at first."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
@@ -186,9 +186,9 @@ def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
         assert (np.diff(heights.mean(axis=1), prepend=0.0) > 0.0).all()
         return rollout.solver.report.rounds
 
-    with_near_pairs = rounds()
+    with_proximities = rounds()
     monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
-    assert 0 < with_near_pairs <= 3 < rounds()
+    assert 0 < with_proximities <= 3 < rounds()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])

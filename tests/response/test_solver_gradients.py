@@ -315,8 +315,8 @@ def test_gradient_in_a_cuda_graph(device):
     assert scene.solver.report.lost_gradients == 0
 
 
-def test_a_step_that_was_not_all_taken_down_gives_nan(device):
-    """As happens in a CUDA graph that has too little room."""
+def test_an_incomplete_record_gives_nan(device):
+    """As in a CUDA graph whose buffers are too small."""
     scene = Throw(device, friction=0.3, steps=1)
     scene.velocity.assign(np.float32([[0.0, 0.0, -9.0]]))
     scene.backward()

@@ -281,7 +281,7 @@ def _check_complete(constraints: wp.array[int], record: StepRecord, capacity: in
 
 
 class RecordedStep:
-    """A copy of a step for its adjoint: its record and results, or as much as a CUDA graph has room for.
+    """A copy of a step for its adjoint: its record and results, as far as they fit in the buffers of a CUDA graph.
 
     Attributes:
         dt: Length of the step [s].

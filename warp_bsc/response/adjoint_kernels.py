@@ -40,7 +40,7 @@ from .projection import (
     with_momentum,
 )
 from .proximities import closest_vector
-from .step_record import STOOD_STILL, StepRecord
+from .step_record import NO_CONTACT, StepRecord
 
 __all__ = [
     "Cursor",
@@ -306,8 +306,8 @@ def make_constraints(
         weight = contact_weights(edges, impact.coordinates)
         normal = impact.normal
         if constraints.slow[i] == 1:
-            asked = widened(least, progress)
-            separation = feasible_in_contact(motion, corners, weight, normal, asked, least)
+            target = widened(least, progress)
+            separation = feasible_in_contact(motion, corners, weight, normal, target, least)
     elif kind > PLANE_CONTACT:
         weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
         distance = wp.length(between)
@@ -345,7 +345,7 @@ def truncate_paths(
         before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
         after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
         toi = time_of_entry(before, after)
-    elif kind != STOOD_STILL:
+    elif kind != NO_CONTACT:
         corners = record.contact[entry]
         toi = _impact(
             motion,

@@ -1,4 +1,4 @@
-"""Steps that run from a CUDA graph, and outside it where the graph has too little room for what it finds."""
+"""Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 from collections.abc import Callable, Sequence
 
@@ -66,7 +66,7 @@ class CapturedSteps:
             self._graph = capture.graph
 
     def _launch(self):
-        """Launches the graph; returns whether it had room for all that it found, else restores the state."""
+        """Launches the graph; if its buffers were too small, restores the state and returns False."""
         if self._report is None:
             wp.capture_launch(self._graph)
             return True
@@ -82,5 +82,5 @@ class CapturedSteps:
         return False
 
     def _count_lost(self):
-        """Returns the steps so far that a graph may have had too little room for."""
+        """Returns the steps so far for which the buffers of a graph may have been too small."""
         return self._report.undetected_steps + self._report.lost_gradients

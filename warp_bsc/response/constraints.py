@@ -14,7 +14,7 @@ __all__ = [
     "MAX_ITERATIONS",
     "MAX_TRUNCATIONS",
     "PLANE_CONTACT",
-    "TIMES",
+    "TIME_UNITS",
     "VERTEX_FACE_CONTACT",
     "VERTEX_FACE_PROXIMITY",
     "Contacts",
@@ -48,7 +48,7 @@ VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, PLANE_CONTACT, VERTEX_FACE_PROXIMITY, ED
 )
 """Kinds of constraints: contacts of a vertex and a face, of two edges, of a vertex and a plane; proximities of both."""
 
-TIMES = wp.constant(wp.float64(2.0**30))
+TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
 _SHARE = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes."""
@@ -115,7 +115,7 @@ def update_first_contact(vertices: Vertices, vertex: int, time: wp.float64, kind
 
     Keys order contacts by time in their upper 32 bits, then by contact.
     """
-    key = (wp.int64(wp.floor(TIMES * time)) << wp.int64(32)) | wp.int64(4 * i + kind)
+    key = (wp.int64(wp.floor(TIME_UNITS * time)) << wp.int64(32)) | wp.int64(4 * i + kind)
     wp.atomic_min(vertices.first_contact, vertex, key)
 
 
@@ -171,9 +171,9 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 
 
 @wp.func
-def feasible(asked: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
+def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    return wp.min(asked, wp.max(start, wp.min(separation, start + _RECOVERY * path)))
+    return wp.min(target, wp.max(start, wp.min(separation, start + _RECOVERY * path)))
 
 
 @wp.func
@@ -182,12 +182,12 @@ def feasible_in_contact(
     corners: wp.vec4i,
     weights: wp.vec4d,
     normal: wp.vec3d,
-    asked: wp.float64,
+    target: wp.float64,
     separation: wp.float64,
 ) -> wp.float64:
-    """Returns the separation for a contact of slow elements, where fast ones get ``asked``."""
+    """Returns the separation for a contact of slow elements, where fast ones get ``target`` [m]."""
     start = wp.dot(normal, relative(weights, corners, motion.x0))
-    return feasible(asked, start, separation, longest_path(motion, corners))
+    return feasible(target, start, separation, longest_path(motion, corners))
 
 
 @wp.func
@@ -286,10 +286,10 @@ def collect_contacts(
         friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
         weights = contact_weights(contacts.edges, contacts.coordinates[i])
         normal = contacts.normal[i]
-        asked = widened(separation, progress)
+        target = widened(separation, progress)
         slow = is_slow(motion, corners, contacts.edges)
         if slow == 1:
-            asked = feasible_in_contact(motion, corners, weights, normal, asked, separation)
+            target = feasible_in_contact(motion, corners, weights, normal, target, separation)
         kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
         add_constraint(
             motion,
@@ -298,7 +298,7 @@ def collect_contacts(
             corners,
             weights,
             normal,
-            asked,
+            target,
             friction,
             slow,
             kind,

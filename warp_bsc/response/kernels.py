@@ -7,14 +7,14 @@ from .constraints import (
     EDGE_EDGE_CONTACT,
     MAX_TRUNCATIONS,
     PLANE_CONTACT,
-    TIMES,
+    TIME_UNITS,
     Contacts,
     contact_vertices,
     to_double,
     to_single,
     truncated_path,
 )
-from .step_record import STOOD_STILL, StepRecord, begin_iteration, is_recording
+from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = ["decide", "drop_if_full", "freeze_undetected", "record_offsets", "truncate_vertices"]
 
@@ -69,12 +69,12 @@ def _record_truncation(
         return
     record.vertex[entry] = vertex
     record.end[entry] = vertices.x1[vertex]
-    kind = wp.where(cuts, first & 3, STOOD_STILL)
+    kind = wp.where(cuts, first & 3, NO_CONTACT)
     i = first >> 2
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
     record.toi[entry] = time
-    if kind != PLANE_CONTACT and kind != STOOD_STILL:
+    if kind != PLANE_CONTACT and kind != NO_CONTACT:
         record.contact[entry] = contact_vertices(contacts, i)
         record.localized[entry] = contacts.localized[i]
         record.toi[entry] = contacts.toi[i]
@@ -100,7 +100,7 @@ def truncate_vertices(
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
         return
-    time = wp.float64(key >> wp.int64(32)) / TIMES
+    time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
     cuts = progress.status.iteration[0] <= progress.max_iterations + MAX_TRUNCATIONS
     if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
         first = int(key & wp.int64(0xFFFFFFFF))
@@ -125,7 +125,7 @@ def truncate_vertices(
 
 @wp.kernel(**_KERNEL)
 def freeze_undetected(motion: Motion, vertices: Vertices, progress: Progress):
-    """Freezes all vertices if a detection was incomplete: positions were not finite, or a graph had no room."""
+    """Freezes all vertices if a detection was incomplete: positions were not finite, or a buffer overflowed."""
     vertex = wp.tid()
     if progress.status.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = motion.x0[vertex]

@@ -258,11 +258,10 @@ def project_positions(
     if pushes_only:
         momentum = wp.min(momentum, _PUSHING_MOMENTUM)
     old = constraints.position_multiplier[i]
-    previous = constraints.previous_multiplier[i]
     if is_recording(record):
-        record_entry(record, place, i, old, previous, momentum)
+        record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
     multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
-    new = with_momentum(multiplier, previous, momentum)
+    new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
     constraints.previous_multiplier[i] = multiplier
     constraints.position_multiplier[i] = new
     add_delta(motion, constraints, i, new - old, vertices.particle_delta_x)
@@ -362,11 +361,10 @@ def project_velocities(
     i = constraints.active_set[place]
     momentum = _momentum(constraints, progress, i)
     old = constraints.velocity_multiplier[i]
-    previous = constraints.previous_multiplier[i]
     if is_recording(record):
-        record_entry(record, place, i, old, previous, momentum)
+        record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
     multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
-    new = with_momentum(multiplier, previous, momentum)
+    new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
     constraints.previous_multiplier[i] = multiplier
     constraints.velocity_multiplier[i] = new
     add_delta(motion, constraints, i, new - old, vertices.particle_delta_v)

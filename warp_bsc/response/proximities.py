@@ -106,10 +106,10 @@ def collect_proximities(
     if distance == _ZERO or distance > wp.max(path, _REACH * separation):
         return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
-    asked = feasible(separation, distance, separation, path)
+    target = feasible(separation, distance, separation, path)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     normal = between / distance
-    add_constraint(motion, vertices, constraints, corners, weights, normal, asked, friction, 1, kind, True, _ZERO)
+    add_constraint(motion, vertices, constraints, corners, weights, normal, target, friction, 1, kind, True, _ZERO)
 
 
 @wp.kernel(**_KERNEL)

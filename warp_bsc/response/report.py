@@ -54,7 +54,8 @@ class SolverReport:
     def undetected(self) -> bool:
         """Whether the last step froze all vertices because its detection was incomplete.
 
-        Positions were not finite, or a CUDA graph had too little room: see :class:`.captured_steps.CapturedSteps`.
+        Positions were not finite, or the buffers of a CUDA graph were too small, see
+        :class:`.captured_steps.CapturedSteps`.
         """
         return bool(_read(self._response.status.undetected))
 
@@ -131,7 +132,7 @@ class SolverReport:
 
     @property
     def lost_gradients(self) -> int:
-        """Steps so far on a tape, in a CUDA graph, that had too little room for their record.
+        """Steps so far on a tape, in a CUDA graph, whose record did not fit in its buffers.
 
         Gradients through such a step are NaN: see :class:`.captured_steps.CapturedSteps`.
         """

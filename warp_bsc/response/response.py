@@ -117,7 +117,7 @@ class Response:
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self._most_penetrations = self._movable * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
-        self.constraints = self._with_room(0)
+        self.constraints = allocate_constraints(0, device)
         self._retired = []
 
     @property
@@ -130,18 +130,18 @@ class Response:
         self._progress.max_iterations = value
 
     def prepare(self, motion: ModelMotion) -> None:
-        """Resolves a motion to allocate what a CUDA graph cannot: the hierarchy, and some room; clears the status."""
+        """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
         self.resolve(motion, 1.0)
         self._status_values.zero_()
         self.vertices.outcome.zero_()
 
     def resolve(self, motion: ModelMotion, dt: float, record: StepRecorder | None = None) -> Resolution:
-        """Returns the motion without the contacts, or with those only that cannot be resolved.
+        """Returns the motion without its contacts, except for those that cannot be resolved.
 
         Args:
             motion: The motion that is wanted; it is only read.
             dt: Length of the step [s].
-            record: Where to record what is done, for the adjoint.
+            record: Records the step for its adjoint; None to record nothing.
 
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
@@ -153,7 +153,7 @@ class Response:
             if not self.device.is_capturing:
                 record.reserve_entries(_MIN_ENTRIES)
             elif not len(record.record.constraint):
-                raise RuntimeError("step once on a tape before capturing, so that there is room to record steps")
+                raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             self._record = record.begin()
         wp.copy(vertices.x1, wanted.x1)
         wp.copy(vertices.velocity, wanted.velocity)
@@ -163,7 +163,7 @@ class Response:
         for array in (vertices.particle_delta_x, vertices.particle_delta_v, vertices.outcome, vertices.changed):
             array.zero_()
         vertices.first_contact.fill_(int(NEVER))
-        if self._most_penetrations:  # vertices that only lie on a plane need no second detection
+        if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
             self._collect_penetrations(ahead=True)
             self._record_offsets()
@@ -244,7 +244,7 @@ class Response:
         wp.capture_while(self._sweep.another, batch)
 
     def _reserve_entries(self, sweeps):
-        """Makes room to record sweeps, if the step is recorded; a CUDA graph keeps the room that it has."""
+        """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
         if self._recorder is not None and not self.device.is_capturing:
             entries = sweeps * int(self.constraints.count.numpy()[0])
             self._record = self._recorder.reserve_entries(entries)
@@ -318,25 +318,21 @@ class Response:
         """Most contacts that a detection finds with its queues as they are."""
         return self._most_penetrations + sum(len(n.unsorted.pairs) for n in self.detector.narrow_phases)
 
-    def _with_room(self, room):
-        """Returns constraints, none yet."""
-        return allocate_constraints(room, self.device)
-
     def _reserve(self, needed):
-        """Makes room for more constraints, and as many in later iterations; a CUDA graph keeps the room that it has."""
+        """Reserves ``needed`` more constraints, and as many for later iterations; does nothing in a CUDA graph."""
         old = self.constraints
         if self.device.is_capturing:
             return
         filled = int(old.count.numpy()[0])
         if len(old.vertices) < filled + needed:
-            self.constraints = new = self._with_room(filled + _ITERATIONS_RESERVED * needed)
+            self.constraints = new = allocate_constraints(filled + _ITERATIONS_RESERVED * needed, self.device)
             for name in Constraints.vars if filled else ():
                 array = getattr(old, name)
                 wp.copy(getattr(new, name), array, count=min(filled, len(array)))
             self._retired.append(old)  # a CUDA graph may still write to it
 
     def _reserve_near(self):
-        """Removes the proximities and makes room for them if they did not fit, and returns whether. Synchronizes."""
+        """Removes the proximities and reserves capacity if they did not fit; returns whether. Synchronizes."""
         kept, found = (int(count.numpy()[0]) for count in (self._kept, self.constraints.count))
         if found + self._most_contacts <= len(self.constraints.vertices):
             return False

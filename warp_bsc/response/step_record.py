@@ -4,10 +4,10 @@ import warp as wp
 
 __all__ = [
     "MAX_OFFSETS",
+    "NO_CONTACT",
     "OFFSETS",
     "PER_ENTRY",
     "PER_TRUNCATION",
-    "STOOD_STILL",
     "RecordCounts",
     "StepRecord",
     "StepRecorder",
@@ -18,8 +18,8 @@ __all__ = [
     "record_entry",
 ]
 
-STOOD_STILL = wp.constant(-1)
-"""The kind of contact of a vertex that is left where it was."""
+NO_CONTACT = wp.constant(-1)
+"""The kind of contact of a path that was not truncated before a contact: its vertex was frozen."""
 
 MAX_OFFSETS = wp.constant(64)
 """Capacity of the offsets, one for each iteration of detect and project."""
@@ -56,7 +56,7 @@ class StepRecord:
     truncation_offsets: wp.array[int]  # truncated paths at the beginning of an iteration
     vertex: wp.array[int]  # of a truncated path
     end: wp.array[wp.vec3]  # of the path before it was truncated [m]
-    kind: wp.array[int]  # of the contact that it was truncated before, or STOOD_STILL
+    kind: wp.array[int]  # of the contact that it was truncated before, or NO_CONTACT
     contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a plane
     localized: wp.array[wp.bool]
     toi: wp.array[wp.float64]
@@ -146,11 +146,11 @@ class StepRecorder:
         return self.record
 
     def reserve_entries(self, more: int) -> StepRecord:
-        """Makes room for ``more`` entries, and returns the record. Synchronizes with the device."""
+        """Reserves ``more`` entries, and returns the record. Synchronizes with the device."""
         return self._reserve(PER_ENTRY, self.record.counts.entries, more)
 
     def reserve_truncations(self, more: int) -> StepRecord:
-        """Makes room for ``more`` truncated paths, and returns the record. Synchronizes with the device."""
+        """Reserves ``more`` truncated paths, and returns the record. Synchronizes with the device."""
         return self._reserve(PER_TRUNCATION, self.record.counts.truncations, more)
 
     def _reserve(self, names, count, more):
