@@ -25,11 +25,12 @@ if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
+    "CapturedCollisions": "detection.collisions",
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
-    "Collisions": "detection.detector",
-    "DetectionStats": "detection.detector",
+    "Collisions": "detection.collisions",
+    "DetectionStats": "detection.collisions",
     "QueryResult": "detection.query",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.solver_ccd",
@@ -38,6 +39,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "CapturedCollisions",
     "CollisionArrays",
     "CollisionDetector",
     "CollisionMesh",

@@ -5,7 +5,7 @@ Their adjoints are what :mod:`.adjoint` launches; what they do is done by the mo
 
 import warp as wp
 
-from ..detection.narrow_phase import TOLERANCE, Count
+from ..detection.settings import TOLERANCE, Count
 from ..kernels.gradients import with_gradients
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..detection.narrow_phase import Count
+from ..detection.settings import Count
 from ..kernels.closest import closest_coordinates
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import is_filled
@@ -24,7 +24,7 @@ from .constraints import (
 
 __all__ = ["NearPairs", "closest_weights", "collect_near_pairs", "forget_near_pairs"]
 
-_NEAR = wp.constant(int(Count.NEAR))
+_QUEUED = wp.constant(int(Count.QUEUED))
 _REACH = wp.constant(wp.float64(1.5))
 """Within how many separations pairs are near, whatever they do: neighbours in a stack."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -81,7 +81,7 @@ def collect_near_pairs(
     within both elements are taken, because elsewhere they soon are those of other elements.
     """
     i = wp.tid()
-    if not is_filled(i, near.pairs, near.counts, _NEAR):
+    if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
     if wp.min(corners) >= vertices.movable or not is_projecting(progress, vertices.world[corners[0]]):

@@ -8,6 +8,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from ..detection.host_function import run_on_host
+from ..detection.intersections import find_intersections
 from .adjoint import Recording, Undoing
 from .constraints import CERTIFIED, FIRST_HITS, REMAINING, ROUND, UNDETECTED
 from .model_mesh import ModelMesh
@@ -147,7 +148,7 @@ class SolverReport:
         when asked, by exact arithmetic.
         """
         mesh, particles = self._mesh, self._mesh.model.particle_count
-        pairs = self._response.detector.find_intersections(self._response.vertices.x0)
+        pairs = find_intersections(self._response.detector.mesh, self._response.vertices.x0)
         of_particles = [(elements < particles).any(axis=1) for elements in (mesh.edges, mesh.faces)]
         return pairs[of_particles[0][pairs[:, 0]] | of_particles[1][pairs[:, 1]]]
 
