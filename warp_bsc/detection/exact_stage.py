@@ -14,10 +14,9 @@ import warp as wp
 from ..kernels.closest import contact_at
 from ..kernels.exact.decision import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
-from ..kernels.motion import double, edge_edge_motion, vertex_face_motion
+from ..kernels.motion import double, relative_motion
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
-from ..kernels.polynomials import VERTEX_FACE
 from ..kernels.signs import FREE, HIT
 from ..kernels.time_of_impact import LEAST_DIGITS
 from .contact_buffer import ContactBuffer
@@ -31,17 +30,6 @@ __all__ = ["launch_exact_stage"]
 def _kernel(dtype: type, limbs: int) -> wp.Kernel:
     """The kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)
-
-    @wp.func
-    def motion_of(kind: int, x0: wp.array[dtype], x1: wp.array[dtype], v: wp.vec4i):
-        roundoff = wp.float64(0.0)
-        if kind == VERTEX_FACE:
-            return vertex_face_motion(
-                x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]], roundoff
-            )
-        return edge_edge_motion(
-            x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]], roundoff
-        )
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def decide_contacts(
@@ -95,7 +83,19 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
             if timed:
                 # where floating point has given up is a lower bound too
                 time = wp.max(time, contacts.toi[i])
-                at, direction = contact_at(motion_of(kind, x0, x1, v), time)
+                motion = relative_motion(
+                    kind,
+                    x0[v[0]],
+                    x0[v[1]],
+                    x0[v[2]],
+                    x0[v[3]],
+                    x1[v[0]],
+                    x1[v[1]],
+                    x1[v[2]],
+                    x1[v[3]],
+                    wp.float64(0.0),
+                )
+                at, direction = contact_at(motion, time)
                 contacts.within_tolerance[i] = True
                 contacts.toi[i] = time
                 contacts.coordinates[i] = at

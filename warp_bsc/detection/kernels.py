@@ -13,7 +13,7 @@ from ..kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import coplanarity
@@ -46,6 +46,7 @@ class PairKernels(NamedTuple):
 @functools.cache
 def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
     """Returns the kernels for one kind of pair and one type of position, each in a module of its own."""
+    kind_number = int(kind)
     vertex_face = kind == PairKind.VERTEX_FACE
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
@@ -74,8 +75,9 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         roundoff: wp.float64,
         # in
         queue: wp.array[wp.vec2i],
-        # out
+        # in and out
         counts: wp.array[wp.int64],
+        # out
         survivors: wp.array[wp.vec2i],
     ):
         i = first + wp.tid()
@@ -107,8 +109,9 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         roundoff: wp.float64,
         # in
         queue: wp.array[wp.vec2i],
-        # out
+        # in and out
         counts: wp.array[wp.int64],
+        # out
         survivors: wp.array[wp.vec2i],
     ):
         i = BATCH * (first + wp.tid())
@@ -129,8 +132,9 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         roundoff: wp.float64,
         # in
         survivors: wp.array[wp.vec2i],
-        # out
+        # in and out
         counts: wp.array[wp.int64],
+        # out
         contacts: ContactBuffer,
     ):
         i = first + wp.tid()
@@ -139,7 +143,7 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         pair = survivors[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+        motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         status = classify(motion, coplanarity(motion))
         if status != FREE:
             slot = take_slot(counts, _CONTACTS)
@@ -180,7 +184,7 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         if timed or status != HIT:
             a0, b0, c0, d0 = four_points(x0, elements, pair)
             a1, b1, c1, d1 = four_points(x1, elements, pair)
-            motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             result = impact(motion, coplanarity(motion), status, tolerance)
             status = result.status
             contacts.status[i] = wp.int8(status)
@@ -213,7 +217,7 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         i = wp.tid()
         a0, b0, c0, d0 = four_points(x0, elements, pairs[i])
         a1, b1, c1, d1 = four_points(x1, elements, pairs[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+        motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         at, direction = contact_at(motion, toi[i])
         coordinates[i] = at
         normal[i] = direction
