@@ -2,6 +2,9 @@
 
 ``ccd_vertex_face`` and ``ccd_edge_edge`` answer FREE, HIT or UNSURE; ``impact_vertex_face`` and
 ``impact_edge_edge`` find the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``.
+Answers are certain whatever the options of the module that calls them, ``fast_math`` among them, and where a processor
+is told to take subnormal numbers for zero, as long as it rounds to nearest.
+
 The other modules hold one idea of the method each.
 """
 

@@ -80,7 +80,7 @@ def _size(x0: wp.vec3d, x1: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _motion(
+def _scaled(
     kind: int,
     roundoff: wp.float64,
     u0: wp.vec3d,
@@ -89,8 +89,8 @@ def _motion(
     v1: wp.vec3d,
     w0: wp.vec3d,
     w1: wp.vec3d,
-):
-    """Relative motion and its size, the motion scaled by a power of two, which is exact, to coordinates below 2.
+) -> Motion:
+    """Relative motion, scaled by a power of two, which is exact, to coordinates below 2.
 
     It is zero, which nothing can certify, where its size, its largest coordinate, is zero or out of range.
 
@@ -105,8 +105,9 @@ def _motion(
     v_size = _size(v0, v1)
     w_size = _size(w0, w1)
     size = wp.max(wp.max(u_size, wp.max(v_size, w_size)))
+    motion.size = size
     if not (size >= _SMALLEST and size < _LARGEST):
-        return motion, size
+        return motion
     scale = inverse_power_of_two(size)
     motion.u0 = scale * u0
     motion.u1 = scale * u1
@@ -118,7 +119,7 @@ def _motion(
     motion.v_size = scale * v_size
     motion.w_size = scale * w_size
     motion.scale = scale
-    return motion, size
+    return motion
 
 
 @wp.func
@@ -161,28 +162,8 @@ def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def _scale_of_rescaled(scale: wp.float64, size: wp.float64) -> wp.float64:
-    """The scale of a motion of rescaled points; 0 where gradients would be out of range."""
-    return wp.where(size > _SMALLEST_WITH_GRADIENT and size < _ONE, _LIFT * scale, _ZERO)
-
-
-@wp.func
-def _vertex_face(
-    p0: wp.vec3d,
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    p1: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    roundoff: wp.float64,
-):
-    return _motion(VERTEX_FACE, roundoff, b0 - a0, b1 - a1, c0 - a0, c1 - a1, p0 - a0, p1 - a1)
-
-
-@wp.func
-def _edge_edge(
+def _motion_of_kind(
+    kind: int,
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
@@ -192,63 +173,58 @@ def _edge_edge(
     c1: wp.vec3d,
     d1: wp.vec3d,
     roundoff: wp.float64,
-):
-    return _motion(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
+) -> Motion:
+    if kind == VERTEX_FACE:
+        return _scaled(VERTEX_FACE, roundoff, c0 - b0, c1 - b1, d0 - b0, d1 - b1, a0 - b0, a1 - b1)
+    return _scaled(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
 
 
 @wp.func
 def vertex_face_motion(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of a vertex and a triangle; of finite coordinates only."""
+    """Relative motion of a vertex and a triangle; of finite coordinates only.
+
+    It is zero, so that no cull decides it, where :func:`relative_motion` would take points in another scale, for which
+    culls have no registers.
+    """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    motion, size = _vertex_face(p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
-    if _out_of_range(p0, size):
-        motion, _ = _vertex_face(
-            _rescaled(p, size),
-            _rescaled(a, size),
-            _rescaled(b, size),
-            _rescaled(c, size),
-            _rescaled(to_p, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            roundoff,
-        )
-        motion.scale = _scale_of_rescaled(motion.scale, size)
-    return motion
+    return _motion_of_kind(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
 
 
 @wp.func
 def edge_edge_motion(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of two edges; of finite coordinates only."""
+    """Relative motion of two edges, as :func:`vertex_face_motion` has it."""
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    motion, size = _edge_edge(a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
-    if _out_of_range(a0, size):
-        motion, _ = _edge_edge(
-            _rescaled(a, size),
-            _rescaled(b, size),
-            _rescaled(c, size),
-            _rescaled(d, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            _rescaled(to_d, size),
-            roundoff,
-        )
-        motion.scale = _scale_of_rescaled(motion.scale, size)
-    return motion
+    return _motion_of_kind(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
 
 
 @wp.func
 def relative_motion(
     kind: int, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of a query of either kind, in the order of its points; of finite coordinates only."""
-    if kind == VERTEX_FACE:
-        return vertex_face_motion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-    return edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+    """Relative motion of a query of either kind, at any scale, points in its order; of finite coordinates only."""
+    from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
+    size = motion.size
+    if _out_of_range(a0, size):
+        motion = _motion_of_kind(
+            kind,
+            _rescaled(from_a, size),
+            _rescaled(from_b, size),
+            _rescaled(from_c, size),
+            _rescaled(from_d, size),
+            _rescaled(to_a, size),
+            _rescaled(to_b, size),
+            _rescaled(to_c, size),
+            _rescaled(to_d, size),
+            roundoff,
+        )
+        in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
+        motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
+    return motion

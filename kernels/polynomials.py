@@ -54,6 +54,7 @@ class Motion:
     w_size: wp.vec3d
     kind: int  # VERTEX_FACE or EDGE_EDGE
     roundoff: wp.float64  # ROUNDOFF, or 0 for the signs that floating point computes
+    size: wp.float64  # the largest coordinate before that
     scale: wp.float64  # by which coordinates are scaled, a power of two; 0 where gradients are out of its range
 
 

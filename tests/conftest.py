@@ -27,9 +27,14 @@ def pytest_configure(config):
         wp.config.mode = "debug"
 
 
+def _find_device():
+    """The device that all tests run on: ``WARP_BSC_DEVICE``, or Warp's default."""
+    return wp.get_device(os.environ.get("WARP_BSC_DEVICE") or wp.get_preferred_device())
+
+
 def pytest_collection_modifyitems(items):
-    """Skips the tests that need a GPU where there is none."""
-    if not wp.is_cuda_available():
+    """Skips the tests that need a GPU where they would run on another device."""
+    if not _find_device().is_cuda:
         for item in items:
             if item.get_closest_marker("gpu"):
                 item.add_marker(pytest.mark.skip(reason="needs a GPU"))
@@ -37,6 +42,6 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def device():
-    """The device that all tests run on: ``WARP_BSC_DEVICE``, or Warp's default."""
-    wp.set_device(os.environ.get("WARP_BSC_DEVICE") or wp.get_preferred_device())
+    """The device that all tests run on."""
+    wp.set_device(_find_device())
     return wp.get_device()

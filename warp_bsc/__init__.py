@@ -25,12 +25,13 @@ if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
+    "CapturedCollisions": "detection.collisions",
     "CapturedSteps": "response.captured_steps",
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
-    "Collisions": "detection.detector",
-    "DetectionStats": "detection.detector",
+    "Collisions": "detection.collisions",
+    "DetectionStats": "detection.collisions",
     "QueryResult": "detection.query",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
@@ -39,6 +40,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "CapturedCollisions",
     "CapturedSteps",
     "CollisionArrays",
     "CollisionDetector",

@@ -23,9 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..detection.contact_buffer import ContactBuffer
 from ..detection.exact_stage import launch_exact_stage
 from ..detection.launch import launch_over, launch_over_queue
-from ..detection.narrow_phase import TOLERANCE
+from ..detection.settings import TOLERANCE, PairKind
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
@@ -414,17 +415,19 @@ class MethodRun:
             kernels["subdivide"], self._open, counts, _Count.OPEN, inputs=inputs, outputs=outputs, block_dim=32
         )
         if self.method == "exact":
+            contacts = ContactBuffer()
+            contacts.pairs, contacts.decided = arrays[3], self.status
             launch_exact_stage(
-                queries.kind,
+                PairKind[queries.kind.upper()],
                 *arrays[:3],
                 timed=False,
                 tolerance=TOLERANCE,
                 queues=self._unsure,
                 counts=counts,
-                asked=int(_Count.UNSURE),
-                too_wide=[int(_Count.WIDE), int(_Count.WIDER), int(_Count.WIDEST)],
-                refuted=int(_Count.REFUTED),
-                contacts=[arrays[3], self.status, *[None] * 4],
+                filled=_Count.UNSURE,
+                too_wide=[_Count.WIDE, _Count.WIDER, _Count.WIDEST],
+                refuted=_Count.REFUTED,
+                contacts=contacts,
                 keys=self._keys,
                 last_key=0,
             )

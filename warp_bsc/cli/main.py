@@ -19,8 +19,8 @@ from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
 from ..bench.scenes import default_scenes, load_scene
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
-from ..detection.narrow_phase import METHODS
 from ..detection.query import query_edge_edge, query_vertex_face
+from ..detection.settings import METHODS
 from .bench_paper import add_paper_options, run_paper_benchmarks
 from .error_boundary import run_guarded
 from .query_file import KINDS, find_query_files, read_query_file

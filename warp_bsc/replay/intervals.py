@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.detector import CollisionDetector, DetectionStats
+from ..detection.collisions import DetectionStats
+from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..usd.scene import Scene
 from .scene_contacts import Contacts, find_contacts

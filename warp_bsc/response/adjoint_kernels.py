@@ -5,7 +5,7 @@ Each computes what a kernel of the forward pass changes, by the same functions.
 
 import warp as wp
 
-from ..detection.narrow_phase import TOLERANCE, Count
+from ..detection.settings import TOLERANCE, Count
 from ..kernels.gradients import with_gradients
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..detection.narrow_phase import Count
+from ..detection.settings import Count
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..detection.narrow_phase import Count
+from ..detection.settings import Count
 from ..kernels.closest import closest_coordinates
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import is_filled
@@ -22,7 +22,7 @@ from .constraints import (
 
 __all__ = ["Proximities", "closest_vector", "collect_proximities", "drop_proximities"]
 
-_NEAR = wp.constant(int(Count.NEAR))
+_QUEUED = wp.constant(int(Count.QUEUED))
 _REACH = wp.constant(wp.float64(1.5))
 """Distance in separations up to which pairs are proximities even if they stand still: neighbours in a stack."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -91,7 +91,7 @@ def collect_proximities(
     whose closest points are within both elements are used, because others soon are those of other elements.
     """
     i = wp.tid()
-    if not is_filled(i, near.pairs, near.counts, _NEAR):
+    if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
     if wp.min(corners) >= motion.movable or not is_projecting(progress, motion.world[corners[0]]):

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ..detection.intersections import find_intersections
 from .buffers import FROZEN, TRUNCATED
 from .model_motion import ModelMotion
 from .response import Response
@@ -83,7 +84,7 @@ class SolverReport:
         """
         mesh = self._response.detector.mesh
         particles = mesh.model.particle_count
-        pairs = self._response.detector.find_intersections(self._motion.vertices.x0)
+        pairs = find_intersections(mesh, self._motion.vertices.x0)
         of_particles = [(elements < particles).any(axis=1) for elements in (mesh.edges, mesh.faces)]
         return pairs[of_particles[0][pairs[:, 0]] | of_particles[1][pairs[:, 1]]]
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.detector import CollisionDetector
-from ..detection.narrow_phase import Count, roomy
+from ..detection.launch import retry_until_fits
+from ..detection.pipeline import DetectionPipeline
+from ..detection.settings import Count, PairKind, capacity_for
 from .adjoint_kernels import count_grazing
 from .angular_momentum import SUMS, sum_moments, sum_torques, turn_vertices
 from .buffers import (
@@ -96,7 +97,7 @@ class Response:
             tolerance: Tolerance of constraints, as a share of the separation.
         """
         self.device = device = mesh.device
-        self.detector = CollisionDetector(mesh)
+        self.detector = DetectionPipeline(mesh)
         self.separation, self.restitution = separation, restitution
         self._tolerance = tolerance * separation
         self.worlds = max(1, mesh.model.world_count)
@@ -186,21 +187,19 @@ class Response:
     def _collect_near_pairs(self):
         """Adds constraints for proximities, in worlds that have contacts."""
         detector, motion, vertices = self.detector, self._motion.vertices, self.vertices
-        while True:
-            narrow_phases = detector.find_candidates()
-            if self.device.is_capturing or not detector.grow():
-                break
+        retry_until_fits(detector.find_candidates, detector, self.device)
         wp.copy(self._kept, self.constraints.count)
-        while True:
-            for narrow_phase, elements in self._with_elements(narrow_phases):
+
+        def collect() -> None:
+            for narrow_phase, elements in self._with_elements():
                 near = Proximities()
-                near.edges = int(narrow_phase.kind == "edge_edge")
-                near.elements, near.pairs, near.counts = elements, narrow_phase.near, narrow_phase.counts
+                near.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
+                near.elements, near.pairs, near.counts = elements, narrow_phase.queue, narrow_phase.counts
                 inputs = [motion, vertices, near, self.constraints, self._progress, self.separation]
-                self._launch_over(collect_proximities, near.pairs, near.counts, Count.NEAR, inputs)
-            if self.device.is_capturing or not self._reserve_near():
-                break
-        inputs = [self.constraints, self._kept, self._most_contacts, detector.counts, detector.capacities]
+                self._launch_over(collect_proximities, near.pairs, near.counts, Count.QUEUED, inputs)
+
+        retry_until_fits(collect, self, self.device)
+        inputs = [self.constraints, self._kept, self._most_contacts, detector.counters.array, detector.capacities]
         wp.launch(drop_proximities, 1, inputs=inputs, device=self.device)
 
     def _record_offsets(self, after=0):
@@ -279,10 +278,11 @@ class Response:
         detector, motion, vertices = self.detector, self._motion.vertices, self.vertices
         progress = self._progress
         changed = vertices.changed if refit else None
-        while True:
-            detector.find_contacts(motion.x0, vertices.x1, refit=refit, changed=changed)
-            if self.device.is_capturing or not detector.grow():
-                break
+        retry_until_fits(
+            lambda: detector.find_contacts(motion.x0, vertices.x1, refit=refit, changed=changed),
+            detector,
+            self.device,
+        )
         vertices.changed.zero_()
         self._reserve(self._most_contacts)
         inputs = [self.constraints, self._record, self._most_contacts]
@@ -295,28 +295,27 @@ class Response:
                 self._launch_over(count_grazing, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
-        wp.launch(decide, 1, inputs=[progress, detector.counts, detector.capacities], device=self.device)
+        wp.launch(decide, 1, inputs=[progress, detector.counters.array, detector.capacities], device=self.device)
 
     def _contacts(self):
         """Yields the contacts that the last detection found, vertex-face and edge-edge."""
-        for narrow_phase, elements in self._with_elements(self.detector.narrow_phases):
-            found = narrow_phase.unsorted
+        for narrow_phase, elements in self._with_elements():
+            found = narrow_phase.contacts
             contacts = Contacts()
-            contacts.edges = int(narrow_phase.kind == "edge_edge")
+            contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
             contacts.elements, contacts.counts = elements, narrow_phase.counts
-            contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.localized
+            contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.within_tolerance
             contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
             yield contacts
 
-    def _with_elements(self, narrow_phases):
+    def _with_elements(self):
         """Returns each narrow phase with the vertices of its second elements."""
-        mesh = self.detector.mesh
-        return zip(narrow_phases, (mesh.device_faces, mesh.device_edges), strict=True)
+        return ((n, self.detector.mesh.device_elements(n.kind)) for n in self.detector.narrow_phases)
 
     @property
     def _most_contacts(self):
         """Most contacts that a detection finds with its queues as they are."""
-        return self._most_penetrations + sum(len(n.unsorted.pairs) for n in self.detector.narrow_phases)
+        return self._most_penetrations + sum(len(n.contacts.pairs) for n in self.detector.narrow_phases)
 
     def _reserve(self, needed):
         """Reserves ``needed`` more constraints, and as many for later iterations; does nothing in a CUDA graph."""
@@ -331,13 +330,13 @@ class Response:
                 wp.copy(getattr(new, name), array, count=min(filled, len(array)))
             self._retired.append(old)  # a CUDA graph may still write to it
 
-    def _reserve_near(self):
-        """Removes the proximities and reserves capacity if they did not fit; returns whether. Synchronizes."""
+    def grow(self) -> bool:
+        """Enlarges the constraints, without the proximities, if those did not fit; returns whether. Synchronizes."""
         kept, found = (int(count.numpy()[0]) for count in (self._kept, self.constraints.count))
         if found + self._most_contacts <= len(self.constraints.vertices):
             return False
         wp.copy(self.constraints.count, self._kept)
-        self._reserve(self._most_contacts + roomy(found - kept))
+        self._reserve(self._most_contacts + capacity_for(found - kept, "proximities"))
         return True
 
     def _launch_over(self, kernel, queue, counts, count, inputs):
