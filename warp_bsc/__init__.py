@@ -25,15 +25,17 @@ if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
 
 _MODULES = {
+    "CapturedCollisions": "detection.collisions",
+    "CapturedSteps": "response.captured_steps",
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
-    "Collisions": "detection.detector",
-    "DetectionStats": "detection.detector",
+    "Collisions": "detection.collisions",
+    "DetectionStats": "detection.collisions",
     "QueryResult": "detection.query",
     "Scene": "usd.scene",
     "SolverCCD": "response.solver_ccd",
-    "SolverReport": "response.solver_ccd",
+    "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
     "query_vertex_face": "detection.query",
@@ -41,6 +43,8 @@ _MODULES = {
 }
 
 __all__ = [
+    "CapturedCollisions",
+    "CapturedSteps",
     "CollisionArrays",
     "CollisionDetector",
     "CollisionMesh",

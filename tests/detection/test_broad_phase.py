@@ -7,15 +7,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import warp_bsc as bsc
-from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
-from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
-from warp_bsc.detection.narrow_phase import Count
+from warp_bsc.detection.broad_phase_bvh import BroadPhaseBvh
+from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.settings import Count
 
 
 def find_pairs(broad_phase, mesh, x0, x1):
     """Counts and pairs of each kind, and the (edge, face) pairs at the start."""
     device = mesh.device
-    if broad_phase is BlockBroadPhase and device.is_cuda:
+    if broad_phase is BroadPhaseSimd and device.is_cuda:
         pytest.skip("blocks are for the CPU")
     dtype = wp.vec3 if x0.dtype == np.float32 else wp.vec3d
     x0, x1 = (wp.array(x, dtype=dtype, device=device) for x in (x0, x1))
@@ -29,7 +29,7 @@ def find_pairs(broad_phase, mesh, x0, x1):
     own_count.zero_()
     finder.pair_edges_with_faces(x0, counts[2], queues[2])
     counts = counts.numpy()
-    found = [queue.numpy()[: count[Count.NEAR]] for queue, count in zip(queues, counts, strict=True)]
+    found = [queue.numpy()[: count[Count.QUEUED]] for queue, count in zip(queues, counts, strict=True)]
     return counts[:2, Count.CANDIDATES].tolist(), [sorted(map(tuple, pairs.tolist())) for pairs in found]
 
 
@@ -58,7 +58,7 @@ def all_pairs(mesh, x0, x1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("broad_phase", [BlockBroadPhase, BvhBroadPhase])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @given(
     faces=st.integers(1, 90),
@@ -85,7 +85,7 @@ def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat,
     assert find_pairs(broad_phase, mesh, x0, x1) == all_pairs(mesh, x0, x1)
 
 
-@pytest.mark.parametrize("broad_phase", [BlockBroadPhase, BvhBroadPhase])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
 def test_trees_of_several_levels(broad_phase):
     """A strip long enough for four levels of blocks, whose pairs are known by counting."""
     n = 6000

@@ -1,5 +1,7 @@
 """Meshes and the collision detector: all pairs by brute force, known scenes, the same answer always, bad input."""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,20 +11,24 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.broad_phase_bvh import BvhBroadPhase
-from warp_bsc.detection.broad_phase_simd import BlockBroadPhase
-from warp_bsc.detection.narrow_phase import Count
+from warp_bsc.detection.broad_phase_bvh import BroadPhaseBvh
+from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.intersections import find_intersections
+from warp_bsc.detection.launch import retry_until_fits
+from warp_bsc.detection.pipeline import DetectionPipeline
+from warp_bsc.detection.settings import Count
 from warp_bsc.kernels.signs import FREE
 
 METHODS = ("float", "conservative", "exact")
 
 
-@pytest.fixture(params=[BlockBroadPhase, BvhBroadPhase], ids=["blocks", "bvh"])
+@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseBvh], ids=["blocks", "bvh"])
 def broad_phase(request, monkeypatch, device):
     """Both broad phases where both run, whatever the detector would choose."""
-    if device.is_cuda and request.param is BlockBroadPhase:
+    if device.is_cuda and request.param is BroadPhaseSimd:
         pytest.skip("blocks are for the CPU")
-    monkeypatch.setattr("warp_bsc.detection.detector._broad_phase", request.param)
+    chosen = "BroadPhaseSimd" if device.is_cpu else "BroadPhaseBvh"
+    monkeypatch.setattr(f"warp_bsc.detection.broad_phase.{chosen}", request.param)
     return request.param
 
 
@@ -240,7 +246,7 @@ def test_vertices_that_no_face_uses_take_no_part(value, on_device, broad_phase):
     """Wherever they are, if anywhere; where one that takes part is not finite, it is named, and not they."""
     x0, x1, faces = crumpled(0)
     expected = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0))).detect(x0, x1)
-    crossing = bsc.CollisionDetector(expected._detector.mesh).find_intersections(x0)
+    crossing = find_intersections(bsc.CollisionMesh(faces, len(x0)), x0)
     assert len(expected.vertex_face) and len(expected.edge_edge)
     x0, x1 = (np.concatenate([[[value] * 3], x, [[0.0, value, -value]]]).astype(np.float32) for x in (x0, x1))
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces + 1, len(x0)))
@@ -276,13 +282,14 @@ def test_queues_with_room_for_one_entry_grow(broad_phase):
     expected = bsc.CollisionDetector(mesh).detect(x0, x1)
     assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
     detector = bsc.CollisionDetector(mesh)
-    assert bool(detector._broad_phase.queues) == (broad_phase is BvhBroadPhase)
-    if detector._broad_phase.queues:
-        detector._broad_phase.queues = [wp.empty(1, dtype=wp.vec2i)]
-    for narrow_phase in (detector._vertex_face, detector._edge_edge):
-        narrow_phase.near = wp.empty(1, dtype=wp.vec2i)
-        narrow_phase._reserve_survivors(1)
-        narrow_phase._reserve_contacts(1)
+    pipeline = detector._pipeline
+    assert bool(pipeline._broad_phase.buffers) == (broad_phase is BroadPhaseBvh)
+    if broad_phase is BroadPhaseBvh:
+        pipeline._broad_phase._face_pairs = wp.empty(1, dtype=wp.vec2i)
+    for narrow_phase in pipeline.narrow_phases:
+        narrow_phase.queue = wp.empty(1, dtype=wp.vec2i)
+        narrow_phase._allocate_survivors(1)
+        narrow_phase._allocate_contacts(1)
     c = detector.detect(x0, x1)
     assert_same(c, expected)
     assert c.certified and not c.overflowed
@@ -293,8 +300,8 @@ def found_pairs(narrow_phases):
     found = []
     for narrow_phase in narrow_phases:
         count = int(narrow_phase.counts.numpy()[Count.CONTACTS])
-        real = narrow_phase.unsorted.status.numpy()[:count] != FREE
-        found.append({tuple(pair) for pair in narrow_phase.unsorted.pairs.numpy()[:count][real].tolist()})
+        real = narrow_phase.contacts.status.numpy()[:count] != FREE
+        found.append({tuple(pair) for pair in narrow_phase.contacts.pairs.numpy()[:count][real].tolist()})
     return found
 
 
@@ -302,18 +309,22 @@ def test_of_what_has_changed_all_contacts_are_found_again(broad_phase, device):
     """Pairs of which no vertex has changed may be left out, and all that is found is right."""
     x0, x1, faces = crumpled(1)
     mesh = bsc.CollisionMesh(faces, len(x0), device=device)
-    detector = bsc.CollisionDetector(mesh)
-    detector.detect(x0, x1)  # makes room
+    pipeline = DetectionPipeline(mesh)
+
+    def find(*positions, **options):
+        retry_until_fits(lambda: pipeline.find_contacts(*positions, **options), pipeline, device)
+        return found_pairs(pipeline.narrow_phases)
+
     random = np.random.default_rng(0)
     for share in (0.0, 0.02, 0.3, 1.0):
         moved = random.random(len(x0)) < share
         after = x1 + (0.002 * moved[:, None] * random.standard_normal(x1.shape)).astype(np.float32)
         start, first, second = (wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1, after))
-        everything = found_pairs(detector.find_contacts(start, second))
-        detector.find_contacts(start, first)
+        everything = find(start, second)
+        find(start, first)
         changed = wp.array(moved, dtype=int, device=device)
-        again = found_pairs(detector.find_contacts(start, second, refit=True, changed=changed))
-        candidates = sum(int(n.counts.numpy()[Count.CANDIDATES]) for n in detector.narrow_phases)
+        again = find(start, second, refit=True, changed=changed)
+        candidates = sum(int(n.counts.numpy()[Count.CANDIDATES]) for n in pipeline.narrow_phases)
         assert (share == 0.0) == (candidates == 0)
         for full, part, (one, other) in zip(
             everything, again, ((mesh.vertices[:, None], mesh.faces), (mesh.edges, mesh.edges)), strict=True
@@ -327,17 +338,12 @@ def test_all_overlapping_pairs_can_be_had(broad_phase, device):
     """Those as well that an axis separates, and as many as were counted."""
     x0, x1, faces = crumpled(2)
     mesh = bsc.CollisionMesh(faces, len(x0), device=device)
-    detector = bsc.CollisionDetector(mesh)
+    pipeline = DetectionPipeline(mesh)
     positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
-    detector.find_contacts(*positions)
-    while detector.grow():
-        detector.find_contacts(*positions)
-    while True:
-        counts = [narrow_phase.counts.numpy().copy() for narrow_phase in detector.find_candidates()]
-        if not detector.grow():
-            break
-    for kind_counts in counts:
-        assert kind_counts[Count.NEAR] == kind_counts[Count.CANDIDATES] > 0
+    retry_until_fits(lambda: pipeline.find_contacts(*positions), pipeline, device)
+    retry_until_fits(pipeline.find_candidates, pipeline, device)
+    for counts in (pipeline.counts.vertex_face, pipeline.counts.edge_edge):
+        assert counts.queued == counts.candidates > 0
 
 
 def test_every_pair_a_candidate(broad_phase):
@@ -406,35 +412,37 @@ def test_a_graph_finds_what_a_detection_finds(captured):
         expected = on_cpu.detect(x0, x1)
         for _ in range(34):
             replay()
-            assert_same(c, expected)
-        assert c.certified and not c.overflowed
+            assert_same(c.read(), expected)
+        assert c.read().certified and not c.read().overflowed
 
 
 @pytest.mark.gpu
 def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured):
     detector, c, _, end, replay = captured
     replay()
-    expected = c.edge_edge.tolist()
+    expected = c.read().edge_edge.tolist()
     assert len(detector.find_intersections(end))
-    assert c.edge_edge.tolist() == expected
+    assert c.read().edge_edge.tolist() == expected
 
 
 @pytest.mark.gpu
 def test_a_graph_says_that_a_queue_was_too_small(captured):
     detector, _, start, end, _ = captured
-    detector._edge_edge._reserve_contacts(1)
+    detector._pipeline.edge_edge._allocate_contacts(1)
     with wp.ScopedCapture(device="cuda:0") as capture:
         c = detector.detect(start, end)
     wp.capture_launch(capture.graph)
-    assert c.overflowed and not c.certified
+    assert c.read().overflowed and not c.read().certified
+    (overflow,) = c.read().overflows
+    assert re.fullmatch("edge_edge contacts: [0-9]+ do not fit in the capacity 1", overflow)
     assert detector.detect(start, end).certified  # grows
     wp.capture_launch(capture.graph)  # writes to the queues that it was captured with
     with pytest.raises(RuntimeError, match="capture again"):
-        c.certified  # noqa: B018
+        c.read()
     with wp.ScopedCapture(device="cuda:0") as capture:
         c = detector.detect(start, end)
     wp.capture_launch(capture.graph)
-    assert c.certified and not c.overflowed
+    assert c.read().certified and not c.read().overflowed
 
 
 @pytest.mark.gpu
@@ -444,7 +452,7 @@ def test_a_graph_says_that_a_position_is_not_finite(captured):
     positions[7, 1] = np.nan
     end.assign(positions)
     replay()
-    assert not c.certified
+    assert not c.read().certified
 
 
 @pytest.mark.gpu
@@ -461,7 +469,7 @@ def test_two_detectors_on_two_streams(captured):
     _, c, start, end, replay = captured
     x0, _, faces = crumpled(3)
     replay()
-    expected = c.vertex_face.tolist()
+    expected = c.read().vertex_face.tolist()
     streams = [wp.Stream("cuda:0"), wp.Stream("cuda:0")]
     detectors = [bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")) for _ in streams]
     results = []

@@ -176,7 +176,7 @@ def test_a_graph_decides_all_but_what_is_too_wide(device):
         for array, positions in zip((x0, x1), passing(size, -(2.0**-53)), strict=True):
             array.assign(positions)
         wp.capture_launch(capture.graph)
-        assert (c.vertex_face.tolist(), c.certified) == ([[3, 0]] * hits, certified)
+        assert (c.read().vertex_face.tolist(), c.read().certified) == ([[3, 0]] * hits, certified)
 
 
 # --- Widths ---

@@ -119,12 +119,12 @@ def test_a_detection_reads_the_positions_of_the_replay(dtype):
     with wp.ScopedCapture(CPU) as capture:
         collisions = detector.detect(x0, x1)
     with pytest.raises(RuntimeError, match="not been launched"):
-        _ = collisions.vertex_face
+        collisions.read()
     for end, expected in ((START, []), (END, [[3, 0], [4, 0], [5, 0]]), (START, [])):
         x1.assign(end.astype(dtype))
         wp.capture_launch(capture.graph)
-        assert collisions.vertex_face.tolist() == expected
-        assert collisions.certified
+        assert collisions.read().vertex_face.tolist() == expected
+        assert collisions.read().certified
 
 
 def test_queues_grow_in_a_replay():
@@ -141,6 +141,7 @@ def test_queues_grow_in_a_replay():
     x0.assign(start)
     x1.assign(end)
     wp.capture_launch(capture.graph)
+    collisions = collisions.read()
     expected = bsc.CollisionDetector(detector.mesh).detect(start, end)
     assert len(expected.edge_edge) > 2 * len(faces)
     np.testing.assert_array_equal(collisions.vertex_face, expected.vertex_face)
@@ -190,6 +191,60 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
         assert (solver.report.steps, solver.report.uncertified_steps) == (8, 0)
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy(), reports])
     assert np.max(reports, axis=0)[1] > 1
+    for actual, expected in zip(*ends, strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+@wp.kernel(enable_backward=False)
+def _run_out_of_room(
+    replays: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    undetected_steps: wp.array[int],
+    lost_gradients: wp.array[int],
+):
+    replay = replays[0]
+    replays[0] = replay + 1
+    if replay == 2 or replay == 4:
+        particle_q[0] = wp.vec3(1.0, 2.0, 3.0)
+    if replay == 2:
+        undetected_steps[0] = undetected_steps[0] + 1
+    if replay == 4:
+        lost_gradients[0] = lost_gradients[0] + 1
+
+
+class CapturedOnCpu(bsc.CapturedSteps):
+    """Captures on the CPU as well."""
+
+    def _capture(self):
+        self._graph = captured(self._steps)
+
+
+def test_a_replay_without_room_is_taken_back():
+    ends, retaken = [], []
+    for runner in (CapturedOnCpu, bsc.CapturedSteps):
+        model = bullet(60.0, device=CPU)
+        solver = bsc.SolverCCD(SOLVERS["xpbd"](model))
+        states, control = (model.state(), model.state()), model.control()
+        replays = wp.zeros(1, dtype=int, device=CPU)
+
+        def step(solver=solver, states=states, control=control, replays=replays):
+            start, end = states
+            start.clear_forces()
+            solver.step(start, end, control, None, DT)
+            start.assign(end)
+            if CPU.is_capturing:
+                totals = solver.report._totals
+                outputs = [replays, start.particle_q, totals.undetected_steps, totals.lost_gradients]
+                wp.launch(_run_out_of_room, 1, outputs=outputs, device=CPU)
+
+        steps = runner(step, solver, [states[0]])
+        for _ in range(7):
+            steps()
+        ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
+        retaken.append((steps.retaken, int(replays.numpy()[0])))
+        report = solver.report
+        assert (report.steps, report.undetected_steps, report.lost_gradients, report.uncertified_steps) == (7, 0, 0, 0)
+    assert retaken == [(2, 6), (0, 0)]  # the first run is outside the graph
     for actual, expected in zip(*ends, strict=True):
         np.testing.assert_array_equal(actual, expected)
 

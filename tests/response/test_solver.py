@@ -169,7 +169,7 @@ def test_without_collisions_nothing_changes(inner, device):
         assert staged.velocities.tobytes() == wanted[1].tobytes()
 
 
-def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
+def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch):
     """Six patches in a pile fall on a box, all at one speed: only the lowest has a contact at first."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
@@ -186,9 +186,9 @@ def test_what_is_near_saves_a_pile_a_round_for_each_layer(device, monkeypatch):
         assert (np.diff(heights.mean(axis=1), prepend=0.0) > 0.0).all()
         return rollout.solver.report.rounds
 
-    with_near_pairs = rounds()
+    with_proximities = rounds()
     monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
-    assert 0 < with_near_pairs <= 3 < rounds()
+    assert 0 < with_proximities <= 3 < rounds()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
@@ -405,14 +405,19 @@ def test_positions_that_are_not_finite_leave_everything_standing(device):
     assert (end.particle_qd.numpy() == 0.0).all()
 
 
+def leave_capacity_for_one_contact(detector):
+    """Makes a detection whose buffers cannot grow overflow as soon as two vertex-face contacts are found."""
+    detector.vertex_face._allocate_contacts(1)
+    detector.capacities = detector._device_capacities()
+
+
 def test_a_graph_without_room_stands_still_and_says_so(device):
     if not device.is_cuda or not wp.is_conditional_graph_supported():
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
     response = rollout.solver._response
-    response.detector._vertex_face._reserve_contacts(1)
-    response.detector.capacities.assign(response.detector._room())
+    leave_capacity_for_one_contact(response.detector)
     start, end = rollout.states
     with wp.ScopedCapture(device) as capture:
         rollout.solver.step(start, end, rollout.control, None, DT)
@@ -424,4 +429,30 @@ def test_a_graph_without_room_stands_still_and_says_so(device):
             break
     report = rollout.solver.report
     assert report.undetected and not report.certified
-    np.testing.assert_array_equal(end.particle_q.numpy(), response.vertices.x0.numpy())
+    np.testing.assert_array_equal(end.particle_q.numpy(), rollout.solver._motion.vertices.x0.numpy())
+
+
+def test_captured_steps_make_the_room_that_a_graph_lacks(device):
+    if not device.is_cuda or not wp.is_conditional_graph_supported():
+        pytest.skip("needs a GPU with conditional nodes")
+    model = bullet(60.0, device=device)
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
+
+    def frame(rollout):
+        for start, end in (rollout.states, rollout.states[::-1]):
+            start.clear_forces()
+            rollout.solver.step(start, end, rollout.control, None, DT)
+
+    steps = bsc.CapturedSteps(lambda: frame(captured), captured.solver, [captured.states[0]])
+    steps()
+    leave_capacity_for_one_contact(captured.solver._response.detector)
+    steps._capture()
+    frame(plain)
+    for _ in range(5):
+        frame(plain)
+        steps()
+        assert plain.positions.tobytes() == captured.positions.tobytes()
+        assert plain.velocities.tobytes() == captured.velocities.tobytes()
+    assert steps.retaken > 0
+    report = captured.solver.report
+    assert (report.steps, report.undetected_steps, report.uncertified_steps) == (12, 0, 0)

@@ -9,7 +9,8 @@ import pytest
 import warp as wp
 
 import warp_bsc as bsc
-from warp_bsc.response.adjoint import Recording, Undoing
+from warp_bsc.response.adjoint import RecordedStep, StepAdjoint
+from warp_bsc.response.response import Resolution
 
 DT = 1.0 / 600.0
 STEPS = 40
@@ -65,7 +66,7 @@ class Throw:
         model.particle_grid = None
         self.solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False), **options)
         if projections is not None:
-            self.solver._response.projections = projections
+            self.solver._response.max_iterations = projections
         self.states = [model.state() for _ in range(steps + 1)]
         self.control = model.control()
         self.velocity = wp.zeros(1, dtype=wp.vec3, device=device, requires_grad=requires_grad)
@@ -191,7 +192,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(motion, friction, res
         builder.add_ground_plane()
     model = builder.finalize(device=device, requires_grad=True)
     solver = bsc.SolverCCD(Still(model), friction=friction, restitution=restitution)
-    solver._response.projections = projections
+    solver._response.max_iterations = projections
     random = np.random.default_rng(0)
     n, dt = len(start), 0.01
     first = [np.array(start), wanted, (wanted - start) / dt + random.normal(scale=0.1, size=(n, 3))]
@@ -314,18 +315,20 @@ def test_gradient_in_a_cuda_graph(device):
     assert scene.solver.report.lost_gradients == 0
 
 
-def test_a_step_that_was_not_all_taken_down_gives_nan(device):
-    """As happens in a CUDA graph that has too little room."""
+def test_an_incomplete_record_gives_nan(device):
+    """As in a CUDA graph whose buffers are too small."""
     scene = Throw(device, friction=0.3, steps=1)
     scene.velocity.assign(np.float32([[0.0, 0.0, -9.0]]))
     scene.backward()
-    response = scene.solver._response
-    recording = Recording(response, DT)
+    solver = scene.solver
+    response = solver._response
+    resolution = Resolution(response.vertices, response.constraints, response.status, response._status_values)
+    recorded = RecordedStep(solver._motion, resolution, solver._recorder, DT)
     arrays = [wp.zeros(scene.model.particle_count, dtype=wp.vec3, device=device) for _ in range(3)]
-    Undoing(recording, response).backward(*arrays)
+    StepAdjoint(recorded, response).backward(*arrays)
     assert all(np.isfinite(array.numpy()).all() for array in arrays)
-    recording.complete.zero_()
-    for name in ("constraint", "multiplier", "reached", "momentum"):  # nothing may be read where nothing is
-        setattr(recording.history, name, getattr(recording.history, name)[:1])
-    Undoing(recording, response).backward(*arrays)
+    recorded.complete.zero_()
+    for name in ("constraint", "multiplier", "previous_multiplier", "momentum"):  # nothing may be read out of bounds
+        setattr(recorded.record, name, getattr(recorded.record, name)[:1])
+    StepAdjoint(recorded, response).backward(*arrays)
     assert all(np.isnan(array.numpy()).all() for array in arrays)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.detector import CollisionDetector, DetectionStats, StageCounts
+from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from .scenes import BenchmarkScene
@@ -138,9 +139,10 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     """Median time of a replay of the detection as a CUDA graph [ms]."""
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
-        collisions = detector.detect(x0, x1)
+        captured = detector.detect(x0, x1)
     assert capture.graph
     milliseconds = replay_graph(capture.graph, device, replays=_GRAPH_REPLAYS)
-    if (collisions.stats.vertex_face, collisions.stats.edge_edge) != (stats.vertex_face, stats.edge_edge):
+    found = captured.read().stats
+    if (found.vertex_face, found.edge_edge) != (stats.vertex_face, stats.edge_edge):
         raise RuntimeError("the CUDA graph found other pairs than the detection outside it")
     return milliseconds

@@ -28,10 +28,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch_over, launch_over_queue
-from ..detection.narrow_phase import METHODS as NARROW_PHASE_METHODS
-from ..detection.narrow_phase import TOLERANCE, Count, NarrowPhase
+from ..detection.launch import launch_over, launch_over_queue, retry_until_fits
+from ..detection.narrow_phase import NarrowPhase
 from ..detection.query_points import query_points
+from ..detection.settings import METHODS as NARROW_PHASE_METHODS
+from ..detection.settings import TOLERANCE, Count, PairCounts, PairKind
+from ..detection.stage_timer import StageTimer
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
@@ -304,17 +306,11 @@ class MethodRun:
         x0, _, elements, pairs = queries.arrays
         first_elements = len(x0) if queries.kind == "vertex_face" else len(elements)
         self._counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
-        self._start_counts = wp.array(
-            [n if count == Count.NEAR else 0 for count in Count], dtype=wp.int64, device=device
-        )
-        self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(elements)))
-        wp.copy(self._narrow_phase.near, pairs)
-        while True:
-            self.launch()
-            counts = self._counts.numpy()
-            if not self._narrow_phase.overflowed(counts):
-                break
-            self._narrow_phase.grow(counts)
+        self._start_counts = wp.array(PairCounts(queued=n).values(), dtype=wp.int64, device=device)
+        kind = PairKind[queries.kind.upper()]
+        self._narrow_phase = NarrowPhase(kind, self._counts, n, (first_elements, len(elements)))
+        wp.copy(self._narrow_phase.queue, pairs)
+        retry_until_fits(self.launch, self._narrow_phase, device)
 
     def launch(self) -> None:
         """Answers all queries; on a GPU without synchronizing with the device."""
@@ -322,7 +318,7 @@ class MethodRun:
         arrays, device = queries.arrays, queries.device
         if self.method in NARROW_PHASE_METHODS:
             wp.copy(self._counts, self._start_counts)
-            self._narrow_phase.run(*arrays[:3], method=self.method, timed=False)
+            self._narrow_phase.run(*arrays[:3], method=self.method, timed=False, timer=StageTimer(None))
             return
         cubic, cull, cull_batches, classify_survivors, _ = _kernels(queries.kind, queries.dtype)
         if self.method == "cubic":
@@ -346,14 +342,14 @@ class MethodRun:
         if self.method not in NARROW_PHASE_METHODS:
             return self._status.numpy().copy()
         status = np.full(self.queries.count, FREE, dtype=np.int8)
-        contacts = self._narrow_phase.unsorted
+        contacts = self._narrow_phase.contacts
         count = int(self._counts.numpy()[Count.CONTACTS])
         keys, of_contacts = (
             np.ascontiguousarray(pairs, dtype=np.int32).view(np.int64)[:, 0]
             for pairs in (self.queries.pairs, contacts.pairs.numpy()[:count])
         )
         order = np.argsort(keys)
-        status[order[np.searchsorted(keys, of_contacts, sorter=order)]] = contacts.answers.numpy()[:count]
+        status[order[np.searchsorted(keys, of_contacts, sorter=order)]] = contacts.decided.numpy()[:count]
         return status
 
     def find_hits(self) -> np.ndarray:

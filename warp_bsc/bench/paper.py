@@ -15,10 +15,9 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from ..detection.detector import CollisionDetector
-from ..detection.launch import one_core
+from ..detection.launch import one_core, retry_until_fits
 from ..detection.mesh import CollisionMesh
-from ..detection.narrow_phase import Count
+from ..detection.pipeline import DetectionPipeline
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
 from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
@@ -278,16 +277,16 @@ def _gather(
 def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
-    detector = CollisionDetector(mesh)
-    detector.detect(scene.x0, scene.x1)
-    detector.find_candidates()
-    while detector.grow():
-        detector.find_candidates()
+    pipeline = DetectionPipeline(mesh)
+    x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
+    retry_until_fits(lambda: pipeline.find_contacts(x0, x1), pipeline, mesh.device)
+    retry_until_fits(pipeline.find_candidates, pipeline, mesh.device)
+    queued = pipeline.counts.vertex_face.queued, pipeline.counts.edge_edge.queued
     found = {}
-    for kind, narrow_phase, elements in zip(KINDS, detector.narrow_phases, (mesh.faces, mesh.edges), strict=True):
-        pairs = narrow_phase.near.numpy()[: int(narrow_phase.counts.numpy()[Count.NEAR])]
+    for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):
+        pairs = narrow_phase.queue.numpy()[:count]
         # a GPU finds them in an order that varies
-        found[kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+        found[narrow_phase.kind.label] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     return found
 
 

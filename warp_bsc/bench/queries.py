@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..detection.launch import launch_over, launch_over_queue
-from ..detection.narrow_phase import TOLERANCE
+from ..detection.settings import TOLERANCE
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart

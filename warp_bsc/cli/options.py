@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable
 
-from ..detection.narrow_phase import METHODS
+from ..detection.settings import METHODS
 
 __all__ = [
     "BENCH_EXIT_STATUS",

@@ -7,19 +7,18 @@ import warp as wp
 from ..kernels.pipeline.boxes import boxes_apart, boxes_overlap, rounded
 from ..kernels.pipeline.pairs import owns_edge, owns_vertex
 from ..kernels.pipeline.queues import append, is_filled, take_slots, write
-from .narrow_phase import Count, roomy
+from .mesh import CollisionMesh
+from .settings import NO_GRADIENTS, Count, capacity_for
 
-__all__ = ["BvhBroadPhase"]
+__all__ = ["BroadPhaseBvh"]
 
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
-_NEAR = wp.constant(int(Count.NEAR))
+_QUEUED = wp.constant(int(Count.QUEUED))
 
 _CHUNK = wp.constant(16)
 _CHUNK_SLOTS = wp.constant(wp.int64(16))
 """Slots of face pairs that a thread takes at once, in both types: Warp reads a constant that a kernel both converts and
 uses as it is before it is set."""
-
-_KERNEL = {"enable_backward": False, "module": "unique"}
 
 
 @wp.func
@@ -27,7 +26,7 @@ def _has_changed(changed: wp.array[int], faces: wp.array2d[int], face: int):
     return changed[faces[face, 0]] + changed[faces[face, 1]] + changed[faces[face, 2]] != 0
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_GRADIENTS)
 def _pair_faces(
     bvh: wp.uint64,
     lowers: wp.array[wp.vec3],
@@ -87,7 +86,7 @@ class _Mesh:
 def _box_elements(dtype):
     """The kernel that boxes moving elements, for one type of position."""
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_GRADIENTS)
     def box_elements(x0: wp.array[dtype], x1: wp.array[dtype], mesh: _Mesh):
         i = wp.tid()
         if i < mesh.vertex_boxes.shape[0]:
@@ -229,7 +228,7 @@ def _lowest_bit(bits: int):
     return _bit_count((bits & -bits) - 1)
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_GRADIENTS)
 def _pair_elements(
     mesh: _Mesh,
     face_pairs: wp.array[wp.vec2i],
@@ -258,7 +257,7 @@ def _pair_elements(
     # of the rest only what no axis separates
     vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
     edges = edges >> 9
-    slot = take_slots(vertex_face_counts, _NEAR, _bit_count(vertices))
+    slot = take_slots(vertex_face_counts, _QUEUED, _bit_count(vertices))
     while vertices != 0:
         corner = _lowest_bit(vertices)
         vertices = vertices & (vertices - 1)
@@ -267,7 +266,7 @@ def _pair_elements(
         else:
             write(wp.vec2i(mesh.faces[other, corner - 3], face), vertex_face, slot)
         slot += wp.int64(1)
-    slot = take_slots(edge_edge_counts, _NEAR, _bit_count(edges))
+    slot = take_slots(edge_edge_counts, _QUEUED, _bit_count(edges))
     while edges != 0:
         bit = _lowest_bit(edges)
         edges = edges & (edges - 1)
@@ -294,10 +293,10 @@ def _pair_edges_with_face(mesh: _Mesh, face: int, other: int, counts: wp.array[w
                 mesh.face_uppers[other],
             ):
                 if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
-                    append(wp.vec2i(edge, other), pairs, counts, _NEAR)
+                    append(wp.vec2i(edge, other), pairs, counts, _QUEUED)
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_GRADIENTS)
 def _pair_edges_with_faces(
     mesh: _Mesh,
     face_pairs: wp.array[wp.vec2i],
@@ -315,23 +314,11 @@ def _pair_edges_with_faces(
         _pair_edges_with_face(mesh, other, face, counts, pairs)
 
 
-class BvhBroadPhase:
-    """Finds the candidate pairs of a mesh: those that share no vertex and whose swept boxes overlap.
+class BroadPhaseBvh:
+    """The broad phase by a hierarchy over the faces, see :class:`warp_bsc.detection.broad_phase.BroadPhase`."""
 
-    Only enqueues: counts stay on the device, and the caller provides the queues of the results. Boxes are in single
-    precision, rounded so that no overlap is lost.
-
-    Attributes:
-        queues: All arrays that a run writes to and that may be replaced.
-    """
-
-    def __init__(self, mesh, count):
-        """Makes room for the boxes.
-
-        Args:
-            mesh: The collision mesh.
-            count: Array of one int64, zero before each run.
-        """
+    def __init__(self, mesh: CollisionMesh, count: wp.array):
+        """Allocates the boxes and a queue for pairs of faces, which ``count`` counts, array of one int64."""
         device = mesh.device
         self._device = device
         self._worlds = mesh.device_face_world
@@ -349,50 +336,47 @@ class BvhBroadPhase:
         self._mesh.face_uppers = wp.empty(faces, dtype=wp.vec3, device=device)
         self._most = max(mesh.vertex_count, edges, faces)
         self._bvh = None
-        self.queues = [wp.empty(8 * faces, dtype=wp.vec2i, device=device)]
+        self._face_pairs = wp.empty(8 * faces, dtype=wp.vec2i, device=device)
 
     @property
-    def capacity(self):
-        """How much room there is for what the count counts."""
-        return len(self.queues[0])
+    def buffers(self) -> list[wp.array]:
+        """The queue for pairs of faces."""
+        return [self._face_pairs]
 
-    def grow(self, count):
-        """Makes the queue large enough for the count."""
+    @property
+    def capacity(self) -> int:
+        """Capacity for pairs of faces."""
+        return len(self._face_pairs)
+
+    def grow(self, count: int) -> None:
+        """Enlarges the queue if it is too small for the count."""
         if count > self.capacity:
-            self.queues = [wp.empty(roomy(count), dtype=wp.vec2i, device=self._device)]
+            self._face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
 
     def pair_elements(
-        self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False, changed=None
-    ):
-        """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
-
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d.
-            x1: Positions at the end, of the same type.
-            vertex_face_counts: By :class:`Count`, array of int64.
-            vertex_face: Queue for (vertex, face), array of vec2i.
-            edge_edge_counts: By :class:`Count`, array of int64.
-            edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
-            refit: Whether to keep the hierarchy of the run before and only refit its boxes, which is as right and
-                allocates nothing, but slows down what follows if much has moved.
-            changed: Nonzero for each vertex that pairs are wanted of, array of int, of whose faces all pairs are
-                found; None for all.
-        """
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_face_counts: wp.array,
+        vertex_face: wp.array,
+        edge_edge_counts: wp.array,
+        edge_edge: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+    ) -> None:
+        """Counts the candidates, and enqueues those that no coordinate axis separates."""
         self._pair_faces(x0, x1, refit, changed)
         self._launch_over_pairs(_pair_elements, False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
-    def pair_overlapping_elements(self, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
-        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+    def pair_overlapping_elements(
+        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
+    ) -> None:
+        """Enqueues all candidates of the last run."""
         self._launch_over_pairs(_pair_elements, True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
-    def pair_edges_with_faces(self, x, counts, pairs):
-        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
-
-        Args:
-            x: Positions, Warp array of vec3 or vec3d.
-            counts: By :class:`Count`, array of int64.
-            pairs: Queue for (edge, face), array of vec2i.
-        """
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
         self._pair_faces(x, x, False)
         self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
 
@@ -410,10 +394,9 @@ class BvhBroadPhase:
             self._bvh.refit()
         else:
             self._bvh.rebuild()
-        inputs = [self._bvh.id, *boxes, self._worlds, self._mesh.faces, changed, self._count, *self.queues]
+        inputs = [self._bvh.id, *boxes, self._worlds, self._mesh.faces, changed, self._count, self._face_pairs]
         wp.launch(_pair_faces, faces, inputs=inputs, device=self._device, record_tape=False)
 
     def _launch_over_pairs(self, kernel, *arguments):
-        (face_pairs,) = self.queues
-        inputs = [self._mesh, face_pairs, self._count, *arguments]
-        wp.launch(kernel, len(face_pairs), inputs=inputs, device=self._device, record_tape=False)
+        inputs = [self._mesh, self._face_pairs, self._count, *arguments]
+        wp.launch(kernel, self.capacity, inputs=inputs, device=self._device, record_tape=False)

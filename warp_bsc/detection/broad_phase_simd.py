@@ -8,23 +8,22 @@ import warp as wp
 from ..kernels.pipeline.blocks import pair_block
 from ..kernels.pipeline.boxes import rounded
 from .launch import launch_over
-from .narrow_phase import UNLIMITED, Count
+from .mesh import CollisionMesh
+from .settings import NO_GRADIENTS, UNLIMITED, Count
 
-__all__ = ["BlockBroadPhase"]
+__all__ = ["BroadPhaseSimd"]
 
 _CODE_BITS = 10
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
-_NEAR = wp.constant(int(Count.NEAR))
+_QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
-
-_KERNEL = {"enable_backward": False, "module": "unique"}
 
 
 @functools.cache
 def _kernels(dtype):
     """The kernels that read positions, for one type of them."""
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_GRADIENTS)
     def encode(
         first: int,
         x0: wp.array[dtype],
@@ -50,7 +49,7 @@ def _kernels(dtype):
         codes[i] = code
         order[i] = i
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_GRADIENTS)
     def fill_blocks(
         first: int,
         x0: wp.array[dtype],
@@ -106,7 +105,7 @@ def _kernels(dtype):
     return encode, fill_blocks
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_GRADIENTS)
 def _pair_blocks(
     first: int,
     boxes: wp.array[wp.float32],
@@ -138,7 +137,7 @@ def _pair_blocks(
         keep_apart,
         counts,
         _CANDIDATES,
-        _NEAR,
+        _QUEUED,
         pairs,
     )
 
@@ -248,58 +247,51 @@ def _join(children, parents):
         parents[: len(lanes), :, lane] = lanes
 
 
-class BlockBroadPhase:
-    """Finds the candidate pairs of a mesh: those that share no vertex and whose swept boxes overlap.
+class BroadPhaseSimd:
+    """The broad phase by trees of SIMD packets, see :class:`warp_bsc.detection.broad_phase.BroadPhase`.
 
-    It has the interface of :class:`warp_bsc.detection.broad_phase_bvh.BvhBroadPhase`, but no queue of its own.
+    It pairs elements directly, and has no queue for pairs of faces.
     """
 
-    queues = ()
-    capacity = UNLIMITED
+    buffers: tuple[wp.array, ...] = ()
+    capacity: int = UNLIMITED
 
-    def __init__(self, mesh, count):
-        """Makes room for trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
+    def __init__(self, mesh: CollisionMesh, count: wp.array):
+        """Allocates trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
         self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
         self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world)
         self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
         self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world)
 
-    def grow(self, count):
-        """Nothing, as there is nothing that could."""
+    def grow(self, count: int) -> None:
+        """Does nothing, as there is no queue."""
 
     def pair_elements(
-        self, x0, x1, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, *, refit=False, changed=None
-    ):
-        """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
-
-        Args:
-            x0: Positions at the start, Warp array of vec3 or vec3d.
-            x1: Positions at the end, of the same type.
-            vertex_face_counts: By :class:`Count`, array of int64.
-            vertex_face: Queue for (vertex, face), array of vec2i.
-            edge_edge_counts: By :class:`Count`, array of int64.
-            edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
-            refit: Whether to keep the order of the run before, which is as right, but slows down what follows if much
-                has moved.
-            changed: Nonzero for each vertex that pairs are wanted of, array of int; None for all pairs.
-        """
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_face_counts: wp.array,
+        vertex_face: wp.array,
+        edge_edge_counts: wp.array,
+        edge_edge: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+    ) -> None:
+        """Counts the candidates, and enqueues those that no coordinate axis separates."""
         self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge)
 
-    def pair_overlapping_elements(self, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge):
-        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+    def pair_overlapping_elements(
+        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
+    ) -> None:
+        """Enqueues all candidates of the last run."""
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_apart=True)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_apart=True)
 
-    def pair_edges_with_faces(self, x, counts, pairs):
-        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
-
-        Args:
-            x: Positions, Warp array of vec3 or vec3d.
-            counts: By :class:`Count`, array of int64.
-            pairs: Queue for (edge, face), array of vec2i.
-        """
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
         self._build([self._edges, self._faces], x, x, False)
         self._edges.pair(self._faces, counts, pairs)
 

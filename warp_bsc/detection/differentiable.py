@@ -7,40 +7,37 @@ import warp as wp
 from ..kernels.gradients import with_gradients
 from ..kernels.motion import double
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import HIT, UNSURE
 from ..kernels.time_of_impact import Impact
-from .narrow_phase import Count
+from .contact_buffer import ContactBuffer
+from .mesh import CollisionMesh
+from .settings import PairKind
 
-__all__ = ["CollisionArrays", "put", "take"]
-
-_FOUND = wp.constant(int(Count.FOUND))
-_REFUTED = wp.constant(int(Count.REFUTED))
+__all__ = ["CollisionArrays"]
 
 
 @functools.cache
-def _kernel(dtype):
+def _kernel(dtype: type) -> wp.Kernel:
     """The kernel for one type of position, in a module of its own."""
 
     @wp.kernel(module="unique", module_options={"fuse_fp": False})
     def differentiate(
         kind: int,
+        # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         tolerance: wp.float64,
-        pairs: wp.array[wp.vec2i],
-        localized: wp.array[wp.bool],
-        found_toi: wp.array[wp.float64],
-        found_coordinates: wp.array[wp.vec3d],
-        found_normal: wp.array[wp.vec3d],
+        # in
+        contacts: ContactBuffer,
+        # out
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
         normal: wp.array[wp.vec3d],
         grazing: wp.array[wp.bool],
     ):
         i = wp.tid()
-        pair = pairs[i]
+        pair = contacts.pairs[i]
         if pair[0] < 0:
             toi[i] = wp.float64(2.0)
             coordinates[i] = wp.vec3d()
@@ -49,11 +46,11 @@ def _kernel(dtype):
             return
         v = vertices_of_pair(kind, elements, pair)
         found = Impact()
-        found.status = wp.where(localized[i], HIT, UNSURE)
-        found.localized = wp.where(localized[i], 1, 0)
-        found.toi = found_toi[i]
-        found.coordinates = found_coordinates[i]
-        found.normal = found_normal[i]
+        found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
+        found.localized = wp.where(contacts.within_tolerance[i], 1, 0)
+        found.toi = contacts.toi[i]
+        found.coordinates = contacts.coordinates[i]
+        found.normal = contacts.normal[i]
         contact = with_gradients(
             kind,
             double(x0[v[0]]),
@@ -73,32 +70,6 @@ def _kernel(dtype):
         grazing[i] = contact.grazing == 1
 
     return differentiate
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def _take(
-    counts: wp.array[wp.int64],
-    pairs: wp.array[wp.vec2i],
-    localized: wp.array[wp.bool],
-    toi: wp.array[wp.float64],
-    coordinates: wp.array[wp.vec3d],
-    normal: wp.array[wp.vec3d],
-    taken_pairs: wp.array[wp.vec2i],
-    taken_localized: wp.array[wp.bool],
-    taken_toi: wp.array[wp.float64],
-    taken_coordinates: wp.array[wp.vec3d],
-    taken_normal: wp.array[wp.vec3d],
-):
-    """Copies the contacts out of a queue that the next detection overwrites; what is behind them is none."""
-    i = wp.tid()
-    if wp.int64(i) >= counts[_FOUND] - counts[_REFUTED]:
-        taken_pairs[i] = wp.vec2i(-1, -1)
-        return
-    taken_pairs[i] = pairs[i]
-    taken_localized[i] = localized[i]
-    taken_toi[i] = toi[i]
-    taken_coordinates[i] = coordinates[i]
-    taken_normal[i] = normal[i]
 
 
 class CollisionArrays:
@@ -125,7 +96,26 @@ class CollisionArrays:
         edge_edge_grazing: The same for the edges, array of bool.
     """
 
-    def __init__(self, x0, x1, mesh, tolerance, found):
+    vertex_face: wp.array
+    edge_edge: wp.array
+    vertex_face_toi: wp.array
+    edge_edge_toi: wp.array
+    vertex_face_coordinates: wp.array
+    edge_edge_coordinates: wp.array
+    vertex_face_normal: wp.array
+    edge_edge_normal: wp.array
+    vertex_face_grazing: wp.array
+    edge_edge_grazing: wp.array
+
+    def __init__(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        mesh: CollisionMesh,
+        tolerance: float,
+        vertex_face: ContactBuffer,
+        edge_edge: ContactBuffer,
+    ):
         """Makes the arrays, and records on the tape how.
 
         Args:
@@ -133,38 +123,16 @@ class CollisionArrays:
             x1: Positions at the end, of the same type.
             mesh: The mesh.
             tolerance: Of the times of impact, as a share of the step.
-            found: Arrays for "vertex_face" and for "edge_edge": pairs, localized, times, coordinates, normals.
+            vertex_face: The sorted contacts of vertices with faces, which nothing may change any more.
+            edge_edge: Those of edges with edges.
         """
-        for kind, elements in (("vertex_face", mesh.device_faces), ("edge_edge", mesh.device_edges)):
-            pairs, *constants = found[kind]
-            number = int(VERTEX_FACE if kind == "vertex_face" else EDGE_EDGE)
-            toi, coordinates, normal = (wp.zeros_like(array, requires_grad=True) for array in constants[1:])
-            grazing = wp.zeros(len(pairs), dtype=wp.bool, device=pairs.device)
-            inputs = [number, x0, x1, elements, tolerance, pairs, *constants]
+        for kind, contacts in ((PairKind.VERTEX_FACE, vertex_face), (PairKind.EDGE_EDGE, edge_edge)):
+            constants = contacts.toi, contacts.coordinates, contacts.normal
+            toi, coordinates, normal = (wp.zeros_like(array, requires_grad=True) for array in constants)
+            grazing = wp.zeros(len(contacts.pairs), dtype=wp.bool, device=mesh.device)
+            inputs = [int(kind), x0, x1, mesh.device_elements(kind), tolerance, contacts]
             outputs = [toi, coordinates, normal, grazing]
-            wp.launch(_kernel(x0.dtype), len(pairs), inputs=inputs, outputs=outputs, device=pairs.device)
-            setattr(self, kind, pairs)
+            wp.launch(_kernel(x0.dtype), len(contacts.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
+            setattr(self, kind.label, contacts.pairs)
             for name, array in zip(("toi", "coordinates", "normal", "grazing"), outputs, strict=True):
-                setattr(self, f"{kind}_{name}", array)
-
-
-def put(results, kind, device):
-    """Collisions of one kind that the host has read, by name, as arrays for :class:`CollisionArrays`."""
-    names = kind, f"_{kind}_localized", f"{kind}_toi", f"{kind}_coordinates", f"{kind}_normal"
-    dtypes = wp.vec2i, wp.bool, wp.float64, wp.vec3d, wp.vec3d
-    return [wp.array(results[name], dtype=dtype, device=device) for name, dtype in zip(names, dtypes, strict=True)]
-
-
-def take(contacts, counts, read=None):
-    """Copies of sorted :class:`Contacts` for :class:`CollisionArrays`.
-
-    Args:
-        contacts: The contacts.
-        counts: By :class:`Count`, array of int64.
-        read: The same as NumPy array; None to take all rows of the queue, filled or not, without asking the device.
-    """
-    rows = len(contacts.pairs) if read is None else int(read[Count.FOUND] - read[Count.REFUTED])
-    arrays = [contacts.pairs, contacts.localized, contacts.toi, contacts.coordinates, contacts.normal]
-    taken = [wp.empty(rows, dtype=array.dtype, device=array.device) for array in arrays]
-    wp.launch(_take, rows, inputs=[counts, *arrays], outputs=taken, device=counts.device, record_tape=False)
-    return taken
+                setattr(self, f"{kind.label}_{name}", array)

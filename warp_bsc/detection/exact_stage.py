@@ -1,9 +1,9 @@
-"""The exact stage: wide integers decide, on the device, what floating point leaves open.
+"""The exact stage: wide integers decide, on the device, the contacts that floating point cannot.
 
-Contacts that the stage before has put in a queue are decided in integers of one limb a coordinate, see
+Contacts that the stage before has enqueued are decided in integers of one limb a coordinate, see
 :mod:`warp_bsc.kernels.exact.decision`. Those whose exponents are too far apart for that go to the next queue, for two
-limbs, and so on to eight, which take every query in single precision. What is too wide for that too is counted, and
-left to the host. Each width has a kernel of its own, so that the usual one stays small.
+limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are too wide
+for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays small.
 """
 
 import functools
@@ -17,51 +17,48 @@ from ..kernels.exact.polygon import BITS
 from ..kernels.motion import double, relative_motion
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT
 from ..kernels.time_of_impact import LEAST_DIGITS
+from .contact_buffer import ContactBuffer
 from .launch import launch_over_queue
+from .settings import NO_FUSED_OPERATIONS, PairKind
 
 __all__ = ["launch_exact_stage"]
 
-_KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
-"""Without fused operations every device computes the same bits."""
-
 
 @functools.cache
-def _kernel(dtype, limbs):
+def _kernel(dtype: type, limbs: int) -> wp.Kernel:
     """The kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def decide_contacts(
         first: int,
+        # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
         kind: int,
         timed: bool,
         digits: int,
+        # in
         queue: wp.array[int],
-        counts: wp.array[wp.int64],
         filled: int,
         too_wide: int,
         refuted: int,
-        contacts: wp.array[wp.vec2i],
-        answer: wp.array[wp.int8],
-        localized: wp.array[wp.bool],
-        toi: wp.array[wp.float64],
-        coordinates: wp.array[wp.vec3d],
-        normal: wp.array[wp.vec3d],
-        keys: wp.array[wp.int64],
         last_key: wp.int64,
+        # in and out
+        counts: wp.array[wp.int64],
+        contacts: ContactBuffer,
+        # out
+        keys: wp.array[wp.int64],
         left: wp.array[int],
     ):
         slot = first + wp.tid()
         if wp.int64(slot) >= counts[filled]:
             return
         i = queue[slot]
-        v = vertices_of_pair(kind, elements, contacts[i])
+        v = vertices_of_pair(kind, elements, contacts.pairs[i])
         time = decide(
             kind,
             double(x0[v[0]]),
@@ -78,14 +75,14 @@ def _kernel(dtype, limbs):
         if time == TOO_WIDE:
             left[wp.int32(take_slot(counts, too_wide))] = i
         elif time == NONE:
-            answer[i] = wp.int8(FREE)
+            contacts.decided[i] = wp.int8(FREE)
             keys[i] = last_key
             take_slot(counts, refuted)
         else:
-            answer[i] = wp.int8(HIT)
+            contacts.decided[i] = wp.int8(HIT)
             if timed:
                 # where floating point has given up is a lower bound too
-                time = wp.max(time, toi[i])
+                time = wp.max(time, contacts.toi[i])
                 motion = relative_motion(
                     kind,
                     x0[v[0]],
@@ -99,41 +96,61 @@ def _kernel(dtype, limbs):
                     wp.float64(0.0),
                 )
                 at, direction = contact_at(motion, time)
-                localized[i] = True
-                toi[i] = time
-                coordinates[i] = at
-                normal[i] = direction
+                contacts.within_tolerance[i] = True
+                contacts.toi[i] = time
+                contacts.coordinates[i] = at
+                contacts.normal[i] = direction
 
     return decide_contacts
 
 
 def launch_exact_stage(
-    kind, x0, x1, elements, *, timed, tolerance, queues, counts, asked, too_wide, refuted, contacts, keys, last_key
-):
-    """Decides contacts exactly, without asking the device anything.
+    kind: PairKind,
+    x0: wp.array,
+    x1: wp.array,
+    elements: wp.array,
+    *,
+    timed: bool,
+    tolerance: float,
+    queues: list[wp.array],
+    counts: wp.array,
+    filled: int,
+    too_wide: list[int],
+    refuted: int,
+    contacts: ContactBuffer,
+    keys: wp.array,
+    last_key: int,
+) -> None:
+    """Decides contacts exactly, without synchronizing with a GPU.
 
     Args:
-        kind: "vertex_face" or "edge_edge".
-        x0: Positions at the start of the step, Warp array of vec3 or vec3d.
+        kind: The kind of pair.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
         x1: Positions at its end, of the same type.
-        elements: Vertex indices of the faces or edges, two-dimensional Warp array of int.
-        timed: Whether to find times of impact, coordinates and normals of what is decided to collide.
+        elements: Vertex indices of the faces or edges, two-dimensional array of int.
+        timed: Whether to find times of impact, coordinates and normals of hits.
         tolerance: Of the times of impact, as a share of the step.
-        queues: Contacts to decide, by their number, and room for those that are too wide; both are written to.
-        counts: Counts of the narrow phase, Warp array of int64.
-        asked: Place of the number of contacts to decide in it.
-        too_wide: Places of the numbers of those too wide for each width.
+        queues: Rows of the contacts to decide, and a queue for those that are too wide; both are overwritten. Arrays
+            of int.
+        counts: Counts of the narrow phase, array of int64.
+        filled: Place of the number of contacts to decide in it.
+        too_wide: Places of the numbers of those too wide for 1, 2 and 8 limbs.
         refuted: Place of the number of those decided to be free.
-        contacts: Arrays of the contacts: pairs, answer, localized, toi, coordinates, normal.
-        keys: By which contacts are sorted, Warp array of int64.
-        last_key: Key of a contact that is none.
+        contacts: The contacts; without times only ``pairs`` and ``decided`` are used.
+        keys: Sorting keys of the contacts, array of int64.
+        last_key: Key of a contact that is refuted.
     """
-    number = VERTEX_FACE if kind == "vertex_face" else EDGE_EDGE
     digits = max(LEAST_DIGITS, math.ceil(-math.log2(tolerance)))
     queue, left = queues
     for limbs, too_wide_for_it in zip(BITS, too_wide, strict=True):
-        inputs = [x0, x1, elements, int(number), timed, digits, queue, counts, asked, too_wide_for_it, refuted]
-        outputs = [*contacts, keys, last_key, left]
-        kernel = _kernel(x0.dtype, limbs)
-        launch_over_queue(kernel, queue, counts, asked, inputs=inputs, outputs=outputs, block_dim=64)
-        queue, left, asked = left, queue, too_wide_for_it
+        places = [int(filled), int(too_wide_for_it), int(refuted)]
+        launch_over_queue(
+            _kernel(x0.dtype, limbs),
+            queue,
+            counts,
+            filled,
+            inputs=[x0, x1, elements, int(kind), timed, digits, queue, *places, last_key],
+            outputs=[counts, contacts, keys, left],
+            block_dim=64,
+        )
+        queue, left, filled = left, queue, too_wide_for_it

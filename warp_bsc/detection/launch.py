@@ -1,15 +1,16 @@
-"""Launches over the entries of a queue, of which only the device knows how many there are; on no tape."""
+"""Launches over queues whose length only the device knows, on no tape, and launches until the buffers suffice."""
 
 import contextlib
 import contextvars
 import functools
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol, TypeVar
 
 import warp as wp
 
-__all__ = ["launch_over", "launch_over_queue", "one_core"]
+__all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "one_core", "retry_until_fits"]
 
 _THREADS = os.cpu_count() or 1
 
@@ -27,12 +28,12 @@ def one_core() -> Iterator[None]:
 
 
 @functools.cache
-def _pool():
+def _pool() -> ThreadPoolExecutor:
     """Threads for the CPU: Warp runs a kernel on one, but lets others run meanwhile."""
     return ThreadPoolExecutor(_THREADS)
 
 
-def _may_share(kernel) -> bool:
+def _may_share(kernel: wp.Kernel) -> bool:
     """Whether several threads may run a kernel at once.
 
     Warp's kernels on a CPU share a pointer to the stack of the thread that set it last, for their tiles. A kernel
@@ -44,11 +45,20 @@ def _may_share(kernel) -> bool:
     return mode == "release" and level != 0
 
 
-def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=1024):
+def launch_over(
+    kernel: wp.Kernel,
+    count: int,
+    *,
+    inputs: list,
+    outputs: list,
+    device: wp.Device,
+    block_dim: int = 256,
+    chunk: int = 1024,
+) -> None:
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
     The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
-    suit kernels of which few threads work long; a chunk, at least so large, is what a core takes at a time.
+    suit kernels in which few threads work long. A core takes at least ``chunk`` entries at a time.
 
     Raises:
         RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
@@ -71,10 +81,57 @@ def launch_over(kernel, count, *, inputs, outputs, device, block_dim=256, chunk=
     list(run(wp.Launch.launch, commands))
 
 
-def launch_over_queue(kernel, queue, counts, count, *, inputs, outputs, block_dim=256):
-    """Launches a kernel over a queue: as far as it is filled on the CPU, over all of it on a GPU, without asking."""
+def launch_over_queue(
+    kernel: wp.Kernel,
+    queue: wp.array,
+    counts: wp.array,
+    count: int,
+    *,
+    inputs: list,
+    outputs: list,
+    block_dim: int = 256,
+) -> None:
+    """Launches a kernel over a queue: its filled entries on the CPU; all on a GPU, without synchronizing.
+
+    Args:
+        kernel: The kernel, with a first argument as for :func:`launch_over`.
+        queue: The queue.
+        counts: Counts of several queues, array of int64.
+        count: Place of the queue's count in it.
+        inputs: Arguments of the kernel after the first.
+        outputs: The rest of its arguments.
+        block_dim: Threads of a block on a GPU.
+    """
     device = queue.device
     entries = len(queue)
     if device.is_cpu:
         entries = min(entries, int(counts.numpy()[count]))
     launch_over(kernel, entries, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)
+
+
+class GrowingBuffers(Protocol):
+    """Buffers that count on the device how much they would have to hold."""
+
+    def grow(self) -> bool:
+        """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
+        ...
+
+
+_Result = TypeVar("_Result")
+
+
+def retry_until_fits(launch: Callable[[], _Result], buffers: GrowingBuffers, device: wp.Device) -> _Result:
+    """Launches, and again with larger buffers while some were too small; once where a graph is captured.
+
+    Args:
+        launch: Launches everything that writes to the buffers, from the start.
+        buffers: The buffers. In a graph they keep their capacities, and their counts show an overflow.
+        device: The device.
+
+    Returns:
+        What the last call of ``launch`` returned.
+    """
+    while True:
+        result = launch()
+        if device.is_capturing or not buffers.grow():
+            return result

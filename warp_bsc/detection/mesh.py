@@ -1,9 +1,12 @@
-"""The collision mesh: what of a triangle mesh takes part in collision detection."""
+"""The collision mesh: the part of a triangle mesh that takes part in collision detection."""
 
 from numbers import Integral
 
 import numpy as np
 import warp as wp
+
+from .._arrays import checked_shape
+from .settings import PairKind
 
 __all__ = ["CollisionMesh"]
 
@@ -23,14 +26,21 @@ class CollisionMesh:
         device: Warp device of the arrays that the detector uses.
     """
 
-    def __init__(self, faces, vertex_count, *, world=None, device=None):
+    def __init__(
+        self,
+        faces: np.ndarray | wp.array,
+        vertex_count: int,
+        *,
+        world: np.ndarray | wp.array | None = None,
+        device: wp.DeviceLike = None,
+    ):
         """Finds the edges and puts the mesh on a device.
 
         Args:
             faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
-            world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array: what is
-                in different worlds does not collide. Default: all are in one.
+            world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
+                vertices in different worlds do not collide. Default: all are in one.
             device: Warp device; default: Warp's default.
 
         Raises:
@@ -80,7 +90,36 @@ class CollisionMesh:
         if world is not None:
             self.device_face_world = wp.array(self.world[self.faces[:, 0]], dtype=int, device=self.device)
 
-    def _checked_world(self, world):
+    def device_elements(self, kind: PairKind) -> wp.array:
+        """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int."""
+        return self.device_faces if kind == PairKind.VERTEX_FACE else self.device_edges
+
+    def device_positions(self, x: np.ndarray | wp.array, name: str) -> wp.array:
+        """Returns positions on the device as an array of vec3 or vec3d, unchanged or a copy; finite or not.
+
+        Args:
+            x: Positions, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
+            name: What to call them in errors.
+
+        Raises:
+            ValueError: If they have another shape or type; or if a graph is captured or they require gradients, and
+                they are no Warp array of vec3 or vec3d on the device.
+        """
+        if isinstance(x, wp.array) and x.device == self.device and x.dtype in (wp.vec3, wp.vec3d):
+            if x.shape != (self.vertex_count,):
+                raise ValueError(f"{name} must have {self.vertex_count} rows, one a vertex, got {x.shape}")
+            return x
+        capturing = self.device.is_capturing
+        if capturing or (isinstance(x, wp.array) and x.requires_grad):
+            when = "in a graph" if capturing else "to have gradients"
+            raise ValueError(f"{when} {name} must be a Warp array of vec3 or vec3d on {self.device}")
+        values = checked_shape(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
+        if len(values) != self.vertex_count:
+            raise ValueError(f"{name} must have {self.vertex_count} rows, one a vertex, got {len(values)}")
+        dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+    def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face."""
         world = world.numpy() if isinstance(world, wp.array) else np.asarray(world)
         if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):

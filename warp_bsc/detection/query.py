@@ -7,7 +7,11 @@ import warp as wp
 
 from .._arrays import check_finite, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
-from .narrow_phase import TOLERANCE, Count, NarrowPhase, check_method, check_tolerance, decide_exactly
+from .contact_buffer import HostContacts, read_contacts
+from .launch import retry_until_fits
+from .narrow_phase import NarrowPhase, decide_on_host
+from .settings import TOLERANCE, Count, PairCounts, PairKind, check_method, check_tolerance
+from .stage_timer import StageTimer
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
 
@@ -34,8 +38,15 @@ class QueryResult:
     normal: np.ndarray | None
 
 
-def query_vertex_face(points, *, method="exact", toi=True, tolerance=TOLERANCE, device=None):
-    """Asks which moving vertices meet which moving triangles.
+def query_vertex_face(
+    points: np.ndarray | wp.array,
+    *,
+    method: str = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which moving vertices meet their moving triangles.
 
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1:
@@ -52,11 +63,18 @@ def query_vertex_face(points, *, method="exact", toi=True, tolerance=TOLERANCE, 
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
             method.
     """
-    return _query("vertex_face", points, method, toi, tolerance, device)
+    return _query(PairKind.VERTEX_FACE, points, method, toi, tolerance, device)
 
 
-def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, device=None):
-    """Asks which moving edges meet.
+def query_edge_edge(
+    points: np.ndarray | wp.array,
+    *,
+    method: str = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which pairs of moving edges meet.
 
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
@@ -73,10 +91,17 @@ def query_edge_edge(points, *, method="exact", toi=True, tolerance=TOLERANCE, de
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
             method.
     """
-    return _query("edge_edge", points, method, toi, tolerance, device)
+    return _query(PairKind.EDGE_EDGE, points, method, toi, tolerance, device)
 
 
-def _query(kind, points, method, timed, tolerance, device):
+def _query(
+    kind: PairKind,
+    points: np.ndarray | wp.array,
+    method: str,
+    timed: bool,
+    tolerance: float,
+    device: wp.DeviceLike,
+) -> QueryResult:
     check_method(method)
     check_tolerance(tolerance)
     if isinstance(points, wp.array):
@@ -94,51 +119,53 @@ def _query(kind, points, method, timed, tolerance, device):
     x1 = wp.array(np.ascontiguousarray(points[:, 4:]).reshape(-1, 3), dtype=dtype, device=device)
     vertices = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
     rows = np.arange(n, dtype=np.int32)
-    if kind == "vertex_face":
+    if kind == PairKind.VERTEX_FACE:
         elements, pairs = vertices[:, 1:], np.stack([4 * rows, rows], axis=1)
     else:
         elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
     elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
-    narrow_phase.near.assign(pairs)
+    narrow_phase.queue.assign(pairs)
+    all_queued = PairCounts(queued=n).values()
 
-    def solve(method):
-        while True:
-            counts.assign([n if count == Count.NEAR else 0 for count in Count])
-            # exactly also the times of certified hits that floating point could not place
-            stages = "exact" if method == "conservative" and timed else method
-            narrow_phase.run(x0, x1, elements, method=stages, timed=timed, tolerance=tolerance)
-            if not narrow_phase.overflowed(counts.numpy()):
-                break
-            narrow_phase.grow(counts.numpy())
-        contacts = narrow_phase.unsorted.read(counts.numpy()[Count.CONTACTS])
-        found = contacts["status"] != FREE
-        contacts = {name: values[found] for name, values in contacts.items()}
+    def solve(method: str) -> tuple[HostContacts, np.ndarray]:
+        """The contacts by a method, and the query of each."""
+        # exactly also the times of certified hits that floating point could not find within the tolerance
+        stages = "exact" if method == "conservative" and timed else method
+
+        def launch() -> None:
+            counts.assign(all_queued)
+            options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
+            narrow_phase.run(x0, x1, elements, **options)
+
+        retry_until_fits(launch, narrow_phase, device)
+        contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
+        contacts = contacts.rows(contacts.status != FREE)
         if method == "conservative":
-            contacts["hit"][:] = True
+            contacts.decided[:] = HIT  # whatever the exact stage has decided
         if method != "float":
-            ask = contacts["hit"] & ~contacts["localized"] & timed & (contacts["status"] == HIT)
+            left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":
-                ask |= contacts["answers"] == UNSURE
-            decide_exactly(kind, x0, x1, elements, contacts, ask, timed=timed)
-        rows = contacts["pairs"][:, 1] if kind == "vertex_face" else contacts["pairs"][:, 0] // 2
+                left |= contacts.decided == UNSURE
+            decide_on_host(kind, x0, x1, elements, contacts, left, timed=timed)
+        rows = contacts.pairs[:, 1] if kind == PairKind.VERTEX_FACE else contacts.pairs[:, 0] // 2
         return contacts, rows
 
     certified, certified_rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)
-    status[certified_rows] = certified["status"]
-    answers, answer_rows = solve("float") if method == "float" else (certified, certified_rows)
-    found = answers["hit"]
-    answer_rows = answer_rows[found]
+    status[certified_rows] = certified.status
+    decided, decided_rows = solve("float") if method == "float" else (certified, certified_rows)
+    found = decided.hit
+    decided_rows = decided_rows[found]
     hit = np.zeros(n, dtype=bool)
-    hit[answer_rows] = True
+    hit[decided_rows] = True
     if not timed:
         return QueryResult(hit, status, None, None, None)
     toi = np.full(n, 2.0)
     coordinates = np.full((n, 3), np.nan)
     normal = np.full((n, 3), np.nan)
-    toi[answer_rows] = answers["toi"][found]
-    coordinates[answer_rows] = answers["coordinates"][found]
-    normal[answer_rows] = answers["normal"][found]
+    toi[decided_rows] = decided.toi[found]
+    coordinates[decided_rows] = decided.coordinates[found]
+    normal[decided_rows] = decided.normal[found]
     return QueryResult(hit, status, toi, coordinates, normal)

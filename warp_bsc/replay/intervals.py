@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..detection.detector import CollisionDetector, DetectionStats
+from ..detection.collisions import DetectionStats
+from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..usd.scene import Scene
 from .scene_contacts import SceneContacts, find_contacts

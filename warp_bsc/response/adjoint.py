@@ -1,11 +1,10 @@
-"""The gradient of a response: undoes what a step did, last things first, and carries gradients along.
+"""The adjoint of a step: carries gradients from its results to its inputs, going back through the record of the step.
 
-What a response did is a long chain of small steps: contacts become constraints, each iteration changes multipliers and
-by them positions, paths are cut, and in the end velocities change. Which contacts there were, which constraints acted
-and when it was enough is taken as given; all the rest is differentiated as it was computed. The adjoint of each small
-step is Warp's; this module only sees to it that each finds what was there when the step was made. For that iterations
-are undone: multipliers are in the history, and positions follow by taking back what multipliers had changed, exactly,
-as the sums are integers.
+A step is a long chain of small changes: contacts become constraints, each sweep changes multipliers and by them
+positions, paths are truncated, and in the end velocities change. Which contacts there were, which constraints were
+active and when sweeps ended are constants; everything else is differentiated as it was computed. Warp makes the adjoint
+of each small change, see :mod:`.adjoint_kernels`; this module restores the values that each was computed from.
+Multipliers are in the record, and positions follow exactly from the changes of multipliers, as sums are integers.
 """
 
 from types import SimpleNamespace
@@ -13,81 +12,79 @@ from types import SimpleNamespace
 import warp as wp
 
 from .adjoint_kernels import (
-    CURRENT,
-    CURSOR,
-    FIRST,
-    MARK,
-    NEXT,
-    accelerating,
-    constraining,
-    displacing,
+    Cursor,
+    add_moments,
+    add_torques,
+    change_position_multipliers,
+    change_velocity_multipliers,
     entry_of,
-    massing,
-    starting,
-    truncating,
-    turning,
-    twisting,
+    initialize_multipliers,
+    make_constraints,
+    truncate_paths,
+    turn_velocities,
 )
 from .angular_momentum import SUMS, turns
-from .constraints import PROJECTED, ROUND, STEER, TRUNCATIONS, UNDETECTED, Constraints, Progress, Vertices
-from .planes import HalfSpaces
-from .projection import BATCH, moved, spread
+from .buffers import PROJECTED, Constraints, Motion, Progress, SolveStatus, Vertices
+from .constraints import MAX_TRUNCATIONS
+from .planes import MovingPlanes
+from .projection import SWEEPS_PER_BATCH, add_delta, with_delta
 from .step_record import (
-    ENTRIES,
-    FORGOTTEN,
-    ITERATIONS_DONE,
-    MARKED,
-    OF_ENTRIES,
-    OF_TRUNCATIONS,
-    TRUNCATED_PATHS,
-    History,
+    OFFSETS,
+    PER_ENTRY,
+    PER_TRUNCATION,
+    RecordCounts,
+    StepRecord,
+    name_elements,
 )
 
-__all__ = ["Recording", "Undoing"]
+__all__ = ["RecordedStep", "StepAdjoint"]
 
-_OF_CONSTRAINTS = (
+_CONSTRAINT_ARRAYS = (
     "vertices",
     "weights",
     "normal",
     "separation",
     "friction",
-    "urgency",
-    "origin",
+    "kind",
     "localized",
     "toi",
+    "approach",
     "slow",
-    "displacing",
-    "impulse",
-    "reached",
+    "position_multiplier",
+    "velocity_multiplier",
+    "previous_multiplier",
 )
-_UNDONE_OF_CONSTRAINTS = "displacing", "impulse", "reached"
-_DIFFERENTIABLE = "weights", "normal", "separation", "urgency", "displacing", "impulse", "reached"
-_OF_VERTICES = "x0", "x1", "velocity", "wanted_x1", "wanted_velocity", "displacement", "velocity_change", "done"
-_UNDONE_OF_VERTICES = "x1", "velocity", "displacement", "velocity_change"
+_RESTORED_CONSTRAINT_ARRAYS = "position_multiplier", "velocity_multiplier", "previous_multiplier"
+_DIFFERENTIABLE = "weights", "normal", "separation", "approach", *_RESTORED_CONSTRAINT_ARRAYS
+_MOTION_ARRAYS = "x0", "x1", "velocity"
+_VERTEX_ARRAYS = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
+_RESTORED_VERTEX_ARRAYS = "x1", "velocity", "particle_delta_x", "particle_delta_v"
 _KERNEL = {"enable_backward": False}
 
 
 @wp.struct
 class _Gradients:
-    """Gradients with respect to positions and velocities as they are where undoing is."""
+    """Gradients with respect to positions and velocities at the place of the cursor."""
 
     x1: wp.array[wp.vec3]
     velocity: wp.array[wp.vec3]
-    more_x1: wp.array[wp.vec3]  # to be added, once everything has read the former
+    more_x1: wp.array[wp.vec3]  # added to x1 once everything has read it
     more_velocity: wp.array[wp.vec3]
-    push: wp.array[wp.vec3]  # with respect to what constraints add to velocities
+    velocity_change: wp.array[wp.vec3]  # with respect to what constraints add to velocities
 
 
 @wp.kernel(**_KERNEL)
 def _begin(
-    vertices: Vertices,
-    gradients: _Gradients,
-    steer: wp.array[int],
+    # in
+    motion: Motion,
+    status: SolveStatus,
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
+    # out
+    gradients: _Gradients,
     x0: wp.array[wp.vec3],
 ):
-    """Takes over the gradients of a step's results; where all stood still, that of the start is all there is."""
+    """Initializes gradients by those of the results; where an undetected step froze everything, only that of x0."""
     vertex = wp.tid()
     x1 = wp.vec3()
     velocity = wp.vec3()
@@ -95,7 +92,7 @@ def _begin(
         x1 = particle_q[vertex]
         velocity = particle_qd[vertex]
     x0[vertex] = wp.vec3()
-    if steer[UNDETECTED] == 1 and vertices.inverse_mass[vertex] > 0.0:
+    if status.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
         x0[vertex] = x1
         x1 = wp.vec3()
         velocity = wp.vec3()
@@ -104,151 +101,163 @@ def _begin(
 
 
 @wp.kernel(**_KERNEL)
-def _begin_undoing(
-    history: History,
-    steer: wp.array[int],
-    projections: int,
+def _begin_adjoint(
+    # in
+    record: StepRecord,
+    status: SolveStatus,
+    max_iterations: int,
     complete: wp.array[int],
-    cursor: wp.array[int],
-    more: wp.array[int],
-    back: wp.array[int],
+    # out
+    cursor: Cursor,
+    more_sweeps: wp.array[int],
+    more_iterations: wp.array[int],
+    iteration: wp.array[int],
 ):
-    """Puts the cursor behind the last iteration on velocities; ``more`` says of iterations and rounds if there are."""
-    cursor[CURRENT] = -1
-    if complete[0] == 0:  # what is missing cannot be undone, and where it would be there is nothing to read
-        cursor[FIRST] = 0
-        cursor[NEXT] = -1
+    """Puts the cursor behind the last sweep on velocities; of an incomplete record, nothing is read."""
+    cursor.current_sweep[0] = -1
+    if complete[0] == 0:
+        cursor.first_sweep[0] = 0
+        cursor.next_sweep[0] = -1
         return
-    mark = wp.min(steer[ROUND], projections + TRUNCATIONS + 1)
-    cursor[MARK] = mark
-    cursor[FIRST] = history.iterations[mark + 1]
-    cursor[NEXT] = history.sizes[ITERATIONS_DONE] - 1
-    more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
-    more[1] = 1
-    back[ROUND] = mark
+    last = wp.min(status.iteration[0], max_iterations + MAX_TRUNCATIONS + 1)
+    cursor.iteration[0] = last
+    cursor.first_sweep[0] = record.sweep_offsets[last + 1]
+    cursor.next_sweep[0] = record.counts.sweeps[0] - 1
+    more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
+    more_iterations[0] = 1
+    iteration[0] = last
 
 
 @wp.kernel(**_KERNEL)
-def _begin_round(history: History, cursor: wp.array[int], more: wp.array[int]):
-    """Puts the cursor behind the last iteration on positions of a round."""
-    mark = cursor[MARK]
-    cursor[FIRST] = history.iterations[mark]
-    cursor[NEXT] = history.iterations[mark + 1] - 1
-    more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
+def _begin_iteration(record: StepRecord, cursor: Cursor, more_sweeps: wp.array[int]):
+    """Puts the cursor behind the last sweep on positions of its iteration."""
+    iteration = cursor.iteration[0]
+    cursor.first_sweep[0] = record.sweep_offsets[iteration]
+    cursor.next_sweep[0] = record.sweep_offsets[iteration + 1] - 1
+    more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
 
 
 @wp.kernel(**_KERNEL)
-def _to_detection(cursor: wp.array[int], back: wp.array[int]):
-    """Goes back to the detection before a round."""
-    back[ROUND] = wp.max(cursor[MARK] - 1, 0)
+def _to_detection(cursor: Cursor, iteration: wp.array[int]):
+    """Sets the iteration to that of the detection before the cursor's iteration."""
+    iteration[0] = wp.max(cursor.iteration[0] - 1, 0)
 
 
 @wp.kernel(**_KERNEL)
-def _end_round(cursor: wp.array[int], more: wp.array[int]):
-    """Goes back to the round before."""
-    cursor[MARK] = cursor[MARK] - 1
-    more[1] = wp.where(cursor[MARK] >= 0, 1, 0)
+def _end_iteration(cursor: Cursor, more_iterations: wp.array[int]):
+    """Moves the cursor to the iteration before."""
+    cursor.iteration[0] = cursor.iteration[0] - 1
+    more_iterations[0] = wp.where(cursor.iteration[0] >= 0, 1, 0)
 
 
 @wp.kernel(**_KERNEL)
-def _undo(
+def _restore_multipliers(
+    motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
-    progress: Progress,
-    cursor: wp.array[int],
+    record: StepRecord,
+    cursor: Cursor,
     multiplier: wp.array[wp.vec3d],
     sums: wp.array2d[wp.int64],
 ):
-    """Takes back what an iteration did to multipliers, and to the sums of what they change."""
-    entry = entry_of(progress.history, cursor[NEXT], wp.tid())
-    if cursor[NEXT] < cursor[FIRST] or entry < 0:
+    """Restores multipliers as they were before a sweep, and the sums of what they changed."""
+    entry = entry_of(record, cursor.next_sweep[0], wp.tid())
+    if cursor.next_sweep[0] < cursor.first_sweep[0] or entry < 0:
         return
-    i = progress.history.constraint[entry]
-    old = progress.history.multiplier[entry]
-    spread(vertices, constraints, i, old - multiplier[i], sums)
+    i = record.constraint[entry]
+    old = record.multiplier[entry]
+    add_delta(motion, constraints, i, old - multiplier[i], sums)
     multiplier[i] = old
-    constraints.reached[i] = progress.history.reached[entry]
+    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     for j in range(4):
         wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
 
 
 @wp.func
-def _step_back(vertex: int, cursor: wp.array[int], more: wp.array[int]):
-    """Lets the cursor be at the iteration that is being undone, and the next be the one before."""
+def _step_back(vertex: int, cursor: Cursor, more_sweeps: wp.array[int]):
+    """Makes the next sweep the current one, and the one before it the next."""
     if vertex == 0:
-        iteration = cursor[NEXT]
-        undone = iteration >= cursor[FIRST]
-        cursor[CURRENT] = wp.where(undone, iteration, -1)
-        cursor[NEXT] = wp.where(undone, iteration - 1, iteration)
-        more[0] = wp.where(cursor[NEXT] >= cursor[FIRST], 1, 0)
+        sweep = cursor.next_sweep[0]
+        exists = sweep >= cursor.first_sweep[0]
+        cursor.current_sweep[0] = wp.where(exists, sweep, -1)
+        cursor.next_sweep[0] = wp.where(exists, sweep - 1, sweep)
+        more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
 
 
 @wp.kernel(**_KERNEL)
-def _undo_displacements(vertices: Vertices, gradients: _Gradients, cursor: wp.array[int], more: wp.array[int]):
-    """Moves vertices back to where they were before an iteration, and adds up their gradients."""
+def _restore_positions(
+    motion: Motion, vertices: Vertices, gradients: _Gradients, cursor: Cursor, more_sweeps: wp.array[int]
+):
+    """Restores positions as they were before a sweep, and adds up their gradients."""
     vertex = wp.tid()
-    _step_back(vertex, cursor, more)
+    _step_back(vertex, cursor, more_sweeps)
     gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
     gradients.more_x1[vertex] = wp.vec3()
-    if vertices.active[vertex] != 0 and vertices.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+    if vertices.active[vertex] != 0 and motion.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
 
 
 @wp.kernel(**_KERNEL)
-def _undo_turn(vertices: Vertices):
-    """Gives vertices the velocities that they had before they were turned."""
+def _restore_unturned(motion: Motion, vertices: Vertices):
+    """Restores velocities as they were before vertices were turned."""
     vertex = wp.tid()
-    if turns(vertices, vertex):
-        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+    if turns(motion, vertices, vertex):
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
 
 
 @wp.kernel(**_KERNEL)
-def _undo_velocities(vertices: Vertices, gradients: _Gradients, cursor: wp.array[int], more: wp.array[int]):
-    """Gives vertices the velocities that they had before an iteration, and adds up their gradients."""
+def _restore_velocities(
+    motion: Motion, vertices: Vertices, gradients: _Gradients, cursor: Cursor, more_sweeps: wp.array[int]
+):
+    """Restores velocities as they were before a sweep, and adds up their gradients."""
     vertex = wp.tid()
-    _step_back(vertex, cursor, more)
+    _step_back(vertex, cursor, more_sweeps)
     gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
     gradients.more_velocity[vertex] = wp.vec3()
-    gradients.push[vertex] = wp.vec3()
-    if vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] <= PROJECTED:
-        gradients.push[vertex] = gradients.velocity[vertex]
-        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+    gradients.velocity_change[vertex] = wp.vec3()
+    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] <= PROJECTED:
+        gradients.velocity_change[vertex] = gradients.velocity[vertex]
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
 
 
 @wp.kernel(**_KERNEL)
-def _undo_truncations(
+def _restore_paths(
+    # in
     vertices: Vertices,
     gradients: _Gradients,
-    history: History,
-    cursor: wp.array[int],
+    record: StepRecord,
+    cursor: Cursor,
+    # out
     end: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Lets paths that were cut end where they did before; the gradients of what was cut go to ``end`` and velocity."""
-    mark = cursor[MARK]
-    entry = history.truncations[mark] + wp.tid()
-    if entry >= history.truncations[mark + 1]:
+    """Restores the ends of truncated paths; the gradients of their vertices move to ``end`` and ``velocity``."""
+    iteration = cursor.iteration[0]
+    entry = record.truncation_offsets[iteration] + wp.tid()
+    if entry >= record.truncation_offsets[iteration + 1]:
         return
-    vertex = history.vertex[entry]
+    vertex = record.vertex[entry]
     end[entry] = gradients.x1[vertex]
     velocity[entry] = gradients.velocity[vertex]
     gradients.x1[vertex] = wp.vec3()
     gradients.velocity[vertex] = wp.vec3()
-    vertices.x1[vertex] = history.end[entry]
+    vertices.x1[vertex] = record.end[entry]
 
 
 @wp.kernel(**_KERNEL)
 def _finish(
+    # in
     gradients: _Gradients,
     x0: wp.array[wp.vec3],
     wanted_x1: wp.array[wp.vec3],
     wanted_velocity: wp.array[wp.vec3],
     complete: wp.array[int],
+    # out
     start_q: wp.array[wp.vec3],
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
 ):
-    """Hands over the gradients of what the step started from; NaN if it was not all taken down."""
+    """Writes the gradients of the inputs of the step; NaN if its record is incomplete."""
     particle = wp.tid()
     missing = float(0.0)
     if complete[0] == 0:
@@ -261,62 +270,71 @@ def _finish(
 
 
 @wp.kernel(**_KERNEL)
-def _judge(constraints: wp.array[int], history: History, room: int, complete: wp.array[int]):
-    """Whether all that a step did has found room in its recording."""
-    sizes = history.sizes
-    fits = constraints[0] <= room and sizes[FORGOTTEN] == 0
-    fits = fits and sizes[ITERATIONS_DONE] <= history.ends.shape[0]
-    fits = fits and sizes[ENTRIES] <= history.constraint.shape[0]
-    fits = fits and sizes[TRUNCATED_PATHS] <= history.vertex.shape[0]
+def _check_complete(constraints: wp.array[int], record: StepRecord, capacity: int, complete: wp.array[int]):
+    """Sets ``complete`` to 1 if everything that a step did fits in its record, else to 0."""
+    counts = record.counts
+    fits = constraints[0] <= capacity and counts.dropped[0] == 0
+    fits = fits and counts.sweeps[0] <= record.sweep_ends.shape[0]
+    fits = fits and counts.entries[0] <= record.constraint.shape[0]
+    fits = fits and counts.truncations[0] <= record.vertex.shape[0]
     complete[0] = wp.where(fits, 1, 0)
 
 
-class Recording:
-    """A step as it was taken down: as much of it as there is or, in a CUDA graph, as there is room for.
+class RecordedStep:
+    """A copy of a step for its adjoint: its record and results, as far as they fit in the buffers of a CUDA graph.
 
     Attributes:
         dt: Length of the step [s].
-        vertices: The vertices at its end.
-        constraints: The constraints at its end.
-        history: What was done.
-        half_spaces: The half-spaces.
-        steer: What the response was steered by.
-        complete: Array of one int, 1 where nothing is missing.
+        motion: The motion that the inner solver wanted, :class:`.buffers.Motion`.
+        planes: The planes, :class:`.planes.MovingPlanes`.
+        vertices: The vertices at the end, :class:`.buffers.Vertices`.
+        constraints: The constraints at the end, :class:`.buffers.Constraints`.
+        status: The solve status at the end, :class:`.buffers.SolveStatus`.
+        record: What each sweep and truncation changed, :class:`.step_record.StepRecord`.
+        complete: Array of one int, 1 if nothing is missing.
     """
 
-    def __init__(self, response, dt):
-        """Copies what a response has just done."""
+    def __init__(self, motion, resolution, recorder, dt: float):
+        """Copies a step.
+
+        Args:
+            motion: The :class:`.model_motion.ModelMotion` that was resolved.
+            resolution: The :class:`.response.Resolution`.
+            recorder: The :class:`.step_record.StepRecorder` that recorded it.
+            dt: Length of the step [s].
+        """
         self.dt = dt
-        constraints, history = response.constraints, response.history.arrays
-        if response.device.is_capturing:
-            count, iterations = len(constraints.vertices), len(history.ends)
-            entries, truncations = len(history.constraint), len(history.vertex)
+        constraints, record, device = resolution.constraints, recorder.record, recorder.counts.device
+        if device.is_capturing:
+            count, sweeps = len(constraints.vertices), len(record.sweep_ends)
+            entries, truncations = len(record.constraint), len(record.vertex)
         else:
             count = int(constraints.count.numpy()[0])
-            iterations, entries, truncations = (
-                int(history.sizes.numpy()[int(place)]) for place in (ITERATIONS_DONE, ENTRIES, TRUNCATED_PATHS)
+            sweeps, entries, truncations = (
+                int(getattr(record.counts, name).numpy()[0]) for name in ("sweeps", "entries", "truncations")
             )
-        self.steer = wp.clone(response.steer)
-        self.half_spaces = HalfSpaces()
-        for name in ("start", "end"):
-            setattr(self.half_spaces, name, wp.clone(getattr(response.half_spaces, name)))
-        self.vertices = _copied(response.vertices, Vertices(), dict.fromkeys(_OF_VERTICES))
+        self.status = name_elements(SolveStatus, wp.clone(resolution.status_values))
+        self.planes = _copied(motion.planes, MovingPlanes(), dict.fromkeys(("start", "end")))
+        self.motion = _copied(motion.vertices, Motion(), dict.fromkeys(_MOTION_ARRAYS))
         for name in ("inverse_mass", "friction", "world"):
-            setattr(self.vertices, name, getattr(response.vertices, name))
-        self.constraints = _copied(constraints, Constraints(), {**dict.fromkeys(_OF_CONSTRAINTS, count), "count": 1})
-        lengths = {"sizes": None, "ends": iterations, **dict.fromkeys(MARKED)}
-        lengths |= {**dict.fromkeys(OF_ENTRIES, entries), **dict.fromkeys(OF_TRUNCATIONS, truncations)}
-        self.history = _copied(history, History(), lengths)
-        self.complete = wp.empty(1, dtype=int, device=response.device)
-        inputs = [constraints.count, history, count]
-        wp.launch(_judge, 1, inputs=inputs, outputs=[self.complete], device=response.device)
+            setattr(self.motion, name, getattr(motion.vertices, name))
+        self.vertices = _copied(resolution.vertices, Vertices(), dict.fromkeys(_VERTEX_ARRAYS))
+        lengths = {**dict.fromkeys(_CONSTRAINT_ARRAYS, count), "count": 1}
+        self.constraints = _copied(constraints, Constraints(), lengths)
+        lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}
+        lengths |= {**dict.fromkeys(PER_ENTRY, entries), **dict.fromkeys(PER_TRUNCATION, truncations)}
+        self.record = _copied(record, StepRecord(), lengths)
+        self.record.counts = name_elements(RecordCounts, wp.clone(recorder.counts))
+        self.complete = wp.empty(1, dtype=int, device=device)
+        inputs = [constraints.count, record, count]
+        wp.launch(_check_complete, 1, inputs=inputs, outputs=[self.complete], device=device)
 
 
 def _copied(struct, into, lengths):
     """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
     for name, length in lengths.items():
         array = getattr(struct, name)
-        if length == 0:  # of which Warp makes no slices
+        if length == 0:  # Warp makes no empty slices
             setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))
         else:
             setattr(into, name, wp.clone(array if length is None else array[:length]))
@@ -324,7 +342,7 @@ def _copied(struct, into, lengths):
 
 
 def _give_gradients(struct, names, gradients=None):
-    """Replaces arrays of a struct by ones of the same data with gradients, given or new ones, which it returns."""
+    """Replaces arrays of a struct by aliases with gradients, given or new ones; returns the gradients by name."""
     into = SimpleNamespace(**(gradients or {}))
     for name in names:
         array = getattr(struct, name)
@@ -337,168 +355,170 @@ def _give_gradients(struct, names, gradients=None):
     return into
 
 
-class Undoing:
-    """Undoes a recorded step, and carries gradients along."""
+class StepAdjoint:
+    """Goes back through a recorded step, and carries gradients along."""
 
-    def __init__(self, recording, response):
-        """Prepares to undo a recording of a response."""
-        self._recording, self._response, self._device = recording, response, response.device
-        self._launch_count = len(recording.constraints.vertices)
-        device, n = self._device, len(recording.vertices.x0)
+    def __init__(self, step: RecordedStep, response):
+        """Copies what going back changes.
+
+        Args:
+            step: The step.
+            response: The :class:`.response.Response` that resolved it.
+        """
+        self._step, self._response, self._device = step, response, response.device
+        self._constraint_count = len(step.constraints.vertices)
+        device, n = self._device, len(step.motion.x0)
         self._gradients = gradients = _Gradients()
         for name in _Gradients.vars:
             setattr(gradients, name, wp.zeros(n, dtype=wp.vec3, device=device))
-        self._vertices = vertices = _copied(recording.vertices, Vertices(), dict.fromkeys(_UNDONE_OF_VERTICES))
-        for name in set(_OF_VERTICES) - set(_UNDONE_OF_VERTICES) | {"inverse_mass", "friction", "world"}:
-            setattr(vertices, name, getattr(recording.vertices, name))
+        self._motion = motion = Motion()
+        for name in (*_MOTION_ARRAYS, "inverse_mass", "friction", "world"):
+            setattr(motion, name, getattr(step.motion, name))
+        self._of_motion = _give_gradients(motion, _MOTION_ARRAYS)
+        self._vertices = vertices = _copied(step.vertices, Vertices(), dict.fromkeys(_RESTORED_VERTEX_ARRAYS))
+        vertices.outcome = step.vertices.outcome
         vertices.active = wp.zeros(n, dtype=int, device=device)
         of_vertices = {"x1": gradients.more_x1, "velocity": gradients.more_velocity}
-        self._of_vertices = _give_gradients(
-            vertices, ("x0", "x1", "velocity", "wanted_x1", "wanted_velocity"), of_vertices
-        )
+        _give_gradients(vertices, of_vertices, of_vertices)
         self._constraints = constraints = _copied(
-            recording.constraints, Constraints(), dict.fromkeys(_UNDONE_OF_CONSTRAINTS)
+            step.constraints, Constraints(), dict.fromkeys(_RESTORED_CONSTRAINT_ARRAYS)
         )
-        for name in set(_OF_CONSTRAINTS) - set(_UNDONE_OF_CONSTRAINTS) | {"count"}:
-            setattr(constraints, name, getattr(recording.constraints, name))
+        for name in set(_CONSTRAINT_ARRAYS) - set(_RESTORED_CONSTRAINT_ARRAYS) | {"count"}:
+            setattr(constraints, name, getattr(step.constraints, name))
         self._of_constraints = _give_gradients(constraints, _DIFFERENTIABLE)
-        truncations = len(recording.history.vertex)
+        truncations = len(step.record.vertex)
         self._of_truncations = [wp.zeros(truncations, dtype=wp.vec3, device=device) for _ in range(2)]
-        self._pushed = wp.empty(n, dtype=wp.vec3, device=device)
+        self._vertex_changes = wp.empty(n, dtype=wp.vec3, device=device)
         self._progress = Progress()
-        self._progress.steer = wp.zeros(int(STEER), dtype=int, device=device)
-        self._progress.history = recording.history
-        self._cursor = wp.zeros(int(CURSOR), dtype=int, device=device)
-        self._more = wp.zeros(2, dtype=int, device=device)
-        self._more_iterations, self._more_rounds = self._more[:1], self._more[1:]
+        self._progress.status = name_elements(SolveStatus, wp.zeros(len(SolveStatus.vars), dtype=int, device=device))
+        self._cursor = name_elements(Cursor, wp.zeros(len(Cursor.vars), dtype=int, device=device))
+        self._more_sweeps, self._more_iterations = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
 
-    def backward(self, start_q, particle_q, particle_qd):
-        """Turns gradients with respect to what the step led to into those with respect to what it came from.
+    def backward(
+        self, start_q: wp.array[wp.vec3], particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3]
+    ) -> None:
+        """Turns gradients with respect to the results of the step into those with respect to its inputs, in place.
 
         Args:
-            start_q: Gradient with respect to positions at the start, to which it is added, array of vec3.
-            particle_q: Gradient with respect to the positions at the end, array of vec3; in its place is put that with
+            start_q: Gradient with respect to positions at the start, shape [particle_count]; is added to.
+            particle_q: Gradient with respect to the positions at the end, shape [particle_count]; becomes that with
                 respect to the positions that the inner solver wanted.
             particle_qd: The same for the velocities.
         """
-        recording, vertices, gradients = self._recording, self._vertices, self._gradients
-        history, of_vertices = recording.history, self._of_vertices
-        inputs = [vertices, gradients, recording.steer, particle_q, particle_qd]
-        self._launch(_begin, len(vertices.x0), inputs, [of_vertices.x0])
-        inputs = [history, recording.steer, self._response.projections, recording.complete]
-        self._launch(_begin_undoing, 1, inputs, [self._cursor, self._more, self._progress.steer])
-        self._undo_turn()
-        wp.capture_while(self._more_iterations, self._batch, undo=self._undo_acceleration)
-        self._undo_start()
-        wp.capture_while(self._more_rounds, self._undo_round)
-        inputs = [gradients, of_vertices.x0, of_vertices.wanted_x1, of_vertices.wanted_velocity, recording.complete]
+        step, motion, gradients, of_motion = self._step, self._motion, self._gradients, self._of_motion
+        iteration = self._progress.status.iteration
+        inputs, outputs = [motion, step.status, particle_q, particle_qd], [gradients, of_motion.x0]
+        self._launch(_begin, len(motion.x0), inputs, outputs)
+        inputs = [step.record, step.status, self._response.max_iterations, step.complete]
+        outputs = [self._cursor, self._more_sweeps, self._more_iterations, iteration]
+        self._launch(_begin_adjoint, 1, inputs, outputs)
+        self._through_turn()
+        wp.capture_while(self._more_sweeps, self._batch, through=self._through_velocity_sweep)
+        self._through_initialization()
+        wp.capture_while(self._more_iterations, self._through_iteration)
+        inputs = [gradients, of_motion.x0, of_motion.x1, of_motion.velocity, step.complete]
         self._launch(_finish, len(particle_q), inputs, [start_q, particle_q, particle_qd])
 
-    def _undo_turn(self):
-        """Undoes the turn that keeps angular momentum."""
-        vertices, constraints = self._vertices, self._constraints
-        n = len(vertices.x0)
-        self._launch(_undo_turn, n, [vertices])
+    def _through_turn(self):
+        """Goes back through the turn that conserves angular momentum."""
+        motion, vertices, constraints = self._motion, self._vertices, self._constraints
+        n = len(motion.x0)
+        self._launch(_restore_unturned, n, [motion, vertices])
         totals = wp.zeros((self._response.worlds, int(SUMS)), dtype=wp.float64, device=self._device, requires_grad=True)
-        self._launch(twisting, self._launch_count, [vertices, constraints], [totals])
-        self._launch(massing, n, [vertices], [totals])
-        self._adjoin(turning, n, [vertices, totals], [self._gradients.velocity])
-        self._adjoin(massing, n, [vertices], [totals.grad])
-        self._adjoin(twisting, self._launch_count, [vertices, constraints], [totals.grad])
+        self._launch(add_torques, self._constraint_count, [motion, vertices, constraints], [totals])
+        self._launch(add_moments, n, [motion, vertices], [totals])
+        self._adjoin(turn_velocities, n, [motion, vertices, totals], [self._gradients.velocity])
+        self._adjoin(add_moments, n, [motion, vertices], [totals.grad])
+        self._adjoin(add_torques, self._constraint_count, [motion, vertices, constraints], [totals.grad])
 
-    def _batch(self, undo):
-        for _ in range(BATCH):
-            undo()
+    def _batch(self, through):
+        for _ in range(SWEEPS_PER_BATCH):
+            through()
 
-    def _undo_acceleration(self):
-        """Undoes an iteration on velocities."""
+    def _through_velocity_sweep(self):
+        """Goes back through a sweep on velocities."""
         constraints, of_constraints = self._constraints, self._of_constraints
-        self._undo(constraints.impulse, self._vertices.velocity_change)
-        self._undo_velocities()
+        self._restore_multipliers(constraints.velocity_multiplier, self._vertices.particle_delta_v)
+        self._restore(_restore_velocities)
         self._adjoin(
-            accelerating,
-            self._launch_count,
-            [self._vertices, constraints, self._progress, self._cursor, self._response.restitution],
-            [of_constraints.impulse, of_constraints.reached, self._gradients.push],
+            change_velocity_multipliers,
+            self._constraint_count,
+            [self._motion, self._vertices, constraints, self._step.record, self._cursor, self._response.restitution],
+            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier, self._gradients.velocity_change],
         )
         self._vertices.active.zero_()
 
-    def _undo_velocities(self):
-        inputs = [self._vertices, self._gradients, self._cursor, self._more]
-        self._launch(_undo_velocities, len(self._vertices.x0), inputs)
-
-    def _undo_start(self):
-        """Undoes the impulses to begin with."""
-        constraints, of_constraints = self._constraints, self._of_constraints
-        self._undo_velocities()
-        self._adjoin(
-            starting,
-            self._launch_count,
-            [self._vertices, constraints, self._recording.dt],
-            [of_constraints.impulse, of_constraints.reached, self._gradients.push],
-        )
-        of_constraints.reached.zero_()
-
-    def _undo_round(self):
-        """Undoes a round: truncation or projection, and what its contacts were made of."""
-        self._undo_displacements()
-        self._undo_truncations()
-        inputs = [self._recording.history, self._cursor]
-        self._launch(_begin_round, 1, inputs, [self._more])
-        wp.capture_while(self._more_iterations, self._batch, undo=self._undo_displacement)
-        self._launch(_to_detection, 1, [self._cursor], [self._progress.steer])
+    def _through_initialization(self):
+        """Goes back through the initial velocity multipliers."""
         of_constraints = self._of_constraints
+        self._restore(_restore_velocities)
         self._adjoin(
-            constraining,
-            self._launch_count,
-            [self._vertices, self._recording.constraints, self._progress, self._cursor, self._response.separation],
-            [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.urgency],
+            initialize_multipliers,
+            self._constraint_count,
+            [self._motion, self._constraints, self._step.dt],
+            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier, self._gradients.velocity_change],
         )
-        self._launch(_end_round, 1, [self._cursor], [self._more])
+        of_constraints.previous_multiplier.zero_()
 
-    def _undo_displacement(self):
-        """Undoes an iteration on positions."""
-        constraints, of_constraints = self._constraints, self._of_constraints
-        self._undo(constraints.displacing, self._vertices.displacement)
-        self._undo_displacements()
+    def _through_iteration(self):
+        """Goes back through an iteration: truncation, sweeps, and the constraints that its detection added."""
+        self._restore(_restore_positions)
+        self._through_truncation()
+        self._launch(_begin_iteration, 1, [self._step.record, self._cursor], [self._more_sweeps])
+        wp.capture_while(self._more_sweeps, self._batch, through=self._through_position_sweep)
+        self._launch(_to_detection, 1, [self._cursor], [self._progress.status.iteration])
+        step, of_constraints, separation = self._step, self._of_constraints, self._response.separation
         self._adjoin(
-            displacing,
-            self._launch_count,
-            [self._vertices, constraints, self._progress, self._cursor],
-            [of_constraints.displacing, of_constraints.reached, self._gradients.x1],
+            make_constraints,
+            self._constraint_count,
+            [self._motion, self._vertices, step.constraints, self._progress, step.record, self._cursor, separation],
+            [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.approach],
+        )
+        self._launch(_end_iteration, 1, [self._cursor], [self._more_iterations])
+
+    def _through_position_sweep(self):
+        """Goes back through a sweep on positions."""
+        constraints, of_constraints = self._constraints, self._of_constraints
+        self._restore_multipliers(constraints.position_multiplier, self._vertices.particle_delta_x)
+        self._restore(_restore_positions)
+        self._adjoin(
+            change_position_multipliers,
+            self._constraint_count,
+            [self._motion, self._vertices, constraints, self._progress, self._step.record, self._cursor],
+            [of_constraints.position_multiplier, of_constraints.previous_multiplier, self._gradients.x1],
         )
         self._vertices.active.zero_()
 
-    def _undo_displacements(self):
-        inputs = [self._vertices, self._gradients, self._cursor, self._more]
-        self._launch(_undo_displacements, len(self._vertices.x0), inputs)
+    def _through_truncation(self):
+        """Goes back through the truncation of paths."""
+        motion, vertices, step = self._motion, self._vertices, self._step
+        truncations = len(step.record.vertex)
+        inputs = [vertices, self._gradients, step.record, self._cursor]
+        self._launch(_restore_paths, truncations, inputs, self._of_truncations)
+        inputs = [motion, vertices, step.planes, step.record, self._cursor, step.dt]
+        self._adjoin(truncate_paths, truncations, inputs, self._of_truncations)
 
-    def _undo_truncations(self):
-        vertices, history = self._vertices, self._recording.history
-        truncations = len(history.vertex)
-        ends, velocities = self._of_truncations
-        inputs = [vertices, self._gradients, history, self._cursor]
-        self._launch(_undo_truncations, truncations, inputs, [ends, velocities])
-        self._adjoin(
-            truncating,
-            truncations,
-            [vertices, self._recording.half_spaces, self._progress, self._cursor, self._recording.dt],
-            [ends, velocities],
-        )
+    def _restore(self, kernel):
+        """Restores positions or velocities as they were before a sweep."""
+        inputs = [self._motion, self._vertices, self._gradients, self._cursor, self._more_sweeps]
+        self._launch(kernel, len(self._motion.x0), inputs)
 
-    def _undo(self, multiplier, sums):
-        inputs = [self._vertices, self._constraints, self._progress, self._cursor, multiplier]
-        self._launch(_undo, self._launch_count, inputs, [sums])
+    def _restore_multipliers(self, multiplier, sums):
+        inputs = [self._motion, self._vertices, self._constraints, self._step.record, self._cursor, multiplier]
+        self._launch(_restore_multipliers, self._constraint_count, inputs, [sums])
 
     def _launch(self, kernel, dim, inputs, outputs=()):
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
 
     def _adjoin(self, kernel, dim, inputs, of_outputs):
-        """Launches the adjoint of a kernel.
+        """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
-        It does not touch outputs, which their gradients stand for, but for those that functions add to.
+        The adjoint does not read or write outputs, so their gradients stand in for them, except for the changes of
+        vertices, which functions add to.
         """
-        outputs = [self._pushed if of is self._gradients.x1 or of is self._gradients.push else of for of in of_outputs]
+        gradients = self._gradients
+        added_to = gradients.x1, gradients.velocity_change
+        outputs = [self._vertex_changes if any(of is x for x in added_to) else of for of in of_outputs]
         of_inputs = [value._cls() if hasattr(value, "_cls") else None for value in inputs]
         wp.launch(
             kernel,

@@ -1,64 +1,71 @@
-"""The small steps of a response as functions that Warp differentiates: what each changes.
+"""The small steps of a response as kernels that Warp differentiates; :mod:`.adjoint` launches their adjoints.
 
-Their adjoints are what :mod:`.adjoint` launches; what they do is done by the modules that they name.
+Each computes what a kernel of the forward pass changes, by the same functions.
 """
 
 import warp as wp
 
-from ..detection.narrow_phase import TOLERANCE, Count
+from ..detection.settings import TOLERANCE, Count
 from ..kernels.gradients import with_gradients
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import Impact
 from .angular_momentum import HELD, MASS, MOMENTS, Moments, acts, change_by_turn, is_held, moments, torque_of, turns
+from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
-    NEAR_EDGES,
-    ON_PLANE,
-    SHARE,
+    EDGE_EDGE_PROXIMITY,
+    PLANE_CONTACT,
     VERTEX_FACE_CONTACT,
-    Constraints,
     Contacts,
-    Progress,
-    Vertices,
+    approach_of,
     contact_vertices,
     contact_weights,
     feasible,
     feasible_in_contact,
     longest_path,
-    relative,
     to_double,
     to_single,
-    urgency_of,
+    truncated_path,
     widened,
 )
-from .planes import HalfSpaces, clearance, time_of_entry
-from .projection import accelerated, displaced, starts, takes_back
-from .proximities import closest_weights
-from .step_record import GRAZING, STANDS, History
+from .planes import MovingPlanes, signed_distance, time_of_entry
+from .projection import (
+    has_pushed,
+    initial_velocity_multiplier,
+    is_reversible,
+    position_multiplier_after,
+    velocity_multiplier_after,
+    with_momentum,
+)
+from .proximities import closest_vector
+from .step_record import NO_CONTACT, StepRecord
 
 __all__ = [
-    "CURRENT",
-    "CURSOR",
-    "FIRST",
-    "MARK",
-    "NEXT",
-    "accelerating",
-    "constraining",
+    "Cursor",
+    "add_moments",
+    "add_torques",
+    "change_position_multipliers",
+    "change_velocity_multipliers",
     "count_grazing",
-    "displacing",
     "entry_of",
-    "massing",
-    "starting",
-    "truncating",
-    "turning",
-    "twisting",
+    "initialize_multipliers",
+    "make_constraints",
+    "truncate_paths",
+    "turn_velocities",
 ]
 
-NEXT, CURRENT, FIRST, MARK, CURSOR = (wp.constant(i) for i in range(5))
-"""Places in the array that says how far undoing is: the iteration to undo next, the one being undone or -1, the first
-of the round, and the mark of the round; and how many places there are."""
+
+@wp.struct
+class Cursor:
+    """Where the adjoint is in the record of a step; each field is an array of one element."""
+
+    iteration: wp.array[int]  # of detect and project
+    first_sweep: wp.array[int]  # of that iteration
+    current_sweep: wp.array[int]  # or -1
+    next_sweep: wp.array[int]  # to go back through
+
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
@@ -67,126 +74,146 @@ _ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.func
-def _push(vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, push: wp.array[wp.vec3]):
-    """Adds what the change of a multiplier does to its vertices, see :func:`.projection.spread`."""
+def _add_change(motion: Motion, constraints: Constraints, i: int, change: wp.vec3d, vertex_changes: wp.array[wp.vec3]):
+    """Adds what the change of a multiplier does to its vertices, as :func:`.projection.add_delta` does in integers."""
     for j in range(4):
         vertex = constraints.vertices[i][j]
-        share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
-        wp.atomic_add(push, vertex, to_single(share * change))
+        share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
+        wp.atomic_add(vertex_changes, vertex, to_single(share * change))
 
 
 @wp.func
-def _first_entry(history: History, iteration: int) -> int:
-    if iteration == 0:
+def _first_entry(record: StepRecord, sweep: int) -> int:
+    if sweep == 0:
         return 0
-    return history.ends[iteration - 1]
+    return record.sweep_ends[sweep - 1]
 
 
 @wp.func
-def entry_of(history: History, iteration: int, place: int) -> int:
-    """The entry of a constraint that acted in an iteration, by its place; -1 if not so many did."""
-    if iteration < 0:
+def entry_of(record: StepRecord, sweep: int, place: int) -> int:
+    """Returns the entry of the constraint at a place of a sweep's active set; -1 if the set is smaller."""
+    if sweep < 0:
         return -1
-    entry = _first_entry(history, iteration) + place
-    return wp.where(entry < history.ends[iteration], entry, -1)
+    entry = _first_entry(record, sweep) + place
+    return wp.where(entry < record.sweep_ends[sweep], entry, -1)
 
 
 @wp.kernel
-def displacing(
+def change_position_multipliers(
+    # in
+    motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
     progress: Progress,
-    cursor: wp.array[int],
-    multiplier_change: wp.array[wp.vec3d],
-    reached_change: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
+    record: StepRecord,
+    cursor: Cursor,
+    # out
+    multiplier_changes: wp.array[wp.vec3d],
+    previous_changes: wp.array[wp.vec3d],
+    vertex_changes: wp.array[wp.vec3],
 ):
-    """What an iteration on positions changes, by :func:`.projection.displace`."""
-    entry = entry_of(progress.history, cursor[CURRENT], wp.tid())
+    """Computes what a sweep on positions changes, see :func:`.projection.project_positions`."""
+    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
-    i = progress.history.constraint[entry]
-    reached = displaced(vertices, constraints, i, not takes_back(constraints, progress, i))
-    before = constraints.reached[i]
-    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.displacing[i]
-    multiplier_change[i] = change
-    reached_change[i] = reached - before
-    _push(vertices, constraints, i, change, push)
+    i = record.constraint[entry]
+    multiplier = position_multiplier_after(
+        motion, vertices, constraints, i, not is_reversible(constraints, progress, i)
+    )
+    previous = constraints.previous_multiplier[i]
+    new = with_momentum(multiplier, previous, record.momentum[entry])
+    change = new - constraints.position_multiplier[i]
+    multiplier_changes[i] = change
+    previous_changes[i] = multiplier - previous
+    _add_change(motion, constraints, i, change, vertex_changes)
 
 
 @wp.kernel
-def accelerating(
+def change_velocity_multipliers(
+    # in
+    motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
-    progress: Progress,
-    cursor: wp.array[int],
+    record: StepRecord,
+    cursor: Cursor,
     restitution: wp.float64,
-    multiplier_change: wp.array[wp.vec3d],
-    reached_change: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
+    # out
+    multiplier_changes: wp.array[wp.vec3d],
+    previous_changes: wp.array[wp.vec3d],
+    vertex_changes: wp.array[wp.vec3],
 ):
-    """What an iteration on velocities changes, by :func:`.projection.accelerate`."""
-    entry = entry_of(progress.history, cursor[CURRENT], wp.tid())
+    """Computes what a sweep on velocities changes, see :func:`.projection.project_velocities`."""
+    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
-    i = progress.history.constraint[entry]
-    reached = accelerated(vertices, constraints, i, restitution)
-    before = constraints.reached[i]
-    change = reached + progress.history.momentum[entry] * (reached - before) - constraints.impulse[i]
-    multiplier_change[i] = change
-    reached_change[i] = reached - before
-    _push(vertices, constraints, i, change, push)
+    i = record.constraint[entry]
+    multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
+    previous = constraints.previous_multiplier[i]
+    new = with_momentum(multiplier, previous, record.momentum[entry])
+    change = new - constraints.velocity_multiplier[i]
+    multiplier_changes[i] = change
+    previous_changes[i] = multiplier - previous
+    _add_change(motion, constraints, i, change, vertex_changes)
 
 
 @wp.kernel
-def starting(
-    vertices: Vertices,
+def initialize_multipliers(
+    # in
+    motion: Motion,
     constraints: Constraints,
     dt: wp.float64,
-    impulse: wp.array[wp.vec3d],
-    reached: wp.array[wp.vec3d],
-    push: wp.array[wp.vec3],
+    # out
+    velocity_multipliers: wp.array[wp.vec3d],
+    previous_multipliers: wp.array[wp.vec3d],
+    vertex_changes: wp.array[wp.vec3],
 ):
-    """The impulses to begin with, by :func:`.projection.start_impulses`."""
+    """Computes the initial velocity multipliers, see :func:`.projection.initialize_velocity_multipliers`."""
     i = wp.tid()
-    if i < constraints.count[0] and starts(constraints, i):
-        first = constraints.displacing[i] * (constraints.urgency[i] / dt)
-        impulse[i] = first
-        reached[i] = first
-        _push(vertices, constraints, i, first, push)
+    if i < constraints.count[0] and has_pushed(constraints, i):
+        first = initial_velocity_multiplier(constraints, i, dt)
+        velocity_multipliers[i] = first
+        previous_multipliers[i] = first
+        _add_change(motion, constraints, i, first, vertex_changes)
 
 
 @wp.kernel
-def twisting(vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
-    """The torques that contacts have added in each world, by :func:`.angular_momentum.sum_torques`."""
+def add_torques(motion: Motion, vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
+    """Adds the torques of contacts to the totals of their worlds, see :func:`.angular_momentum.sum_torques`."""
     i = wp.tid()
     if i >= constraints.count[0] or not acts(constraints, i):
         return
-    world = vertices.world[constraints.vertices[i][0]]
-    if is_held(vertices, constraints, i):
+    world = motion.world[constraints.vertices[i][0]]
+    if is_held(motion, vertices, constraints, i):
         totals[world, HELD] = _ONE
     else:
-        torque = torque_of(vertices, constraints, i)
+        torque = torque_of(motion, vertices, constraints, i)
         for axis in range(3):
             wp.atomic_add(totals, world, axis, torque[axis])
 
 
 @wp.kernel
-def massing(vertices: Vertices, totals: wp.array2d[wp.float64]):
-    """The moments of what has collided in each world, by :func:`.angular_momentum.sum_bodies`."""
+def add_moments(motion: Motion, vertices: Vertices, totals: wp.array2d[wp.float64]):
+    """Adds the moments of vertices to the totals of their worlds, see :func:`.angular_momentum.sum_moments`."""
     vertex = wp.tid()
-    if turns(vertices, vertex):
-        added = moments(vertices, vertex)
+    if turns(motion, vertices, vertex):
+        added = moments(motion, vertices, vertex)
         for i in range(MOMENTS):
-            wp.atomic_add(totals, vertices.world[vertex], MASS + i, added[i])
+            wp.atomic_add(totals, motion.world[vertex], MASS + i, added[i])
 
 
 @wp.kernel
-def turning(vertices: Vertices, totals: wp.array2d[wp.float64], change: wp.array[wp.vec3]):
-    """How the turn of each world changes velocities, by :func:`.angular_momentum.turn_vertices`."""
+def turn_velocities(
+    # in
+    motion: Motion,
+    vertices: Vertices,
+    totals: wp.array2d[wp.float64],
+    # out
+    changes: wp.array[wp.vec3],
+):
+    """Computes what the turn of each world changes, see :func:`.angular_momentum.turn_vertices`."""
     vertex = wp.tid()
-    world = vertices.world[vertex]
-    if not turns(vertices, vertex) or totals[world, HELD] != _ZERO:
+    world = motion.world[vertex]
+    if not turns(motion, vertices, vertex) or totals[world, HELD] != _ZERO:
         return
     torque = wp.vec3d(totals[world, 0], totals[world, 1], totals[world, 2])
     total = Moments(
@@ -202,11 +229,12 @@ def turning(vertices: Vertices, totals: wp.array2d[wp.float64], change: wp.array
         totals[world, MASS + 9],
         totals[world, MASS + 10],
     )
-    change[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
+    changes[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
 
 
 @wp.func
-def _touching(
+def _impact(
+    motion: Motion,
     vertices: Vertices,
     corners: wp.vec4i,
     kind: int,
@@ -215,7 +243,7 @@ def _touching(
     coordinates: wp.vec3d,
     normal: wp.vec3d,
 ) -> Impact:
-    """A contact as a function of where its vertices are."""
+    """Returns a contact as a differentiable function of the positions of its vertices."""
     found = Impact()
     found.status = wp.where(localized, HIT, UNSURE)
     found.localized = wp.where(localized, 1, 0)
@@ -224,10 +252,10 @@ def _touching(
     found.normal = normal
     return with_gradients(
         wp.where(kind == EDGE_EDGE_CONTACT, EDGE_EDGE, VERTEX_FACE),
-        to_double(vertices.x0[corners[0]]),
-        to_double(vertices.x0[corners[1]]),
-        to_double(vertices.x0[corners[2]]),
-        to_double(vertices.x0[corners[3]]),
+        to_double(motion.x0[corners[0]]),
+        to_double(motion.x0[corners[1]]),
+        to_double(motion.x0[corners[2]]),
+        to_double(motion.x0[corners[3]]),
         to_double(vertices.x1[corners[0]]),
         to_double(vertices.x1[corners[1]]),
         to_double(vertices.x1[corners[2]]),
@@ -238,104 +266,113 @@ def _touching(
 
 
 @wp.kernel
-def constraining(
+def make_constraints(
+    # in
+    motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
     progress: Progress,
-    cursor: wp.array[int],
+    record: StepRecord,
+    cursor: Cursor,
     least: wp.float64,
+    # out
     weights: wp.array[wp.vec4d],
     normals: wp.array[wp.vec3d],
     separations: wp.array[wp.float64],
-    urgencies: wp.array[wp.float64],
+    approaches: wp.array[wp.float64],
 ):
-    """What a round's constraints were made of contacts and near pairs, by :func:`.constraints.collect_contacts`."""
-    mark = cursor[MARK]
+    """Computes the constraints that an iteration added, from contacts and proximities.
+
+    See :func:`.constraints.collect_contacts` and :func:`.proximities.collect_proximities`.
+    """
+    iteration = cursor.iteration[0]
     i = wp.tid()
-    if mark > 0:
-        i += progress.history.constraints[mark - 1]
-    if i >= progress.history.constraints[mark]:
+    if iteration > 0:
+        i += record.constraint_offsets[iteration - 1]
+    if i >= record.constraint_offsets[iteration]:
         return
     corners = constraints.vertices[i]
-    origin = constraints.origin[i]
+    kind = constraints.kind[i]
     weight = constraints.weights[i]
     normal = constraints.normal[i]
     separation = constraints.separation[i]
-    if origin < ON_PLANE:
-        edges = wp.where(origin == EDGE_EDGE_CONTACT, 1, 0)
+    if kind < PLANE_CONTACT:
+        edges = wp.where(kind == EDGE_EDGE_CONTACT, 1, 0)
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
         if edges == 1:
             coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
         localized = constraints.localized[i]
-        touch = _touching(vertices, corners, origin, localized, constraints.toi[i], coordinates, normal)
-        weight = contact_weights(edges, touch.coordinates)
-        normal = touch.normal
+        impact = _impact(motion, vertices, corners, kind, localized, constraints.toi[i], coordinates, normal)
+        weight = contact_weights(edges, impact.coordinates)
+        normal = impact.normal
         if constraints.slow[i] == 1:
-            asked = widened(least, progress)
-            separation = feasible_in_contact(vertices, corners, weight, normal, asked, least)
-    elif origin > ON_PLANE:
-        weight = closest_weights(vertices, corners, wp.where(origin == NEAR_EDGES, 1, 0))
-        between = relative(weight, corners, vertices.x0)
+            target = widened(least, progress)
+            separation = feasible_in_contact(motion, corners, weight, normal, target, least)
+    elif kind > PLANE_CONTACT:
+        weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
         distance = wp.length(between)
         normal = between / distance
-        separation = feasible(least, distance, least, longest_path(vertices, corners))
+        separation = feasible(least, distance, least, longest_path(motion, corners))
     weights[i] = weight
     normals[i] = normal
     separations[i] = separation
-    urgencies[i] = urgency_of(vertices, corners, weight, normal, separation)
+    approaches[i] = approach_of(motion, vertices, corners, weight, normal, separation)
 
 
 @wp.kernel
-def truncating(
+def truncate_paths(
+    # in
+    motion: Motion,
     vertices: Vertices,
-    half_spaces: HalfSpaces,
-    progress: Progress,
-    cursor: wp.array[int],
+    planes: MovingPlanes,
+    record: StepRecord,
+    cursor: Cursor,
     dt: wp.float64,
+    # out
     end: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Where paths are cut, and how fast vertices are then."""
-    history = progress.history
-    mark = cursor[MARK]
-    entry = history.truncations[mark] + wp.tid()
-    if entry >= history.truncations[mark + 1]:
+    """Computes the ends and velocities of truncated paths, see :func:`.kernels.truncate_vertices`."""
+    iteration = cursor.iteration[0]
+    entry = record.truncation_offsets[iteration] + wp.tid()
+    if entry >= record.truncation_offsets[iteration + 1]:
         return
-    vertex = history.vertex[entry]
-    kind = history.kind[entry]
+    vertex = record.vertex[entry]
+    kind = record.kind[entry]
     toi = _ZERO
-    if kind == ON_PLANE:
-        plane = history.contact[entry][1]
-        before, _error = clearance(half_spaces.start[plane], vertices.x0[vertex])
-        after, _error_after = clearance(half_spaces.end[plane], vertices.x1[vertex])
+    if kind == PLANE_CONTACT:
+        plane = record.contact[entry][1]
+        before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
+        after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
         toi = time_of_entry(before, after)
-    elif kind != STANDS:
-        corners = history.contact[entry]
-        toi = _touching(
+    elif kind != NO_CONTACT:
+        corners = record.contact[entry]
+        toi = _impact(
+            motion,
             vertices,
             corners,
             kind,
-            history.localized[entry],
-            history.toi[entry],
-            history.coordinates[entry],
-            history.normal[entry],
+            record.localized[entry],
+            record.toi[entry],
+            record.coordinates[entry],
+            record.normal[entry],
         ).toi
-    x0 = to_double(vertices.x0[vertex])
-    path = SHARE * toi * (to_double(vertices.x1[vertex]) - x0)
+    x0 = to_double(motion.x0[vertex])
+    path = truncated_path(x0, to_double(vertices.x1[vertex]), toi)
     end[entry] = to_single(x0 + path)
     velocity[entry] = to_single(path / dt)
 
 
 @wp.kernel(enable_backward=False)
-def count_grazing(vertices: Vertices, contacts: Contacts, history: History):
+def count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, record: StepRecord):
     """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
     i = wp.tid()
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
     corners = contact_vertices(contacts, i)
-    if wp.min(corners) >= vertices.movable:
+    if wp.min(corners) >= motion.movable:
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]
-    touch = _touching(vertices, corners, kind, contacts.localized[i], contacts.toi[i], at, contacts.normal[i])
-    wp.atomic_add(history.sizes, GRAZING, touch.grazing)
+    impact = _impact(motion, vertices, corners, kind, contacts.localized[i], contacts.toi[i], at, contacts.normal[i])
+    wp.atomic_add(record.counts.grazing, 0, impact.grazing)

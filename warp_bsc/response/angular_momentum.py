@@ -1,11 +1,12 @@
-"""Angular momentum: what displacements have added to it is taken back, by a turn of all that has collided.
+"""Angular momentum: a rigid turn of all vertices that collided removes what the position multipliers added to it.
 
-Only in worlds in which all that has collided is free: elsewhere it is not conserved.
+Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
 """
 
 import warp as wp
 
-from .constraints import PROJECTED, Constraints, Vertices, relative, to_double, to_single
+from .buffers import PROJECTED, Constraints, Motion, Vertices
+from .constraints import relative, to_double, to_single
 
 __all__ = [
     "HELD",
@@ -17,7 +18,7 @@ __all__ = [
     "change_by_turn",
     "is_held",
     "moments",
-    "sum_bodies",
+    "sum_moments",
     "sum_torques",
     "torque_of",
     "turn_vertices",
@@ -25,15 +26,15 @@ __all__ = [
 ]
 
 SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
-"""How many sums of a world there are: of the torque and, from ``MASS`` on, so many moments, which are of mass, mass by
-position, its six second moments, and mass by the square of the change of velocity; and at ``HELD`` of contacts with
-what is not free."""
+"""Columns of the sums of a world: their number; the number of moments, which are mass, mass by position, its six second
+moments, and mass by the squared change of velocity; where they begin, behind the torque; and the column that is not 0
+if a contact is with something that is not free."""
 Moments = wp.types.vector(length=11, dtype=wp.float64)
 
 _UNITS = wp.constant(wp.float64(2.0**32))
-"""Sums are of integers in these units of kg, m and s, so that they are the same in any order."""
+"""Units in one kg, m and s; sums are of integers in these units, so that they are the same in any order."""
 _LIMIT = wp.constant(wp.float64(0.1))
-"""How large the turn may be, as a share of what the contacts have changed, root mean square."""
+"""Largest turn as a share of the velocity changes by contacts, root mean square."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -46,66 +47,66 @@ def _add(sums: wp.array2d[wp.int64], world: int, place: int, x: wp.float64):
 
 
 @wp.func
-def turns(vertices: Vertices, vertex: int) -> bool:
-    """Whether a vertex has collided, and is free to turn."""
-    return vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] == PROJECTED
+def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+    """Returns whether a vertex collided, and is free to turn."""
+    return motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] == PROJECTED
 
 
 @wp.func
-def torque_of(vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
-    """What a contact between free bodies has done to the angular momentum.
+def torque_of(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+    """Returns the change of angular momentum by a contact between free bodies [kg m^2/s].
 
-    Displacements across the motion do something, and so do impulses at points that have slid apart since the contact.
+    Position changes across the motion change it, and so do impulses at points that slid apart since the contact.
     """
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    of_displacement = wp.cross(constraints.displacing[i], relative(weights, corners, vertices.wanted_velocity))
-    return of_displacement + wp.cross(relative(weights, corners, vertices.x1), constraints.impulse[i])
+    of_positions = wp.cross(constraints.position_multiplier[i], relative(weights, corners, motion.velocity))
+    return of_positions + wp.cross(relative(weights, corners, vertices.x1), constraints.velocity_multiplier[i])
 
 
 @wp.func
 def acts(constraints: Constraints, i: int) -> bool:
-    """Whether a constraint has done anything."""
-    return wp.length_sq(constraints.displacing[i]) + wp.length_sq(constraints.impulse[i]) > _ZERO
+    """Returns whether a constraint moved anything."""
+    position, velocity = constraints.position_multiplier[i], constraints.velocity_multiplier[i]
+    return wp.length_sq(position) + wp.length_sq(velocity) > _ZERO
 
 
 @wp.func
-def is_held(vertices: Vertices, constraints: Constraints, i: int) -> bool:
-    """Whether a contact is with something that is not free."""
+def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> bool:
+    """Returns whether a contact is with something that is not free."""
     corners = constraints.vertices[i]
     held = corners[0] == corners[1]  # on a plane
     for j in range(4):
-        held = held or (constraints.weights[i][j] != _ZERO and not turns(vertices, corners[j]))
+        held = held or (constraints.weights[i][j] != _ZERO and not turns(motion, vertices, corners[j]))
     return held
 
 
 @wp.kernel(**_KERNEL)
-def sum_torques(vertices: Vertices, constraints: Constraints, sums: wp.array2d[wp.int64]):
-    """Sums up what contacts between free bodies have done to the angular momentum.
+def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, sums: wp.array2d[wp.int64]):
+    """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
 
-    Displacements across the motion do something, and so do impulses at points that have slid apart since the contact.
-    For a contact alone that cancels; for many at once, which share vertices, it need not.
+    For one contact they cancel; for many at once, which share vertices, they need not.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    world = vertices.world[constraints.vertices[i][0]]
+    world = motion.world[constraints.vertices[i][0]]
     if sums[world, HELD] != wp.int64(0) or not acts(constraints, i):
         return
-    if is_held(vertices, constraints, i):
+    if is_held(motion, vertices, constraints, i):
         sums[world, HELD] = wp.int64(1)
         return
-    added = torque_of(vertices, constraints, i)
+    added = torque_of(motion, vertices, constraints, i)
     for axis in range(3):
         _add(sums, world, axis, added[axis])
 
 
 @wp.func
-def moments(vertices: Vertices, vertex: int) -> Moments:
-    """What a vertex adds to the sums of a world, from :data:`MASS` on."""
-    mass = _ONE / wp.float64(vertices.inverse_mass[vertex])
+def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
+    """Returns what a vertex adds to the sums of its world, from :data:`MASS` on."""
+    mass = _ONE / wp.float64(motion.inverse_mass[vertex])
     x = to_double(vertices.x1[vertex])
-    change = to_double(vertices.velocity[vertex]) - to_double(vertices.wanted_velocity[vertex])
+    change = to_double(vertices.velocity[vertex]) - to_double(motion.velocity[vertex])
     return Moments(
         mass,
         mass * x[0],
@@ -122,22 +123,22 @@ def moments(vertices: Vertices, vertex: int) -> Moments:
 
 
 @wp.kernel(**_KERNEL)
-def sum_bodies(vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Sums up the moments of what has collided."""
+def sum_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the vertices that collided."""
     vertex = wp.tid()
-    if not turns(vertices, vertex):
+    if not turns(motion, vertices, vertex):
         return
-    world = vertices.world[vertex]
+    world = motion.world[vertex]
     if sums[world, HELD] != wp.int64(0):
         return
-    added = moments(vertices, vertex)
+    added = moments(motion, vertices, vertex)
     for i in range(MOMENTS):
         _add(sums, world, MASS + i, added[i])
 
 
 @wp.func
 def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
-    """How a turn of a world, as a rigid body would turn, that takes a torque back changes the velocity at a place."""
+    """Returns the change of velocity at ``x`` by a rigid turn of a world that removes a torque [m/s]."""
     square = total[10]
     if wp.dot(torque, torque) == _ZERO or square <= _ZERO:
         return wp.vec3d()
@@ -168,11 +169,11 @@ def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
 
 
 @wp.kernel(**_KERNEL)
-def turn_vertices(vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Turns what has collided in each world by the torque that contacts have added."""
+def turn_vertices(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Turns the vertices that collided in each world, which removes the torque that contacts added."""
     vertex = wp.tid()
-    world = vertices.world[vertex]
-    if not turns(vertices, vertex) or sums[world, HELD] != wp.int64(0):
+    world = motion.world[vertex]
+    if not turns(motion, vertices, vertex) or sums[world, HELD] != wp.int64(0):
         return
     torque = wp.vec3d()
     for axis in range(3):

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
-from newton import GeoType, Mesh, ParticleFlags, ShapeFlags
+from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
 from ..detection.mesh import CollisionMesh
 
@@ -14,7 +14,7 @@ _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
 
 _BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
-"""For a ``newton.Mesh`` of which only the triangles are used."""
+"""Options of a ``newton.Mesh`` whose triangles alone are used."""
 
 
 class ShapeVertices(NamedTuple):
@@ -23,7 +23,7 @@ class ShapeVertices(NamedTuple):
     Attributes:
         position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
         body: Body that the vertex moves with, -1 for none, int32, shape [n].
-        shape: Shape that it belongs to, as in ``model.shape_material_mu``, int32, shape [n].
+        shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
     """
 
     position: np.ndarray | wp.array
@@ -38,8 +38,8 @@ class Planes(NamedTuple):
         point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
         normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
         body: Body that the plane moves with, -1 for none, int32, shape [n].
-        shape: Shape that it is, int32, shape [n].
-        world: World that it is in, -1 for all of them, int32, shape [n].
+        shape: Shape of the plane, int32, shape [n].
+        world: World of the plane, -1 for all worlds, int32, shape [n].
     """
 
     point: np.ndarray | wp.array
@@ -53,12 +53,12 @@ class ModelMesh(CollisionMesh):
     """The triangles of a Newton model that particles can collide with, as one mesh.
 
     Its vertices are the particles of the model, then those of the tessellated shapes; its faces are the triangles of
-    the model, then the surface triangles of tetrahedra that are none of these, then those of the shapes. Round shapes
-    have their vertices on the surface, so that the mesh of a convex one lies within it. A shape that is in all worlds
-    has vertices in each. Infinite planes are no triangles and are listed apart.
+    the model, then the other surface triangles of its tetrahedra, then those of the shapes. Round shapes have their
+    vertices on the surface, so that the mesh of a convex shape lies within it. A shape that is in all worlds has
+    vertices in each. Infinite planes have no triangles and are listed separately.
 
-    All but the positions and inverse masses is what the model was when the mesh was made. The margins of shapes and the
-    radii of particles are no part of it.
+    Later changes of the model do not change the mesh, except for positions and inverse masses. Margins of shapes and
+    radii of particles are ignored.
 
     Attributes:
         model: The model.
@@ -70,7 +70,7 @@ class ModelMesh(CollisionMesh):
         device_planes: ``planes`` as Warp arrays.
     """
 
-    def __init__(self, model):
+    def __init__(self, model: Model):
         """Tessellates the shapes and puts the mesh on the model's device.
 
         Args:
@@ -130,10 +130,15 @@ class ModelMesh(CollisionMesh):
         self.refresh_inverse_masses()
 
     def _on_device(self, values):
-        """A Warp array of ints, or of vectors where the values are two-dimensional."""
+        """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
         return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
 
-    def positions(self, particle_q, body_q, out):
+    def positions(
+        self,
+        particle_q: wp.array[wp.vec3] | None,
+        body_q: wp.array[wp.transform] | None,
+        out: wp.array[wp.vec3],
+    ) -> None:
         """Writes the positions of all vertices, those of particles bit for bit. Can be captured in a CUDA graph.
 
         Args:
@@ -157,10 +162,10 @@ class ModelMesh(CollisionMesh):
         inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
         wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
 
-    def refresh_inverse_masses(self):
+    def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
 
-        What the response cannot move has inverse mass 0: particles of none, inactive particles, and shapes.
+        The response cannot move vertices with inverse mass 0: kinematic and inactive particles, and shapes.
         """
         model = self.model
         inputs, outputs = [model.particle_inv_mass, model.particle_flags], [self.inverse_masses]
@@ -197,25 +202,25 @@ def _write_inverse_masses(
 
 
 def _soft_faces(model):
-    """The triangles of the model, then the surface triangles of its tetrahedra that are none of them, shape [n, 3]."""
+    """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
     triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
     if model.tet_indices is None:
         return triangles
     sides = model.tet_indices.numpy()[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
-    # an inner side belongs to two tetrahedra; with the triangles counted twice, what occurs once is what is missing
+    # an inner side belongs to two tetrahedra; with the triangles counted twice, the missing sides occur once
     corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
     return np.concatenate([triangles, sides[first[count == 1]]])
 
 
 def _tessellate(model, shape, shape_type, scale):
-    """Cuts the surface of a shape into triangles, without two vertices in one place.
+    """Returns the surface of a shape as triangles, without two vertices in one place.
 
     Args:
         model: The ``newton.Model``.
         shape: Index of the shape.
         shape_type: Its type.
-        scale: Its scale, of which each type has its own idea.
+        scale: Its scale, whose meaning depends on the type.
 
     Returns:
         Positions [m] in the frame of the shape, float64, shape [n, 3], and faces, shape [m, 3].
@@ -253,9 +258,9 @@ def _tessellate(model, shape, shape_type, scale):
 
 
 def _weld(mesh):
-    """The triangles of a ``newton.Mesh``, with one vertex where it has several in one place.
+    """Returns the triangles of a ``newton.Mesh``, with its vertices that are in one place merged.
 
-    Seams of texture or normals have those, and the triangles on both sides would collide with each other forever.
+    Seams of texture or normals have several, and the triangles on both sides would always collide with each other.
 
     Returns:
         Positions [m], float64, shape [n, 3], and faces, shape [m, 3].
@@ -265,7 +270,7 @@ def _weld(mesh):
 
 
 def _capsule_profile(radius, half_height):
-    """Radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
+    """Returns radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
     angle = np.linspace(0.0, np.pi / 2.0, _SEGMENTS // 4 + 1)
     lower = np.stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)], axis=1)
     upper = lower[::-1] * (1.0, -1.0)
@@ -273,7 +278,7 @@ def _capsule_profile(radius, half_height):
 
 
 def _revolve(profile):
-    """Turns a profile around the z axis.
+    """Returns the surface that a profile makes when it turns around the z axis.
 
     Args:
         profile: Radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
@@ -296,7 +301,7 @@ def _revolve(profile):
 
 
 def _rotate(quaternion, vectors):
-    """Vectors rotated by unit quaternions (x, y, z, w), shape [..., 3]."""
+    """Returns vectors rotated by unit quaternions (x, y, z, w), shape [..., 3]."""
     axis = quaternion[..., :3]
     twist = 2.0 * np.cross(axis, vectors)
     return vectors + quaternion[..., 3:] * twist + np.cross(axis, twist)

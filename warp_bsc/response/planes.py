@@ -1,22 +1,11 @@
-"""Infinite planes: the solid half-spaces behind them, which vertices stay out of."""
+"""Infinite planes: each bounds a solid half-space, which vertices stay out of."""
 
 import warp as wp
 
-from .constraints import (
-    FIRST_HITS,
-    ON_PLANE,
-    ROUND,
-    Constraints,
-    Progress,
-    Vertices,
-    add_constraint,
-    add_contact,
-    to_double,
-    touch_in,
-    widened,
-)
+from .buffers import Constraints, Motion, Progress, Vertices
+from .constraints import PLANE_CONTACT, add_constraint, count_contact, to_double, update_first_contact, widened
 
-__all__ = ["HalfSpaces", "clearance", "collect_penetrations", "place_half_spaces", "time_of_entry"]
+__all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transform_planes"]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
@@ -26,10 +15,10 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.struct
-class HalfSpaces:
-    """Half-spaces at the start and at the end of a step, each as the unit normal out of it and its offset.
+class MovingPlanes:
+    """Planes at the start and at the end of a step, each as the unit normal out of its solid and its offset [m].
 
-    Each is convex, and so is what a vertex may move in: one that is outside at both ends is so between.
+    Solids are convex, and so is the region of a vertex: a vertex that is outside at both ends is outside between.
     """
 
     start: wp.array[wp.vec4d]
@@ -39,14 +28,16 @@ class HalfSpaces:
 
 
 @wp.kernel(**_KERNEL)
-def place_half_spaces(
+def transform_planes(
+    # in
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     bodies: wp.array[int],
     body_q: wp.array[wp.transform],
+    # out
     planes: wp.array[wp.vec4d],
 ):
-    """Puts half-spaces where their bodies are."""
+    """Writes planes as they are where their bodies are."""
     i = wp.tid()
     point = points[i]
     direction = normals[i]
@@ -58,8 +49,8 @@ def place_half_spaces(
 
 
 @wp.func
-def clearance(plane: wp.vec4d, x: wp.vec3):
-    """Distance of a point from a half-space [m], negative within, and a bound on the error of what is computed.
+def signed_distance(plane: wp.vec4d, x: wp.vec3):
+    """Returns the distance of a point from a plane [m], negative in the solid, and a bound on its rounding error.
 
     Each of three products, and each of three sums, is off by 2^-53 of itself at most, and by 2^-1075 where it
     underflows.
@@ -75,54 +66,56 @@ def clearance(plane: wp.vec4d, x: wp.vec3):
 
 @wp.func
 def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
-    """When a vertex enters a half-space, from its clearances at the start and at the end of a step."""
+    """Returns when a vertex enters a solid, in [0, 1], from its signed distances at the start and end of a step."""
     return wp.min(wp.max(before, _ZERO) / wp.max(before - after, _TINY), wp.float64(1.0))
 
 
 @wp.kernel(**_KERNEL)
 def collect_penetrations(
+    motion: Motion,
     vertices: Vertices,
-    half_spaces: HalfSpaces,
+    planes: MovingPlanes,
     constraints: Constraints,
     progress: Progress,
     separation: wp.float64,
     ahead: bool,
 ):
-    """Makes constraints of vertices that may have entered half-spaces; after the last projection, takes down when.
+    """Adds constraints for vertices that may have entered solids; after the last projection, finds when they did.
 
-    What is within at the start is moved out as well, but if it cannot be, that is no new contact. Ahead of the first
-    detection contacts are counted, but not as found by it.
+    Vertices inside at the start are moved out as well, but if they cannot be, that is not a new contact. Ahead of the
+    first detection, contacts are counted as those of the wanted motion only.
     """
     vertex = wp.tid()
-    world = vertices.world[vertex]
-    if vertices.inverse_mass[vertex] == 0.0:
+    world = motion.world[vertex]
+    if motion.inverse_mass[vertex] == 0.0:
         return
-    for i in range(half_spaces.end.shape[0]):
-        if half_spaces.world[i] >= 0 and half_spaces.world[i] != world:
+    for i in range(planes.end.shape[0]):
+        if planes.world[i] >= 0 and planes.world[i] != world:
             continue
-        after, error_after = clearance(half_spaces.end[i], vertices.x1[vertex])
+        after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
         if after > error_after:
             continue
-        before, error_before = clearance(half_spaces.start[i], vertices.x0[vertex])
+        before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
         if ahead:
-            wp.atomic_add(progress.steer, FIRST_HITS, 1)
+            wp.atomic_add(progress.status.first_hits, 0, 1)
         elif before >= -error_before:
-            add_contact(progress, world)
+            count_contact(progress, world)
             vertices.changed[vertex] = 1
-        if progress.steer[ROUND] < progress.projections:
-            plane = half_spaces.end[i]
+        if progress.status.iteration[0] < progress.max_iterations:
+            plane = planes.end[i]
             add_constraint(
+                motion,
                 vertices,
                 constraints,
                 wp.vec4i(vertex),
                 wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
                 wp.vec3d(plane[0], plane[1], plane[2]),
                 plane[3] + widened(separation, progress),
-                wp.sqrt(vertices.friction[vertex] * half_spaces.friction[i]),
+                wp.sqrt(motion.friction[vertex] * planes.friction[i]),
                 1,
-                ON_PLANE,
+                PLANE_CONTACT,
                 True,
                 _ZERO,
             )
         else:
-            touch_in(vertices, vertex, time_of_entry(before, after), ON_PLANE, i)
+            update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)

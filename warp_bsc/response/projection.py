@@ -1,58 +1,46 @@
-"""Projection: iterations over constraints that move vertices, and then change velocities, until all are met."""
+"""Projection: Jacobi sweeps over constraints that move vertices, and then change velocities, until all are met."""
 
 import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
-from .constraints import (
-    PROJECTED,
-    ROUND,
-    Constraints,
-    Progress,
-    Vertices,
-    gap,
-    is_projecting,
-    relative,
-    to_double,
-    to_single,
-)
-from .step_record import end_iteration, is_recording, record_entry
+from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices
+from .constraints import gap, is_projecting, relative, to_double, to_single
+from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
-    "ANOTHER",
-    "BATCH",
-    "ITERATIONS",
-    "NUMBER",
-    "accelerate",
-    "accelerated",
-    "change_velocities",
-    "displace",
-    "displaced",
-    "enlist_accelerating",
-    "enlist_displacing",
-    "move_vertices",
-    "moved",
-    "spread",
-    "start_impulses",
-    "starts",
-    "takes_back",
+    "MAX_SWEEPS",
+    "SWEEPS_PER_BATCH",
+    "activate_position_constraints",
+    "activate_velocity_constraints",
+    "add_delta",
+    "has_pushed",
+    "initial_velocity_multiplier",
+    "initialize_velocity_multipliers",
+    "is_reversible",
+    "position_multiplier_after",
+    "project_positions",
+    "project_velocities",
+    "update_positions",
+    "update_velocities",
+    "velocity_multiplier_after",
+    "with_delta",
+    "with_momentum",
 ]
 
-ITERATIONS, BATCH = wp.constant(40), wp.constant(8)
-"""Iterations over constraints at most, in each round on positions, and at the end on velocities; and how many there are
-before it is asked whether any constraint still acts."""
-ANOTHER, NUMBER = wp.constant(0), wp.constant(1)
-"""Places in the array that steers the iterations."""
+MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(8)
+"""Most sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps after each
+of which the device checks whether a constraint is still active."""
 
 _RELAXATION = wp.constant(wp.float64(1.5))
-"""How many of the constraints that share a vertex count as one where they only push: mostly they ask for the same."""
+"""Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
 _PUSHING_MOMENTUM = wp.constant(wp.float64(0.5))
-"""How much of its last step a multiplier that only pushes takes again at most."""
+"""Largest momentum of a multiplier that only pushes."""
 _SLIDING = wp.constant(wp.float64(0.999))
-"""From which share of what friction can hold on something slides."""
+"""Share of the friction limit from which a contact slides."""
 _CREEP = wp.constant(wp.float64(0.1))
-"""How far what friction holds may move, as a share of the tolerance: this adds up over steps."""
+"""Longest path of a contact that friction holds, as a share of the tolerance; it adds up over steps."""
 _UNITS = wp.constant(wp.float64(2.0**40))
-"""Sums are of integers in these units of a metre, so that they are the same in any order."""
+"""Units in a metre; sums are of integers in these units, so that they are the same in any order."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -60,48 +48,48 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.func
-def _parting(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> wp.float64:
-    """How much faster than restitution asks contact points part [m/s]."""
+def _excess_speed(
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64
+) -> wp.float64:
+    """Returns the speed at which contact points part less that of restitution [m/s]; negative if violated."""
     normal = constraints.normal[i]
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    wanted = wp.dot(normal, relative(weights, corners, vertices.wanted_velocity))
+    wanted = wp.dot(normal, relative(weights, corners, motion.velocity))
     speed = wp.dot(normal, relative(weights, corners, vertices.velocity))
     return speed - restitution * wp.max(-wanted, _ZERO)
 
 
 @wp.func
-def _is_pushing(multiplier: wp.vec3d, normal: wp.vec3d) -> bool:
-    return wp.dot(multiplier, normal) > _ZERO
-
-
-@wp.func
-def _mobility(vertices: Vertices, constraints: Constraints, i: int, relaxation: wp.float64) -> wp.float64:
-    mobility = _ZERO
+def _effective_inverse_mass(
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, relaxation: wp.float64
+) -> wp.float64:
+    """Returns the inverse mass of a constraint [1/kg], whose vertices are split among their active constraints."""
+    inverse_mass = _ZERO
     for j in range(4):
         vertex = constraints.vertices[i][j]
         parts = wp.max(wp.float64(vertices.active[vertex]) / relaxation, _ONE)
-        share = wp.float64(vertices.inverse_mass[vertex]) * parts
-        mobility += constraints.weights[i][j] * constraints.weights[i][j] * share
-    return mobility
+        share = wp.float64(motion.inverse_mass[vertex]) * parts
+        inverse_mass += constraints.weights[i][j] * constraints.weights[i][j] * share
+    return inverse_mass
 
 
 @wp.func
-def updated(
+def _multiplier_after(
     multiplier: wp.vec3d,
     normal: wp.vec3d,
     excess: wp.float64,
     motion: wp.vec3d,
-    mobility: wp.float64,
+    inverse_mass: wp.float64,
     friction: wp.float64,
 ) -> wp.vec3d:
-    """A multiplier after a step towards no excess (negative: a lack) along the normal and no motion across it.
+    """Returns a multiplier after a step towards no excess along the normal and no motion across it.
 
-    Along the normal it only pushes; across, it is limited by friction (Coulomb). What has been too much is taken back.
+    Along the normal it only pushes; across, it is limited by friction (Coulomb).
     """
-    along = wp.max(wp.dot(multiplier, normal) - excess / mobility, _ZERO)
+    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass, _ZERO)
     across = multiplier - wp.dot(multiplier, normal) * normal
-    across -= (motion - wp.dot(motion, normal) * normal) / mobility
+    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass
     length = wp.length(across)
     if length > friction * along:
         across = across * (friction * along / length)
@@ -115,29 +103,38 @@ def _add(sums: wp.array2d[wp.int64], vertex: int, x: wp.vec3d):
 
 
 @wp.func
-def spread(vertices: Vertices, constraints: Constraints, i: int, x: wp.vec3d, sums: wp.array2d[wp.int64]):
-    """Adds what a constraint does to its vertices."""
+def add_delta(motion: Motion, constraints: Constraints, i: int, change: wp.vec3d, sums: wp.array2d[wp.int64]):
+    """Adds what the change of a multiplier does to the vertices of its constraint."""
     for j in range(4):
         vertex = constraints.vertices[i][j]
-        share = constraints.weights[i][j] * wp.float64(vertices.inverse_mass[vertex])
+        share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
         if share != _ZERO:
-            _add(sums, vertex, share * x)
+            _add(sums, vertex, share * change)
 
 
 @wp.func
-def takes_back(constraints: Constraints, progress: Progress, i: int) -> bool:
-    """Whether a constraint takes back what it has done too much, which leaves things nearest to what was wanted.
+def with_delta(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
+    """Returns a position or velocity plus the sum of what constraints did to it."""
+    y = to_double(x)
+    for axis in range(3):
+        y[axis] += wp.float64(sums[vertex, axis]) / _UNITS
+    return to_single(y)
 
-    What is fast only pushes after the first round, which makes room where contacts come back.
+
+@wp.func
+def is_reversible(constraints: Constraints, progress: Progress, i: int) -> bool:
+    """Returns whether a constraint may pull back what it pushed too far, which keeps vertices near the wanted motion.
+
+    Constraints of fast elements only push after the first iteration, which makes room where contacts come back.
     """
-    return progress.steer[ROUND] == 1 or constraints.slow[i] == 1
+    return progress.status.iteration[0] == 1 or constraints.slow[i] == 1
 
 
 @wp.func
 def _is_held(
     multiplier: wp.vec3d, normal: wp.vec3d, motion: wp.vec3d, friction: wp.float64, tolerance: wp.float64
 ) -> bool:
-    """Whether friction does what it can: there is no motion across the normal, or it slides."""
+    """Returns whether friction is solved: there is no motion across the normal, or the contact slides."""
     along = wp.dot(multiplier, normal)
     if wp.length(multiplier - along * normal) >= _SLIDING * friction * along:
         return True
@@ -145,218 +142,244 @@ def _is_held(
 
 
 @wp.func
-def _enlist(vertices: Vertices, constraints: Constraints, i: int):
-    """Puts a constraint on the list of those that act in this iteration, and counts it for its vertices."""
-    constraints.acting[int(take_slot(constraints.acting_count, 0))] = i
+def _activate(vertices: Vertices, constraints: Constraints, i: int):
+    """Adds a constraint to the active set, and counts it for its vertices."""
+    constraints.active_set[int(take_slot(constraints.active_count, 0))] = i
     for j in range(4):
         wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
 
 
 @wp.func
 def _momentum(constraints: Constraints, progress: Progress, i: int) -> wp.float64:
-    """How much of its last step a multiplier takes again: ever more (Nesterov), but nothing at the end."""
-    iteration = progress.iteration[NUMBER]
-    last = constraints.iteration[i]
-    constraints.iteration[i] = iteration
-    if last != iteration - 1 or iteration == ITERATIONS - 1:
+    """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
+    sweep = progress.sweep.number[0]
+    last = constraints.last_sweep[i]
+    constraints.last_sweep[i] = sweep
+    if last != sweep - 1 or sweep == MAX_SWEEPS - 1:
         return _ZERO
-    return wp.float64(iteration) / wp.float64(iteration + 3)
+    return wp.float64(sweep) / wp.float64(sweep + 3)
 
 
 @wp.func
-def _finish_iteration(constraints: Constraints, progress: Progress):
-    """Decides whether there is another batch."""
-    iteration = progress.iteration[NUMBER] + 1
-    acting = constraints.acting_count[0] > wp.int64(0)
-    progress.iteration[NUMBER] = iteration
-    progress.iteration[ANOTHER] = wp.where(acting and iteration < ITERATIONS, 1, 0)
-    if is_recording(progress.history):
-        end_iteration(progress.history, int(constraints.acting_count[0]))
-    constraints.acting_count[0] = wp.int64(0)
+def with_momentum(multiplier: wp.vec3d, previous: wp.vec3d, momentum: wp.float64) -> wp.vec3d:
+    """Returns a multiplier after a sweep moved on by a share of its step from the previous one."""
+    return multiplier + momentum * (multiplier - previous)
 
 
 @wp.func
-def _path(vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+def _finish_sweep(constraints: Constraints, progress: Progress, record: StepRecord):
+    """Empties the active set, and decides whether another batch of sweeps is needed."""
+    sweep = progress.sweep.number[0] + 1
+    active = constraints.active_count[0] > wp.int64(0)
+    progress.sweep.number[0] = sweep
+    progress.sweep.another[0] = wp.where(active and sweep < MAX_SWEEPS, 1, 0)
+    if is_recording(record):
+        end_sweep(record, int(constraints.active_count[0]))
+    constraints.active_count[0] = wp.int64(0)
+
+
+@wp.func
+def _path(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    return relative(weights, corners, vertices.x1) - relative(weights, corners, vertices.x0)
+    return relative(weights, corners, vertices.x1) - relative(weights, corners, motion.x0)
 
 
 @wp.kernel(**_KERNEL)
-def enlist_displacing(vertices: Vertices, constraints: Constraints, progress: Progress, tolerance: wp.float64):
-    """Lists the constraints that act on positions: those violated, and those that may take something back.
+def activate_position_constraints(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, tolerance: wp.float64
+):
+    """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
-    What is settled but for the tolerance costs nothing, and moves nothing.
+    Constraints met within the tolerance cost nothing, and move nothing.
     """
     i = wp.tid()
-    if i >= constraints.count[0] or not is_projecting(progress, vertices.world[constraints.vertices[i][0]]):
+    if i >= constraints.count[0] or not is_projecting(progress, motion.world[constraints.vertices[i][0]]):
         return
     distance = gap(vertices, constraints, i)
-    acts = distance < -tolerance
-    if not acts and takes_back(constraints, progress, i):
-        done = constraints.displacing[i]
-        if wp.length_sq(done) > _ZERO:
+    active = distance < -tolerance
+    if not active and is_reversible(constraints, progress, i):
+        multiplier = constraints.position_multiplier[i]
+        if wp.length_sq(multiplier) > _ZERO:
             friction = wp.float64(constraints.friction[i])
-            path = _path(vertices, constraints, i)
-            acts = distance > tolerance or not _is_held(done, constraints.normal[i], path, friction, tolerance)
-    if acts:
-        _enlist(vertices, constraints, i)
+            path = _path(motion, vertices, constraints, i)
+            active = distance > tolerance or not _is_held(multiplier, constraints.normal[i], path, friction, tolerance)
+    if active:
+        _activate(vertices, constraints, i)
 
 
 @wp.func
-def displaced(vertices: Vertices, constraints: Constraints, i: int, pushes_only: bool) -> wp.vec3d:
-    """What the multiplier of a constraint becomes by an iteration on positions, without momentum."""
-    old = constraints.displacing[i]
-    mobility = _mobility(vertices, constraints, i, wp.where(pushes_only, _RELAXATION, _ONE))
-    if mobility <= _ZERO:
+def position_multiplier_after(
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, pushes_only: bool
+) -> wp.vec3d:
+    """Returns the position multiplier of a constraint after a sweep, without momentum."""
+    old = constraints.position_multiplier[i]
+    relaxation = wp.where(pushes_only, _RELAXATION, _ONE)
+    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, relaxation)
+    if inverse_mass <= _ZERO:
         return old
     excess = gap(vertices, constraints, i)
-    path = _path(vertices, constraints, i)
-    return updated(old, constraints.normal[i], excess, path, mobility, wp.float64(constraints.friction[i]))
+    path = _path(motion, vertices, constraints, i)
+    friction = wp.float64(constraints.friction[i])
+    return _multiplier_after(old, constraints.normal[i], excess, path, inverse_mass, friction)
 
 
 @wp.func
-def accelerated(vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64) -> wp.vec3d:
-    """What the multiplier of a constraint becomes by an iteration on velocities, without momentum."""
-    old = constraints.impulse[i]
-    mobility = _mobility(vertices, constraints, i, _ONE)
-    if mobility <= _ZERO:
+def velocity_multiplier_after(
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64
+) -> wp.vec3d:
+    """Returns the velocity multiplier of a constraint after a sweep, without momentum."""
+    old = constraints.velocity_multiplier[i]
+    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, _ONE)
+    if inverse_mass <= _ZERO:
         return old
-    excess = _parting(vertices, constraints, i, restitution)
+    excess = _excess_speed(motion, vertices, constraints, i, restitution)
     velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
-    return updated(old, constraints.normal[i], excess, velocity, mobility, wp.float64(constraints.friction[i]))
+    friction = wp.float64(constraints.friction[i])
+    return _multiplier_after(old, constraints.normal[i], excess, velocity, inverse_mass, friction)
 
 
 @wp.kernel(**_KERNEL)
-def displace(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """An iteration over constraints on positions.
+def project_positions(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
+    """Updates the position multipliers of the active set, in one Jacobi sweep.
 
-    All take a step at once: the mass of a vertex is split among those that act (Tonge et al. 2012), which converges,
-    and conserves momentum, because what a contact does to its two sides is opposite and equal. Momentum of the
-    multipliers (Nesterov; Mazhar et al. 2015) takes it through a stack in few iterations.
+    The mass of a vertex is split among its active constraints (Tonge et al. 2012), which converges, and conserves
+    momentum, because a contact changes its two sides oppositely and equally. Momentum of the multipliers (Nesterov;
+    Mazhar et al. 2015) carries it through a stack in few sweeps.
     """
     place = wp.tid()
-    if wp.int64(place) >= constraints.acting_count[0]:
+    if wp.int64(place) >= constraints.active_count[0]:
         return
-    i = constraints.acting[place]
-    pushes_only = not takes_back(constraints, progress, i)
+    i = constraints.active_set[place]
+    pushes_only = not is_reversible(constraints, progress, i)
     momentum = _momentum(constraints, progress, i)
     if pushes_only:
         momentum = wp.min(momentum, _PUSHING_MOMENTUM)
-    old = constraints.displacing[i]
-    if is_recording(progress.history):
-        record_entry(progress.history, place, i, old, constraints.reached[i], momentum)
-    reached = displaced(vertices, constraints, i, pushes_only)
-    new = reached + momentum * (reached - constraints.reached[i])
-    constraints.reached[i] = reached
-    constraints.displacing[i] = new
-    spread(vertices, constraints, i, new - old, vertices.displacement)
-
-
-@wp.func
-def moved(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
-    """A position or velocity with what constraints have added to it."""
-    y = to_double(x)
-    for axis in range(3):
-        y[axis] += wp.float64(sums[vertex, axis]) / _UNITS
-    return to_single(y)
+    old = constraints.position_multiplier[i]
+    if is_recording(record):
+        record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
+    multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
+    new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
+    constraints.previous_multiplier[i] = multiplier
+    constraints.position_multiplier[i] = new
+    add_delta(motion, constraints, i, new - old, vertices.particle_delta_x)
 
 
 @wp.kernel(**_KERNEL)
-def move_vertices(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """Does to each vertex what its constraints ask for, which ends the iteration."""
+def update_positions(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
+    """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_iteration(constraints, progress)
+        _finish_sweep(constraints, progress, record)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0
-    if vertices.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = moved(vertices.wanted_x1[vertex], vertices.displacement, vertex)
+    if motion.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
-        vertices.done[vertex] = vertices.done[vertex] | PROJECTED
+        vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
 
 @wp.func
-def starts(constraints: Constraints, i: int) -> bool:
-    """Whether a constraint has pushed something, which gives it an impulse."""
-    return _is_pushing(constraints.displacing[i], constraints.normal[i])
+def has_pushed(constraints: Constraints, i: int) -> bool:
+    """Returns whether a constraint pushed its vertices apart."""
+    return wp.dot(constraints.position_multiplier[i], constraints.normal[i]) > _ZERO
+
+
+@wp.func
+def initial_velocity_multiplier(constraints: Constraints, i: int, dt: wp.float64) -> wp.vec3d:
+    """Returns the impulse that goes with the position multiplier, without the part that made the separation."""
+    return constraints.position_multiplier[i] * (constraints.approach[i] / dt)
 
 
 @wp.kernel(**_KERNEL)
-def start_impulses(vertices: Vertices, constraints: Constraints, dt: wp.float64):
-    """Impulses that go with the displacements, but for the separation: as contacts at their times would have acted.
+def initialize_velocity_multipliers(motion: Motion, vertices: Vertices, constraints: Constraints, dt: wp.float64):
+    """Initializes the velocity multipliers of all constraints that pushed, as if contacts had acted at their times.
 
-    Then angular momentum is that of the contacts as well, whose two sides meet in a point (only) at that time.
+    This conserves angular momentum, because the two sides of a contact meet in one point at that time only.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    if starts(constraints, i):
-        constraints.impulse[i] = constraints.displacing[i] * (constraints.urgency[i] / dt)
+    if has_pushed(constraints, i):
+        constraints.velocity_multiplier[i] = initial_velocity_multiplier(constraints, i, dt)
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
-        spread(vertices, constraints, i, constraints.impulse[i], vertices.velocity_change)
-    constraints.reached[i] = constraints.impulse[i]
-    constraints.iteration[i] = -2
+        add_delta(motion, constraints, i, constraints.velocity_multiplier[i], vertices.particle_delta_v)
+    constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
+    constraints.last_sweep[i] = -2
 
 
 @wp.kernel(**_KERNEL)
-def enlist_accelerating(
+def activate_velocity_constraints(
+    motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
     restitution: wp.float64,
     tolerance: wp.float64,
     dt: wp.float64,
 ):
-    """Lists the constraints that act on velocities: of those that have displaced something that still is at it."""
+    """Fills the active set for velocities: constraints that pushed, whose contact points are still near each other."""
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    impulse = constraints.impulse[i]
-    if wp.length_sq(impulse) == _ZERO:
-        if not starts(constraints, i):
+    multiplier = constraints.velocity_multiplier[i]
+    if wp.length_sq(multiplier) == _ZERO:
+        if not has_pushed(constraints, i):
             return
         if gap(vertices, constraints, i) > constraints.separation[i]:
             return
     tolerance /= dt
     normal = constraints.normal[i]
-    excess = _parting(vertices, constraints, i, restitution)
-    acts = excess < -tolerance
-    if not acts and wp.length_sq(impulse) > _ZERO:
+    excess = _excess_speed(motion, vertices, constraints, i, restitution)
+    active = excess < -tolerance
+    if not active and wp.length_sq(multiplier) > _ZERO:
         velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
         friction = wp.float64(constraints.friction[i])
-        acts = excess > tolerance or not _is_held(impulse, normal, velocity, friction, tolerance)
-    if acts:
-        _enlist(vertices, constraints, i)
+        active = excess > tolerance or not _is_held(multiplier, normal, velocity, friction, tolerance)
+    if active:
+        _activate(vertices, constraints, i)
 
 
 @wp.kernel(**_KERNEL)
-def accelerate(vertices: Vertices, constraints: Constraints, progress: Progress, restitution: wp.float64):
-    """An iteration over constraints on velocities, see :func:`displace`."""
+def project_velocities(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    progress: Progress,
+    record: StepRecord,
+    restitution: wp.float64,
+):
+    """Updates the velocity multipliers of the active set, in one Jacobi sweep, see :func:`project_positions`."""
     place = wp.tid()
-    if wp.int64(place) >= constraints.acting_count[0]:
+    if wp.int64(place) >= constraints.active_count[0]:
         return
-    i = constraints.acting[place]
+    i = constraints.active_set[place]
     momentum = _momentum(constraints, progress, i)
-    old = constraints.impulse[i]
-    if is_recording(progress.history):
-        record_entry(progress.history, place, i, old, constraints.reached[i], momentum)
-    reached = accelerated(vertices, constraints, i, restitution)
-    new = reached + momentum * (reached - constraints.reached[i])
-    constraints.reached[i] = reached
-    constraints.impulse[i] = new
-    spread(vertices, constraints, i, new - old, vertices.velocity_change)
+    old = constraints.velocity_multiplier[i]
+    if is_recording(record):
+        record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
+    multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
+    new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
+    constraints.previous_multiplier[i] = multiplier
+    constraints.velocity_multiplier[i] = new
+    add_delta(motion, constraints, i, new - old, vertices.particle_delta_v)
 
 
 @wp.kernel(**_KERNEL)
-def change_velocities(vertices: Vertices, constraints: Constraints, progress: Progress):
-    """Gives each vertex that was not truncated the velocity that its constraints ask for, which ends the iteration."""
+def update_velocities(
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+):
+    """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_iteration(constraints, progress)
+        _finish_sweep(constraints, progress, record)
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0
-    if vertices.inverse_mass[vertex] > 0.0 and vertices.done[vertex] <= PROJECTED:
-        vertices.velocity[vertex] = moved(vertices.wanted_velocity[vertex], vertices.velocity_change, vertex)
+    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] <= PROJECTED:
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)

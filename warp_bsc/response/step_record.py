@@ -1,61 +1,63 @@
-"""What a response did, taken down so that it can be undone, last things first: its gradient needs that."""
+"""The record of a step: everything that its adjoint needs in order to go back through it, last change first."""
 
 import warp as wp
 
 __all__ = [
-    "ENTRIES",
-    "FORGOTTEN",
-    "GRAZING",
-    "ITERATIONS_DONE",
-    "MARKED",
-    "MARKS",
-    "OF_ENTRIES",
-    "OF_TRUNCATIONS",
-    "SIZES",
-    "STANDS",
-    "TRUNCATED_PATHS",
-    "History",
-    "StepHistory",
-    "begin_round",
-    "end_iteration",
+    "MAX_OFFSETS",
+    "NO_CONTACT",
+    "OFFSETS",
+    "PER_ENTRY",
+    "PER_TRUNCATION",
+    "RecordCounts",
+    "StepRecord",
+    "StepRecorder",
+    "begin_iteration",
+    "end_sweep",
     "is_recording",
+    "name_elements",
     "record_entry",
 ]
 
-ITERATIONS_DONE, ENTRIES, TRUNCATED_PATHS, FORGOTTEN, GRAZING, SIZES = (wp.constant(i) for i in range(6))
-"""Places in the array of sizes: iterations so far, constraints that acted in them, paths that were cut, whether
-constraints were forgotten, and contacts whose gradients are clamped; and how many places there are."""
+NO_CONTACT = wp.constant(-1)
+"""The kind of contact of a path that was not truncated before a contact: its vertex was frozen."""
 
-STANDS = wp.constant(-1)
-"""The kind of contact of a vertex that is left where it was."""
+MAX_OFFSETS = wp.constant(64)
+"""Capacity of the offsets, one for each iteration of detect and project."""
 
-MARKS = wp.constant(64)
-"""Room for marks, one a round."""
-
-
-MARKED = "iterations", "constraints", "truncations"
-OF_ENTRIES = "constraint", "multiplier", "reached", "momentum"
-OF_TRUNCATIONS = "vertex", "end", "contact", "kind", "localized", "toi", "coordinates", "normal"
-"""Arrays of a history that have an element for each mark, each entry, each path that was cut."""
+OFFSETS = "sweep_offsets", "constraint_offsets", "truncation_offsets"
+PER_ENTRY = "constraint", "multiplier", "previous_multiplier", "momentum"
+PER_TRUNCATION = "vertex", "end", "contact", "kind", "localized", "toi", "coordinates", "normal"
+"""Arrays of a record that have an element for each iteration, each entry, and each truncated path."""
 
 
 @wp.struct
-class History:
-    """What each iteration and each truncation of a step has changed. Of no length where nothing is taken down."""
+class RecordCounts:
+    """Sizes and flags of a record; each field is an array of one element."""
 
-    sizes: wp.array[int]
-    ends: wp.array[int]  # how many entries there were at the end of an iteration
-    constraint: wp.array[int]  # of an entry: that which acted
-    multiplier: wp.array[wp.vec3d]  # before
-    reached: wp.array[wp.vec3d]  # before
+    sweeps: wp.array[int]
+    entries: wp.array[int]  # active constraints, summed over the sweeps
+    truncations: wp.array[int]  # truncated paths
+    dropped: wp.array[int]  # 1 if constraints were dropped
+    grazing: wp.array[int]  # contacts whose gradients are clamped
+
+
+@wp.struct
+class StepRecord:
+    """What each sweep and each truncation of a step changed. Its arrays are empty where nothing is recorded."""
+
+    counts: RecordCounts
+    sweep_ends: wp.array[int]  # entries at the end of a sweep
+    constraint: wp.array[int]  # of an entry
+    multiplier: wp.array[wp.vec3d]  # before the sweep
+    previous_multiplier: wp.array[wp.vec3d]  # before the sweep
     momentum: wp.array[wp.float64]
-    iterations: wp.array[int]  # how many of each there were at the beginning of a round
-    constraints: wp.array[int]
-    truncations: wp.array[int]
-    vertex: wp.array[int]  # of a path that was cut
-    end: wp.array[wp.vec3]  # of the path before
-    kind: wp.array[int]  # of the contact that it was cut before; STANDS where all of the path was cut
-    contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a half-space
+    sweep_offsets: wp.array[int]  # sweeps at the beginning of an iteration
+    constraint_offsets: wp.array[int]  # constraints at the beginning of an iteration
+    truncation_offsets: wp.array[int]  # truncated paths at the beginning of an iteration
+    vertex: wp.array[int]  # of a truncated path
+    end: wp.array[wp.vec3]  # of the path before it was truncated [m]
+    kind: wp.array[int]  # of the contact that it was truncated before, or NO_CONTACT
+    contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a plane
     localized: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
@@ -63,84 +65,103 @@ class History:
 
 
 @wp.func
-def is_recording(history: History) -> bool:
-    """Whether there is anything to take down in."""
-    return history.sizes.shape[0] > 0
+def is_recording(record: StepRecord) -> bool:
+    """Returns whether the step is recorded."""
+    return record.counts.sweeps.shape[0] > 0
 
 
 @wp.func
 def record_entry(
-    history: History, place: int, constraint: int, multiplier: wp.vec3d, reached: wp.vec3d, momentum: wp.float64
+    record: StepRecord,
+    place: int,
+    constraint: int,
+    multiplier: wp.vec3d,
+    previous_multiplier: wp.vec3d,
+    momentum: wp.float64,
 ):
-    """Takes down what a constraint was before it acted, ``place`` being its place among those of the iteration.
+    """Records an active constraint as it was before a sweep, by its place in the active set.
 
-    What finds no room is missed by :data:`ENTRIES`, which counts it all the same.
+    Entries beyond the capacity are not stored; the count of entries includes them.
     """
-    entry = history.sizes[ENTRIES] + place
-    if entry < history.constraint.shape[0]:
-        history.constraint[entry] = constraint
-        history.multiplier[entry] = multiplier
-        history.reached[entry] = reached
-        history.momentum[entry] = momentum
+    entry = record.counts.entries[0] + place
+    if entry < record.constraint.shape[0]:
+        record.constraint[entry] = constraint
+        record.multiplier[entry] = multiplier
+        record.previous_multiplier[entry] = previous_multiplier
+        record.momentum[entry] = momentum
 
 
 @wp.func
-def end_iteration(history: History, acting: int):
-    """Closes an iteration in which so many constraints acted; one in which none did leaves nothing to undo."""
-    if acting == 0:
+def end_sweep(record: StepRecord, active: int):
+    """Closes a sweep of ``active`` constraints; a sweep of none is not recorded, as it changed nothing."""
+    if active == 0:
         return
-    iteration = history.sizes[ITERATIONS_DONE]
-    entries = history.sizes[ENTRIES] + acting
-    history.sizes[ENTRIES] = entries
-    history.sizes[ITERATIONS_DONE] = iteration + 1
-    if iteration < history.ends.shape[0]:
-        history.ends[iteration] = entries
+    sweep = record.counts.sweeps[0]
+    entries = record.counts.entries[0] + active
+    record.counts.entries[0] = entries
+    record.counts.sweeps[0] = sweep + 1
+    if sweep < record.sweep_ends.shape[0]:
+        record.sweep_ends[sweep] = entries
 
 
 @wp.func
-def begin_round(history: History, mark: int, constraints: int):
-    """Marks where a round begins."""
-    history.iterations[mark] = history.sizes[ITERATIONS_DONE]
-    history.constraints[mark] = constraints
-    history.truncations[mark] = history.sizes[TRUNCATED_PATHS]
+def begin_iteration(record: StepRecord, iteration: int, constraints: int):
+    """Stores the offsets of an iteration."""
+    record.sweep_offsets[iteration] = record.counts.sweeps[0]
+    record.constraint_offsets[iteration] = constraints
+    record.truncation_offsets[iteration] = record.counts.truncations[0]
 
 
-class StepHistory:
-    """Room for the history of a step, used for one step after the other."""
+def name_elements(struct_type, values):
+    """Returns a struct whose fields, in their order, are views of one element each of an array."""
+    struct = struct_type()
+    for i, name in enumerate(struct_type.vars):
+        setattr(struct, name, values[i : i + 1])
+    return struct
 
-    def __init__(self, device, *, iterations):
-        """Makes room for so many iterations, and for nothing that they or truncations do."""
+
+class StepRecorder:
+    """Buffers for the record of a step, reused from step to step.
+
+    Attributes:
+        record: The buffers, :class:`StepRecord`.
+        counts: The elements of ``record.counts`` as one array of int.
+    """
+
+    def __init__(self, device: wp.Device, *, max_sweeps: int):
+        """Allocates buffers for this many sweeps, and none yet for their entries or for truncations."""
         self._device = device
-        self.arrays = arrays = History()
-        arrays.sizes = wp.zeros(int(SIZES), dtype=int, device=device)
-        arrays.ends = wp.zeros(iterations, dtype=int, device=device)
-        for name in MARKED:
-            setattr(arrays, name, wp.zeros(int(MARKS), dtype=int, device=device))
-        for names in (OF_ENTRIES, OF_TRUNCATIONS):
-            self._make(names, 0)
+        self.record = record = StepRecord()
+        self.counts = wp.zeros(len(RecordCounts.vars), dtype=int, device=device)
+        record.counts = name_elements(RecordCounts, self.counts)
+        record.sweep_ends = wp.zeros(max_sweeps, dtype=int, device=device)
+        for name in OFFSETS:
+            setattr(record, name, wp.zeros(int(MAX_OFFSETS), dtype=int, device=device))
+        for names in (PER_ENTRY, PER_TRUNCATION):
+            self._allocate(names, 0)
 
-    def begin(self):
-        """Forgets what was taken down, and returns the arrays to take down the next step in."""
-        self.arrays.sizes.zero_()
-        return self.arrays
+    def begin(self) -> StepRecord:
+        """Clears the record, and returns it for the next step."""
+        self.counts.zero_()
+        return self.record
 
-    def reserve_entries(self, more):
-        """Makes room for so many more constraints that act, and returns the arrays. Asks the device."""
-        return self._reserve(OF_ENTRIES, ENTRIES, more)
+    def reserve_entries(self, more: int) -> StepRecord:
+        """Reserves ``more`` entries, and returns the record. Synchronizes with the device."""
+        return self._reserve(PER_ENTRY, self.record.counts.entries, more)
 
-    def reserve_truncations(self, more):
-        """Makes room for so many more paths that are cut, and returns the arrays. Asks the device."""
-        return self._reserve(OF_TRUNCATIONS, TRUNCATED_PATHS, more)
+    def reserve_truncations(self, more: int) -> StepRecord:
+        """Reserves ``more`` truncated paths, and returns the record. Synchronizes with the device."""
+        return self._reserve(PER_TRUNCATION, self.record.counts.truncations, more)
 
-    def _reserve(self, names, size, more):
-        filled = int(self.arrays.sizes.numpy()[int(size)])
-        old = {name: getattr(self.arrays, name) for name in names}
+    def _reserve(self, names, count, more):
+        filled = int(count.numpy()[0])
+        old = {name: getattr(self.record, name) for name in names}
         if filled + more > len(old[names[0]]):
-            self._make(names, 2 * (filled + more))
+            self._allocate(names, 2 * (filled + more))
             for name in names if filled else ():
-                wp.copy(getattr(self.arrays, name), old[name], count=filled)
-        return self.arrays
+                wp.copy(getattr(self.record, name), old[name], count=filled)
+        return self.record
 
-    def _make(self, names, room):
+    def _allocate(self, names, capacity):
         for name in names:
-            setattr(self.arrays, name, wp.empty(room, dtype=History.vars[name].type.dtype, device=self._device))
+            setattr(self.record, name, wp.empty(capacity, dtype=StepRecord.vars[name].type.dtype, device=self._device))

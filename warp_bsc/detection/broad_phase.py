@@ -1,0 +1,88 @@
+"""What a broad phase does, and which one a device has."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import warp as wp
+
+from .broad_phase_bvh import BroadPhaseBvh
+from .broad_phase_simd import BroadPhaseSimd
+from .mesh import CollisionMesh
+
+__all__ = ["BroadPhase", "make_broad_phase"]
+
+
+class BroadPhase(Protocol):
+    """Finds the candidates of a mesh: pairs of elements that share no vertex and whose swept boxes overlap.
+
+    A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
+    single precision, rounded so that no overlap is lost.
+    """
+
+    @property
+    def buffers(self) -> Sequence[wp.array]:
+        """All arrays that a run writes to and that may be replaced."""
+        ...
+
+    @property
+    def capacity(self) -> int:
+        """Capacity for pairs of faces, :data:`UNLIMITED` without a queue for them."""
+        ...
+
+    def grow(self, count: int) -> None:
+        """Enlarges the queue of pairs of faces if it is too small for the count."""
+        ...
+
+    def pair_elements(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_face_counts: wp.array,
+        vertex_face: wp.array,
+        edge_edge_counts: wp.array,
+        edge_edge: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+    ) -> None:
+        """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
+
+        Args:
+            x0: Positions at the start, array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            vertex_face_counts: By :class:`Count`, array of int64.
+            vertex_face: Queue for (vertex, face), array of vec2i.
+            edge_edge_counts: By :class:`Count`, array of int64.
+            edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
+            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, nothing
+                is allocated, but the traversal is slower if much has moved.
+            changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all. More pairs may be
+                found than wanted.
+        """
+        ...
+
+    def pair_overlapping_elements(
+        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
+    ) -> None:
+        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
+        ...
+
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
+
+        Args:
+            x: Positions, array of vec3 or vec3d.
+            counts: By :class:`Count`, array of int64.
+            pairs: Queue for (edge, face), array of vec2i.
+        """
+        ...
+
+
+def make_broad_phase(mesh: CollisionMesh, count: wp.array) -> BroadPhase:
+    """Returns the broad phase for a mesh's device.
+
+    Args:
+        mesh: The mesh.
+        count: Number of pairs of faces found, zero before each run, array of one int64.
+    """
+    return (BroadPhaseSimd if mesh.device.is_cpu else BroadPhaseBvh)(mesh, count)

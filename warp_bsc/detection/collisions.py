@@ -1,0 +1,189 @@
+"""The results of a detection."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .contact_buffer import ContactBuffer, HostContacts, read_contacts
+from .differentiable import CollisionArrays
+from .settings import Counts, PairCounts
+from .stage_timer import StageTimer
+
+__all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts"]
+
+
+@dataclass(frozen=True)
+class StageCounts:
+    """Numbers of pairs of one kind that entered or left each stage.
+
+    Attributes:
+        candidates: Pairs that share no vertex and whose swept boxes overlap.
+        survivors: Candidates that no cull decides.
+        free: Candidates certified free, by the culls or later.
+        hits: Candidates certified to collide.
+        unsure: Candidates that floating point could not certify either way.
+        exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
+        host: Candidates whose exponents are too far apart for that. The host decides them, but not in a CUDA graph,
+            where they stay unsure.
+    """
+
+    candidates: int
+    survivors: int
+    free: int
+    hits: int
+    unsure: int
+    exact: int
+    host: int
+
+    @classmethod
+    def of(cls, counts: PairCounts, *, exact: bool) -> "StageCounts":
+        """Returns the numbers of one kind of pair from its counters; ``exact``: whether there was an exact stage."""
+        return cls(
+            candidates=counts.candidates,
+            survivors=counts.survivors,
+            free=counts.candidates - counts.found,
+            hits=counts.found - counts.unsure,
+            unsure=counts.unsure,
+            exact=counts.for_exact - counts.too_wide_8 if exact else 0,
+            host=counts.too_wide_8,
+        )
+
+
+@dataclass(frozen=True)
+class DetectionStats:
+    """Counts and times of a detection.
+
+    Attributes:
+        vertex_face: Numbers of vertex-face pairs that entered or left each stage.
+        edge_edge: Numbers of edge-edge pairs that entered or left each stage.
+        milliseconds: Time by stage: "broad phase", "cull", "classify", "time of impact", "sort", "exact". Empty for a
+            detection in a CUDA graph.
+    """
+
+    vertex_face: StageCounts
+    edge_edge: StageCounts
+    milliseconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Collisions:
+    """The collisions of one motion, sorted, the same on every run and every device.
+
+    They are in arrays of their own, on the device until they are first read, and stay as they are whatever is detected
+    later.
+
+    Attributes:
+        certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
+            as well. False for method "float", and if a buffer overflowed, a position was not finite, or a pair was
+            left to the host in a CUDA graph.
+        overflows: Each buffer that was too small, so that collisions are missing, with its count and capacity. Only a
+            detection in a CUDA graph can overflow: detect once outside a graph, which enlarges the buffers, and capture
+            again.
+        arrays: The collisions on the device, with gradients; None unless ``x0`` or ``x1`` requires gradients.
+    """
+
+    certified: bool
+    overflows: tuple[str, ...]
+    arrays: CollisionArrays | None
+    _method: str = field(repr=False)
+    _counts: Counts = field(repr=False)
+    _vertex_face: ContactBuffer = field(repr=False)
+    _edge_edge: ContactBuffer = field(repr=False)
+    _timer: StageTimer = field(repr=False)
+
+    @functools.cached_property
+    def _vertex_face_contacts(self) -> HostContacts:
+        return read_contacts(self._vertex_face, len(self._vertex_face.pairs))
+
+    @functools.cached_property
+    def _edge_edge_contacts(self) -> HostContacts:
+        return read_contacts(self._edge_edge, len(self._edge_edge.pairs))
+
+    @property
+    def vertex_face(self) -> np.ndarray:
+        """(vertex, face), int32, shape [n, 2]."""
+        return self._vertex_face_contacts.pairs
+
+    @property
+    def edge_edge(self) -> np.ndarray:
+        """(edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2]."""
+        return self._edge_edge_contacts.pairs
+
+    @property
+    def vertex_face_toi(self) -> np.ndarray:
+        """Times of impact as a share of the step, float64, shape [n]: no contact of the pair comes earlier.
+
+        They are at most the tolerance before the first contact, except for UNSURE pairs of "float" and "conservative".
+        """
+        return self._vertex_face_contacts.toi
+
+    @property
+    def edge_edge_toi(self) -> np.ndarray:
+        """Times of impact of the edges, as :attr:`vertex_face_toi`, float64, shape [m]."""
+        return self._edge_edge_contacts.toi
+
+    @property
+    def vertex_face_coordinates(self) -> np.ndarray:
+        """Barycentric coordinates of the contact in the face, float64, shape [n, 3]."""
+        return self._vertex_face_contacts.coordinates
+
+    @property
+    def edge_edge_coordinates(self) -> np.ndarray:
+        """(s, r, 0) along the two edges, float64, shape [m, 3]."""
+        return self._edge_edge_contacts.coordinates
+
+    @property
+    def vertex_face_normal(self) -> np.ndarray:
+        """Unit normals, against the velocity of the vertex relative to the face, float64, shape [n, 3]."""
+        return self._vertex_face_contacts.normal
+
+    @property
+    def edge_edge_normal(self) -> np.ndarray:
+        """Unit normals, against the velocity of the first edge relative to the second, float64, shape [m, 3]."""
+        return self._edge_edge_contacts.normal
+
+    @functools.cached_property
+    def earliest_toi(self) -> float:
+        """The earliest time of impact, 2.0 if there is none."""
+        return float(min(self.vertex_face_toi.min(initial=2.0), self.edge_edge_toi.min(initial=2.0)))
+
+    @property
+    def overflowed(self) -> bool:
+        """Whether a buffer was too small, so that collisions are missing; :attr:`overflows` says which."""
+        return bool(self.overflows)
+
+    @functools.cached_property
+    def stats(self) -> DetectionStats:
+        """Counts and times of every stage."""
+        milliseconds = self._timer.read()
+        if milliseconds:
+            milliseconds["exact"] = milliseconds.pop("exact", 0.0)
+        exact = self._method == "exact"
+        vertex_face, edge_edge = (
+            StageCounts.of(counts, exact=exact) for counts in (self._counts.vertex_face, self._counts.edge_edge)
+        )
+        return DetectionStats(vertex_face, edge_edge, milliseconds)
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedCollisions:
+    """The collisions of a detection that is part of a graph.
+
+    Attributes:
+        arrays: The collisions of the last replay on the device, with gradients; None unless ``x0`` or ``x1`` requires
+            gradients.
+    """
+
+    arrays: CollisionArrays | None
+    _read: Callable[[], Collisions] = field(repr=False)
+
+    def read(self) -> Collisions:
+        """Returns what the last replay found; on CUDA what the detector found last, in a graph or not.
+
+        Raises:
+            RuntimeError: If the graph must be captured again, as the detector's buffers have been replaced since, or on
+                the CPU if it has not been launched.
+        """
+        return self._read()

@@ -1,0 +1,196 @@
+"""Detection on the device alone: broad phase and narrow phases, without results on the host."""
+
+import functools
+
+import warp as wp
+
+from .broad_phase import make_broad_phase
+from .mesh import CollisionMesh
+from .narrow_phase import NarrowPhase
+from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, PairKind, check_method, check_tolerance
+from .stage_timer import StageTimer
+
+__all__ = ["DetectionPipeline"]
+
+_UNTIMED = StageTimer(None)
+
+
+@functools.cache
+def _count_not_finite(dtype: type) -> wp.Kernel:
+    """The kernel that counts positions that are not finite, for one type of position."""
+
+    @wp.kernel(**NO_GRADIENTS)
+    def count_not_finite(
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        vertices: wp.array[int],
+        # out
+        count: wp.array[wp.int64],
+    ):
+        vertex = wp.tid()
+        if vertices:
+            vertex = vertices[vertex]
+        if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
+            wp.atomic_add(count, 0, wp.int64(1))
+
+    return count_not_finite
+
+
+class DetectionPipeline:
+    """Finds the contacts of a moving mesh and leaves them on the device, unsorted, with buffers that it reuses.
+
+    Once its buffers are large enough, a run allocates nothing and does not synchronize with a GPU, and can be captured
+    in a CUDA graph::
+
+        pipeline = DetectionPipeline(mesh)
+        retry_until_fits(lambda: pipeline.find_contacts(x0, x1), pipeline, mesh.device)
+        for narrow_phase in pipeline.narrow_phases:
+            narrow_phase.kind, narrow_phase.contacts, narrow_phase.counts
+
+    Attributes:
+        mesh: The mesh.
+        method: One of :data:`METHODS`.
+        tolerance: Of the times of impact, as a share of the step.
+        counters: Counts of the last run, on the device.
+        counts: The same on the host, as the last :meth:`grow` has read them.
+        capacities: Capacities for the counts, in the order of the counters, and 0 for positions that are not finite,
+            Warp array of int64: where a count is larger, something is missing.
+        vertex_face: The narrow phase of vertex-face pairs.
+        edge_edge: The narrow phase of edge-edge pairs.
+        generation: How often buffers have been replaced. Graphs captured before still write to the old buffers.
+    """
+
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        *,
+        method: str = "conservative",
+        tolerance: float = TOLERANCE,
+        only_used_vertices: bool = False,
+    ):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            method: What becomes of pairs that floating point cannot certify, see :class:`CollisionDetector`.
+            tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+            only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
+                counted too if they are not finite.
+
+        Raises:
+            ValueError: If there is no such method, or the tolerance is out of range.
+        """
+        check_method(method)
+        check_tolerance(tolerance)
+        self.mesh = mesh
+        self.method = method
+        self.tolerance = tolerance
+        self.generation = 0
+        self._checked_vertices = mesh.device_vertices if only_used_vertices else None
+        self._captured = False
+        self._retired: list = []  # buffers that a CUDA graph may still write to
+        self.counters = Counters(mesh.device)
+        self.counts = self.counters.read()
+        self._broad_phase = make_broad_phase(mesh, self.counters.face_pairs)
+        vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
+        self.vertex_face = NarrowPhase(
+            PairKind.VERTEX_FACE, self.counters.vertex_face, faces, elements=(vertices, faces)
+        )
+        self.edge_edge = NarrowPhase(PairKind.EDGE_EDGE, self.counters.edge_edge, 2 * faces, elements=(edges, edges))
+        self.capacities = self._device_capacities()
+
+    @property
+    def narrow_phases(self) -> tuple[NarrowPhase, NarrowPhase]:
+        """The narrow phases of vertex-face and of edge-edge pairs."""
+        return self.vertex_face, self.edge_edge
+
+    def find_contacts(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+        sort: bool = False,
+        timer: StageTimer = _UNTIMED,
+        side_stream: wp.Stream | None = None,
+    ) -> None:
+        """Launches the broad phase and both narrow phases, whose ``contacts`` are the result.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
+            x1: Positions at the end, of the same type.
+            refit: Whether to keep the tree of the run before, which is fast if little has moved since. Only then the
+                run can be captured in the body of a conditional node.
+            changed: Nonzero for each vertex whose motion has changed since the run before, or that was in a contact
+                then. Pairs without such a vertex have no contact again, and are excluded. Warp array of int; None for
+                all.
+            sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
+            timer: Measures the stages.
+            side_stream: Stream for the vertex-face pairs; None to find one kind of pair after the other.
+        """
+        self._captured |= bool(self.mesh.device.is_capturing)
+        self.counters.array.zero_()
+        with timer.stage("broad phase"):
+            self._broad_phase.pair_elements(x0, x1, *self._queues(), refit=refit, changed=changed)
+            with wp.ScopedStream(side_stream):
+                self._launch_count_not_finite(x0, x1)
+        for narrow_phase, stream in ((self.vertex_face, side_stream), (self.edge_edge, None)):
+            with wp.ScopedStream(stream):
+                elements = self.mesh.device_elements(narrow_phase.kind)
+                narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance, timer=timer)
+                if sort:
+                    with timer.stage("sort"):
+                        narrow_phase.sort()
+        if side_stream is not None:
+            wp.wait_stream(side_stream)
+
+    def find_candidates(self) -> None:
+        """Enqueues all candidates of the last run in the queues of the narrow phases, which do not run.
+
+        The queue of that run's broad phase must have been large enough, see :meth:`grow`.
+        """
+        self.counters.pairs.zero_()
+        self._broad_phase.pair_overlapping_elements(*self._queues())
+
+    def grow(self) -> bool:
+        """Enlarges the buffers that were too small in the last run; synchronizes with the device.
+
+        Returns:
+            Whether the run is to be repeated. Where a position was not finite no run can be right, and nothing grows.
+
+        Raises:
+            ValueError: If a buffer cannot be large enough.
+        """
+        counts = self.counts = self.counters.read()
+        if counts.not_finite or not self.overflows(counts):
+            return False
+        self.generation += 1
+        if self._captured:
+            buffers = *self._broad_phase.buffers, *self.vertex_face.buffers, *self.edge_edge.buffers, self.capacities
+            self._retired += buffers
+        self._broad_phase.grow(counts.face_pairs)
+        self.vertex_face.grow(counts.vertex_face)
+        self.edge_edge.grow(counts.edge_edge)
+        self.capacities = self._device_capacities()
+        return True
+
+    def overflows(self, counts: Counts) -> list[str]:
+        """Names each buffer that is too small for the counts, with count and capacity."""
+        return counts.overflows(self._host_capacities())
+
+    def _queues(self) -> list[wp.array]:
+        return [queue for narrow_phase in self.narrow_phases for queue in (narrow_phase.counts, narrow_phase.queue)]
+
+    def _host_capacities(self) -> Counts:
+        return Counts(0, self._broad_phase.capacity, self.vertex_face.capacities, self.edge_edge.capacities)
+
+    def _device_capacities(self) -> wp.array:
+        return wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)
+
+    def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
+        vertices, device = self._checked_vertices, self.mesh.device
+        dim = self.mesh.vertex_count if vertices is None else len(vertices)
+        inputs, outputs = [x0, x1, vertices], [self.counters.not_finite]
+        wp.launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)

@@ -1,0 +1,211 @@
+"""What all parts of the detection share: kinds of pairs, methods, tolerances, options of kernels, and counters."""
+
+import enum
+from dataclasses import dataclass, fields
+
+import numpy as np
+import warp as wp
+
+from ..kernels import polynomials
+
+__all__ = [
+    "METHODS",
+    "NO_FUSED_OPERATIONS",
+    "NO_GRADIENTS",
+    "TOLERANCE",
+    "UNLIMITED",
+    "Count",
+    "Counters",
+    "Counts",
+    "PairCounts",
+    "PairKind",
+    "capacity_for",
+    "check_method",
+    "check_tolerance",
+]
+
+METHODS = ("float", "conservative", "exact")
+"""What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
+arithmetic decides."""
+
+TOLERANCE = 2.0**-20
+"""Default tolerance of the time of impact, as a share of the step."""
+
+UNLIMITED = 2**62
+"""Capacity of what is only counted."""
+
+NO_GRADIENTS = {"enable_backward": False, "module": "unique"}
+"""Options of a kernel without gradients, in a module of its own."""
+
+NO_FUSED_OPERATIONS = NO_GRADIENTS | {"module_options": {"fuse_fp": False}}
+"""The same for a kernel that decides: without fused operations every device computes the same bits."""
+
+
+class PairKind(enum.IntEnum):
+    """The two kinds of pairs, with the values that kernels take."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+
+    @property
+    def label(self) -> str:
+        """The name in attributes of results: "vertex_face" or "edge_edge"."""
+        return self.name.lower()
+
+
+def check_method(method: str) -> None:
+    """Raises ValueError if there is no such method."""
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raises ValueError if the tolerance is out of the range that halving the step reaches."""
+    if not 2.0**-38 <= tolerance <= 1.0:
+        raise ValueError(f"tolerance must be in [2^-38, 1], not {tolerance!r}")
+
+
+def capacity_for(count: int, buffer: str) -> int:
+    """Returns the capacity of a buffer that is to hold ``count`` entries, with a quarter to spare.
+
+    Raises:
+        ValueError: If a buffer cannot have as many; names the buffer.
+    """
+    capacity = int(count) + int(count) // 4
+    if capacity >= 2**31:
+        raise ValueError(f"buffer {buffer!r} must hold {count} pairs, more than its largest capacity, {2**31 - 1}")
+    return capacity
+
+
+class Count(enum.IntEnum):
+    """Places of the counts of one kind of pair in an array, in the order of the stages.
+
+    Attributes:
+        CANDIDATES: Pairs that share no vertex and whose swept boxes overlap.
+        QUEUED: Pairs enqueued for the narrow phase: candidates that no coordinate axis separates at the start and at
+            the end, on the same side.
+        SURVIVORS: Queued pairs that no cull decides.
+        CONTACTS: Survivors that classification does not certify free.
+        FOUND: Contacts that are not certified free when their time of impact is sought either.
+        UNSURE: Found pairs that are not certified hits either.
+        FOR_EXACT: Found pairs that the exact stage decides or, where times are wanted, times.
+        TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
+        TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
+        TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs: left to the host.
+        REFUTED: Found pairs that the exact stage decides to be free.
+    """
+
+    CANDIDATES = 0
+    QUEUED = 1
+    SURVIVORS = 2
+    CONTACTS = 3
+    FOUND = 4
+    UNSURE = 5
+    FOR_EXACT = 6
+    TOO_WIDE_1 = 7
+    TOO_WIDE_2 = 8
+    TOO_WIDE_8 = 9
+    REFUTED = 10
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """Counts of one kind of pair, or capacities for them, on the host; the attributes are those of :class:`Count`."""
+
+    candidates: int = 0
+    queued: int = 0
+    survivors: int = 0
+    contacts: int = 0
+    found: int = 0
+    unsure: int = 0
+    for_exact: int = 0
+    too_wide_1: int = 0
+    too_wide_2: int = 0
+    too_wide_8: int = 0
+    refuted: int = 0
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "PairCounts":
+        """Returns the counts in an array of int64 by :class:`Count`."""
+        return cls(*map(int, values))
+
+    def values(self) -> list[int]:
+        """Returns the counts in the order of :class:`Count`."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    @property
+    def collisions(self) -> int:
+        """Number of pairs that are reported."""
+        return self.found - self.refuted
+
+    def overflows(self, capacities: "PairCounts", kind: PairKind) -> list[str]:
+        """Names each buffer of a kind that is too small for these counts, with count and capacity."""
+        return [
+            f"{kind.label} {count.name.lower()}: {needed} do not fit in the capacity {capacity}"
+            for count, needed, capacity in zip(Count, self.values(), capacities.values(), strict=True)
+            if needed > capacity
+        ]
+
+
+_NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
+"""Places of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Counts of a detection, or the capacities for them, on the host.
+
+    Attributes:
+        not_finite: Vertices with a position that is not finite; there is no capacity for these.
+        face_pairs: Pairs of faces whose swept boxes overlap, of a broad phase that has a queue for them.
+        vertex_face: Counts of vertex-face pairs.
+        edge_edge: Counts of edge-edge pairs.
+    """
+
+    not_finite: int
+    face_pairs: int
+    vertex_face: PairCounts
+    edge_edge: PairCounts
+
+    def values(self) -> list[int]:
+        """Returns all counts in the order of :class:`Counters`."""
+        return [self.not_finite, self.face_pairs, *self.vertex_face.values(), *self.edge_edge.values()]
+
+    def overflows(self, capacities: "Counts") -> list[str]:
+        """Names each buffer that is too small for these counts, with count and capacity."""
+        faces = []
+        if self.face_pairs > capacities.face_pairs:
+            faces = [f"face pairs: {self.face_pairs} do not fit in the capacity {capacities.face_pairs}"]
+        return [
+            *faces,
+            *self.vertex_face.overflows(capacities.vertex_face, PairKind.VERTEX_FACE),
+            *self.edge_edge.overflows(capacities.edge_edge, PairKind.EDGE_EDGE),
+        ]
+
+
+class Counters:
+    """The counts of a detection on its device, which any thread may raise.
+
+    Attributes:
+        array: All counts, zero before each detection, Warp array of int64.
+        not_finite: Number of vertices with a position that is not finite, array of one int64.
+        face_pairs: Number of pairs of faces, array of one int64.
+        pairs: Counts of both kinds of pair, array of int64.
+        vertex_face: Counts of vertex-face pairs by :class:`Count`, array of int64.
+        edge_edge: Counts of edge-edge pairs by :class:`Count`, array of int64.
+    """
+
+    def __init__(self, device: wp.Device):
+        """Allocates the counters on a device, all zero."""
+        self.array = wp.zeros(_PAIRS + 2 * len(Count), dtype=wp.int64, device=device)
+        self.not_finite = self.array[_NOT_FINITE:_FACE_PAIRS]
+        self.face_pairs = self.array[_FACE_PAIRS:_PAIRS]
+        self.pairs = self.array[_PAIRS:]
+        self.vertex_face = self.pairs[: len(Count)]
+        self.edge_edge = self.pairs[len(Count) :]
+
+    def read(self) -> Counts:
+        """Returns the counts on the host; synchronizes with the device."""
+        not_finite, face_pairs, *pairs = self.array.numpy().tolist()
+        n = len(Count)
+        return Counts(not_finite, face_pairs, PairCounts(*pairs[:n]), PairCounts(*pairs[n:]))

@@ -1,0 +1,49 @@
+"""Times of the stages of a detection."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+import warp as wp
+
+__all__ = ["StageTimer"]
+
+
+class StageTimer:
+    """Measures stages that follow one another: by events on a GPU, without synchronizing, else by the clock.
+
+    A stage lasts from the end of the stage before to its own. While a graph is captured nothing is measured.
+    """
+
+    def __init__(self, device: wp.Device | None):
+        """Starts the first stage, on the device's current stream; without a device nothing is ever measured."""
+        self._device = device
+        self._ends: list[tuple[str, wp.Event | float]] = []
+        self._start = None if self._is_idle() else self._now()
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time until the end of the context to a stage."""
+        yield
+        if not self._is_idle():
+            self._ends.append((name, self._now()))
+
+    def read(self) -> dict[str, float]:
+        """Returns the time by stage [ms]; waits for the end of the last on a GPU."""
+        milliseconds: dict[str, float] = {}
+        start = self._start
+        for name, end in self._ends:
+            passed = wp.get_event_elapsed_time(start, end) if self._device.is_cuda else 1000.0 * (end - start)
+            milliseconds[name] = milliseconds.get(name, 0.0) + passed
+            start = end
+        return milliseconds
+
+    def _is_idle(self) -> bool:
+        return self._device is None or self._device.is_capturing
+
+    def _now(self) -> wp.Event | float:
+        if not self._device.is_cuda:
+            return time.perf_counter()
+        event = wp.Event(self._device, enable_timing=True)
+        wp.get_stream(self._device).record_event(event)
+        return event

@@ -1,0 +1,132 @@
+"""Device data of the response: the motion that comes in, the vertices and constraints worked on, and the status."""
+
+import warp as wp
+
+__all__ = [
+    "FROZEN",
+    "NEVER",
+    "PROJECTED",
+    "TRUNCATED",
+    "Constraints",
+    "Motion",
+    "Progress",
+    "SolveStatus",
+    "SweepStatus",
+    "Vertices",
+    "allocate_constraints",
+    "allocate_vertices",
+]
+
+PROJECTED, TRUNCATED, FROZEN = (wp.constant(bit) for bit in (1, 2, 4))
+"""Bits of the outcome of a vertex: constraints moved it, its path was cut, it was left where it was."""
+
+NEVER = wp.constant(wp.int64(2**62))
+"""The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
+
+
+@wp.struct
+class Motion:
+    """The motion that the inner solver wants, and properties of its vertices. The response only reads it."""
+
+    x0: wp.array[wp.vec3]  # positions at the start of the step [m]
+    x1: wp.array[wp.vec3]  # wanted positions at its end [m]
+    velocity: wp.array[wp.vec3]  # wanted velocities at its end [m/s]
+    inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved
+    friction: wp.array[float]  # coefficient
+    world: wp.array[int]
+    movable: int  # vertices from here on belong to shapes: contacts of only these do not count
+
+
+@wp.struct
+class Vertices:
+    """The vertices as the response moves them."""
+
+    x1: wp.array[wp.vec3]  # positions at the end of the step [m]
+    velocity: wp.array[wp.vec3]  # velocities at its end [m/s]
+    active: wp.array[int]  # active constraints of the vertex
+    particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see projection.add_delta
+    particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
+    first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
+    changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
+    outcome: wp.array[int]  # bits of PROJECTED, TRUNCATED, FROZEN
+
+
+@wp.struct
+class Constraints:
+    """Contacts of this and earlier iterations as constraints, so that resolving one does not bring back another.
+
+    A constraint keeps two contact points apart along a normal at the end of the step.
+    """
+
+    count: wp.array[int]
+    vertices: wp.array[wp.vec4i]
+    weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
+    normal: wp.array[wp.vec3d]
+    separation: wp.array[wp.float64]  # along the normal [m]
+    friction: wp.array[float]  # coefficient
+    kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
+    localized: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
+    toi: wp.array[wp.float64]  # time of impact
+    approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
+    slow: wp.array[int]  # 1 if its elements move little, see constraints.is_slow
+    position_multiplier: wp.array[wp.vec3d]  # [kg m]
+    velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
+    previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum
+    last_sweep: wp.array[int]  # in which it was active last
+    active_set: wp.array[int]  # indices of the active constraints
+    active_count: wp.array[wp.int64]
+
+
+@wp.struct
+class SolveStatus:
+    """How far the response to a step is, and what came of it; each field is an array of one element."""
+
+    active: wp.array[int]  # 1 while another iteration is needed
+    iteration: wp.array[int]  # iterations of detect and project so far
+    certified: wp.array[int]  # 1 if the last detection was complete and found no contact
+    hits: wp.array[int]  # contacts found so far by the detection in progress
+    first_hits: wp.array[int]  # contacts of the wanted motion
+    remaining: wp.array[int]  # contacts that the last detection found
+    newly_frozen: wp.array[int]  # vertices that this iteration froze
+    undetected: wp.array[int]  # 1 if the last detection was incomplete
+
+
+@wp.struct
+class SweepStatus:
+    """How far the sweeps over constraints are; each field is an array of one element."""
+
+    another: wp.array[int]  # 1 while another batch of sweeps is needed
+    number: wp.array[int]  # sweeps so far
+
+
+@wp.struct
+class Progress:
+    """How far the response to a step is."""
+
+    status: SolveStatus
+    sweep: SweepStatus
+    max_iterations: int  # of detect and project; after them paths are truncated
+    contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
+
+
+def allocate_vertices(count, device) -> Vertices:
+    """Returns vertices without contacts."""
+    vertices = Vertices()
+    for name in ("x1", "velocity"):
+        setattr(vertices, name, wp.zeros(count, dtype=wp.vec3, device=device))
+    for name in ("active", "changed", "outcome"):
+        setattr(vertices, name, wp.zeros(count, dtype=int, device=device))
+    for name in ("particle_delta_x", "particle_delta_v"):
+        setattr(vertices, name, wp.zeros((count, 3), dtype=wp.int64, device=device))
+    vertices.first_contact = wp.full(count, int(NEVER), dtype=wp.int64, device=device)
+    return vertices
+
+
+def allocate_constraints(capacity, device) -> Constraints:
+    """Returns constraints, none yet, with this capacity."""
+    constraints = Constraints()
+    for name, var in Constraints.vars.items():
+        setattr(constraints, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
+    constraints.count = wp.zeros(1, dtype=int, device=device)
+    constraints.active_count = wp.zeros(1, dtype=wp.int64, device=device)
+    return constraints

@@ -1,0 +1,86 @@
+"""Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
+
+from collections.abc import Callable, Sequence
+
+import newton
+import warp as wp
+from newton.solvers import SolverBase
+
+from .solver_ccd import SolverCCD
+
+__all__ = ["CapturedSteps"]
+
+
+class CapturedSteps:
+    """Runs a function that steps a solver, on a GPU from a CUDA graph.
+
+    In a graph, the buffers of a :class:`.solver_ccd.SolverCCD` cannot grow. A step that needs larger ones freezes all
+    particles or loses its gradients, and the report counts it. Such a run is taken back: the state and the totals of
+    the report become those before it, the function runs outside the graph, where buffers grow, and is captured anew.
+    So is the first run. Other solvers have nothing to take back, and on the CPU the function runs as it is.
+
+    Example::
+
+        def simulate():
+            for start, end in ((state_0, state_1), (state_1, state_0)):  # ends in the state that it began with
+                start.clear_forces()
+                solver.step(start, end, control, None, dt)
+
+        frame = CapturedSteps(simulate, solver, [state_0])
+        for _ in range(frames):
+            frame()
+
+    Attributes:
+        retaken: Runs so far that were taken back.
+    """
+
+    def __init__(self, steps: Callable[[], object], solver: SolverBase, state: Sequence[newton.State | wp.array] = ()):
+        """Captures nothing yet.
+
+        Args:
+            steps: Steps the solver, always in the same arrays; in a graph its launches are repeated, and nothing else
+                that it does. If it goes back through a tape, it also has to clear the gradients first.
+            solver: The solver.
+            state: All states and arrays that ``steps`` both reads and changes.
+        """
+        self._steps, self._solver, self._device = steps, solver, solver.model.device
+        self._report = solver.report if isinstance(solver, SolverCCD) else None
+        self._state = list(state)
+        if self._report is not None:
+            self._state.append(self._report._totals_values)
+        self._saved = [wp.clone(x) if isinstance(x, wp.array) else solver.model.state() for x in self._state]
+        self._graph = None
+        self.retaken = 0
+
+    def __call__(self) -> None:
+        """Runs the steps once. Synchronizes with the device where a run may have to be taken back."""
+        if self._graph is None or not self._launch():
+            self._steps()
+            self._capture()
+
+    def _capture(self):
+        self._graph = None
+        if self._device.is_cuda:
+            with wp.ScopedCapture(self._device) as capture:
+                self._steps()
+            self._graph = capture.graph
+
+    def _launch(self):
+        """Launches the graph; if its buffers were too small, restores the state and returns False."""
+        if self._report is None:
+            wp.capture_launch(self._graph)
+            return True
+        for saved, x in zip(self._saved, self._state, strict=True):
+            saved.assign(x)
+        lost = self._count_lost()
+        wp.capture_launch(self._graph)
+        if self._count_lost() == lost:
+            return True
+        for saved, x in zip(self._saved, self._state, strict=True):
+            x.assign(saved)
+        self.retaken += 1
+        return False
+
+    def _count_lost(self):
+        """Returns the steps so far for which the buffers of a graph may have been too small."""
+        return self._report.undetected_steps + self._report.lost_gradients
