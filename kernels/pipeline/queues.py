@@ -1,7 +1,6 @@
 """Queues between the stages of a pipeline: an array of entries, and a count on the device that any thread may raise.
 
-A count goes on where a queue is full, so that whoever reads it sees how much did not fit: nothing is dropped in
-silence.
+A count goes on where a queue is full, so that it shows how many entries did not fit: nothing is dropped silently.
 """
 
 import warp as wp
@@ -61,14 +60,14 @@ def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
 
 @wp.func
 def write(pair: wp.vec2i, queue: wp.array[wp.vec2i], slot: wp.int64):
-    """Writes a pair to a slot of a queue, if there is room."""
+    """Writes a pair to a slot of a queue, if its capacity allows."""
     if slot < wp.int64(queue.shape[0]):
         queue[wp.int32(slot)] = pair
 
 
 @wp.func
 def append(pair: wp.vec2i, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int):
-    """Writes a pair to the end of a queue, if there is room."""
+    """Writes a pair to the end of a queue, if its capacity allows."""
     write(pair, queue, take_slot(counts, count))
 
 

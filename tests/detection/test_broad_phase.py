@@ -16,7 +16,7 @@ def find_pairs(broad_phase, mesh, x0, x1):
     """Counts and pairs of each kind, and the (edge, face) pairs at the start."""
     device = mesh.device
     if broad_phase is BroadPhaseSimd and device.is_cuda:
-        pytest.skip("blocks are for the CPU")
+        pytest.skip("SIMD packets are for the CPU")
     dtype = wp.vec3 if x0.dtype == np.float32 else wp.vec3d
     x0, x1 = (wp.array(x, dtype=dtype, device=device) for x in (x0, x1))
     counts = wp.zeros((3, len(Count)), dtype=wp.int64, device=device)
@@ -87,7 +87,7 @@ def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat,
 
 @pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
 def test_trees_of_several_levels(broad_phase):
-    """A strip long enough for four levels of blocks, whose pairs are known by counting."""
+    """A strip long enough for four levels of packets, whose pairs are known by counting."""
     n = 6000
     columns = np.arange(n + 1)
     x0 = np.stack(np.broadcast_arrays(columns[:, None], np.arange(2), 0.0), axis=-1).reshape(-1, 3).astype(np.float32)

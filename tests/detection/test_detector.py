@@ -22,11 +22,11 @@ from warp_bsc.kernels.signs import FREE
 METHODS = ("float", "conservative", "exact")
 
 
-@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseBvh], ids=["blocks", "bvh"])
+@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseBvh], ids=["simd", "bvh"])
 def broad_phase(request, monkeypatch, device):
     """Both broad phases where both run, whatever the detector would choose."""
     if device.is_cuda and request.param is BroadPhaseSimd:
-        pytest.skip("blocks are for the CPU")
+        pytest.skip("SIMD packets are for the CPU")
     chosen = "BroadPhaseSimd" if device.is_cpu else "BroadPhaseBvh"
     monkeypatch.setattr(f"warp_bsc.detection.broad_phase.{chosen}", request.param)
     return request.param

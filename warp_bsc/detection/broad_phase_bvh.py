@@ -158,10 +158,10 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
-def _overlapping_vertices(mesh: _Mesh, face: int, other: int, keep_apart: bool):
-    """Which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
+def _overlapping_vertices(mesh: _Mesh, face: int, other: int, keep_separated: bool):
+    """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
-    Those that no axis separates, or all with ``keep_apart``, are bits 3 to 5 as well.
+    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
     """
     owned = mesh.owned[face]
     low = mesh.face_lowers[other]
@@ -174,16 +174,16 @@ def _overlapping_vertices(mesh: _Mesh, face: int, other: int, keep_apart: bool):
             if boxes_overlap(_low(mesh.vertex_boxes, vertex), _high(mesh.vertex_boxes, vertex), low, high):
                 if not _has_vertex(mesh.faces, other, vertex):
                     found = found | (1 << corner)
-                    if keep_apart or not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
+                    if keep_separated or not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
                         found = found | (8 << corner)
     return found
 
 
 @wp.func
-def _overlapping_edges(mesh: _Mesh, face: int, other: int, keep_apart: bool):
+def _overlapping_edges(mesh: _Mesh, face: int, other: int, keep_separated: bool):
     """Which edges of a face and of another, each of its own, have overlapping boxes: bit 3 i + j for sides i and j.
 
-    Those that no axis separates, or all with ``keep_apart``, are bits 9 to 17 as well.
+    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well.
     """
     owned = mesh.owned[face]
     other_owned = mesh.owned[other]
@@ -208,7 +208,7 @@ def _overlapping_edges(mesh: _Mesh, face: int, other: int, keep_apart: bool):
                             if a != c and a != d and b != c and b != d:
                                 bit = 3 * side + other_side
                                 found = found | (1 << bit)
-                                if keep_apart or not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
+                                if keep_separated or not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
                                     found = found | (512 << bit)
     return found
 
@@ -233,7 +233,7 @@ def _pair_elements(
     mesh: _Mesh,
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
-    keep_apart: bool,
+    keep_separated: bool,
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
     edge_edge_counts: wp.array[wp.int64],
@@ -249,9 +249,9 @@ def _pair_elements(
     vertices = int(0)
     edges = int(0)
     if face >= 0:
-        vertices = _overlapping_vertices(mesh, face, other, keep_apart)
-        vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_apart) << 6)
-        edges = _overlapping_edges(mesh, face, other, keep_apart)
+        vertices = _overlapping_vertices(mesh, face, other, keep_separated)
+        vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_separated) << 6)
+        edges = _overlapping_edges(mesh, face, other, keep_separated)
     take_slots(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
     take_slots(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
     # of the rest only what no axis separates

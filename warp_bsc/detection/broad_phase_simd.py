@@ -1,12 +1,12 @@
-"""The broad phase of a CPU: a tree of blocks of eight boxes, which vector instructions compare at once."""
+"""The broad phase of a CPU: a wide BVH of packets of eight boxes, which SIMD instructions compare at once."""
 
 import functools
 
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.blocks import pair_block
 from ..kernels.pipeline.boxes import rounded
+from ..kernels.pipeline.wide_bvh import pair_packet
 from .launch import launch_over
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count
@@ -35,7 +35,7 @@ def _kernels(dtype):
         codes: wp.array[wp.int64],
         order: wp.array[int],
     ):
-        """Where an element, taken for its first corner, lies along a Morton curve; one world behind the other."""
+        """Writes the place of each element's first corner along a Morton curve, one world behind the other."""
         i = first + wp.tid()
         vertex = corners[i, 0]
         code = wp.int64(worlds[i])
@@ -50,7 +50,7 @@ def _kernels(dtype):
         order[i] = i
 
     @wp.kernel(**NO_GRADIENTS)
-    def fill_blocks(
+    def fill_packets(
         first: int,
         x0: wp.array[dtype],
         x1: wp.array[dtype],
@@ -64,22 +64,22 @@ def _kernels(dtype):
         nodes: wp.array3d[wp.float32],
         node_worlds: wp.array3d[int],
     ):
-        block = first + wp.tid()
-        count = wp.min(8, corners.shape[0] - 8 * block)
+        packet = first + wp.tid()
+        count = wp.min(8, corners.shape[0] - 8 * packet)
         low = wp.vec3(wp.inf)
         high = wp.vec3(-wp.inf)
         changed_lanes = int(0)
         for lane in range(count):
-            i = order[8 * block + lane]
+            i = order[8 * packet + lane]
             low0 = wp.vec3(wp.inf)
             high0 = wp.vec3(-wp.inf)
             low1 = wp.vec3(wp.inf)
             high1 = wp.vec3(-wp.inf)
-            elements[block, lane] = numbers[i]
-            elements[block, 32 + lane] = worlds[i]
+            elements[packet, lane] = numbers[i]
+            elements[packet, 32 + lane] = worlds[i]
             for corner in range(corners.shape[1]):
                 vertex = corners[i, corner]
-                elements[block, 8 + 8 * corner + lane] = vertex
+                elements[packet, 8 + 8 * corner + lane] = vertex
                 if not changed or changed[vertex] != 0:
                     changed_lanes = changed_lanes | (1 << lane)
                 start = rounded(x0[vertex])
@@ -89,24 +89,24 @@ def _kernels(dtype):
                 low1 = wp.min(low1, end)
                 high1 = wp.max(high1, end)
             for axis in range(3):
-                boxes[block, 4 * axis, lane] = low0[axis]
-                boxes[block, 4 * axis + 1, lane] = high0[axis]
-                boxes[block, 4 * axis + 2, lane] = low1[axis]
-                boxes[block, 4 * axis + 3, lane] = high1[axis]
+                boxes[packet, 4 * axis, lane] = low0[axis]
+                boxes[packet, 4 * axis + 1, lane] = high0[axis]
+                boxes[packet, 4 * axis + 2, lane] = low1[axis]
+                boxes[packet, 4 * axis + 3, lane] = high1[axis]
             low = wp.min(low, wp.min(low0, low1))
             high = wp.max(high, wp.max(high0, high1))
-        elements[block, 40] = changed_lanes
+        elements[packet, 40] = changed_lanes
         for axis in range(3):
-            nodes[block / 8, 2 * axis, block % 8] = low[axis]
-            nodes[block / 8, 2 * axis + 1, block % 8] = high[axis]
-        node_worlds[block / 8, 0, block % 8] = elements[block, 32]
-        node_worlds[block / 8, 1, block % 8] = elements[block, 32 + count - 1]
+            nodes[packet / 8, 2 * axis, packet % 8] = low[axis]
+            nodes[packet / 8, 2 * axis + 1, packet % 8] = high[axis]
+        node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
+        node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
 
-    return encode, fill_blocks
+    return encode, fill_packets
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _pair_blocks(
+def _pair_packets(
     first: int,
     boxes: wp.array[wp.float32],
     elements: wp.array[int],
@@ -118,11 +118,11 @@ def _pair_blocks(
     other_node_worlds: wp.array[int],
     level_starts: wp.array[int],
     symmetric: int,
-    keep_apart: int,
+    keep_separated: int,
     counts: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
 ):
-    pair_block(
+    pair_packet(
         first + wp.tid(),
         boxes,
         elements,
@@ -134,7 +134,7 @@ def _pair_blocks(
         other_node_worlds,
         level_starts,
         symmetric,
-        keep_apart,
+        keep_separated,
         counts,
         _CANDIDATES,
         _QUEUED,
@@ -143,7 +143,7 @@ def _pair_blocks(
 
 
 class _Tree:
-    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.pipeline.blocks`."""
+    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.pipeline.wide_bvh`."""
 
     def __init__(self, corners, numbers, world):
         """Makes an empty tree.
@@ -154,9 +154,9 @@ class _Tree:
             world: World of each vertex, int32, or None: all in one.
         """
         n = len(corners)
-        blocks = -(-n // 8)
+        packets = -(-n // 8)
         starts = [0]
-        width = blocks
+        width = packets
         while True:
             width = -(-width // 8)
             starts.append(starts[-1] + width)
@@ -172,8 +172,8 @@ class _Tree:
         self._order = wp.empty(2 * n, dtype=int, device=device)
         # empty boxes, which overlap nothing, where there are less than eight; worlds of no element
         empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
-        self._boxes = wp.array(np.tile(empty, (blocks, 6, 8)), dtype=wp.float32, device=device)
-        self._elements = wp.full((blocks, 41), -1, dtype=int, device=device)
+        self._boxes = wp.array(np.tile(empty, (packets, 6, 8)), dtype=wp.float32, device=device)
+        self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
 
@@ -200,11 +200,11 @@ class _Tree:
             x1: Positions at the end, of the same type.
             changed: Which vertices have changed, array of int, None for all.
         """
-        _, fill_blocks = _kernels(x0.dtype)
+        _, fill_packets = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed]
         outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
         device = self._corners.device
-        launch_over(fill_blocks, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
+        launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
         for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
             _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
@@ -212,16 +212,16 @@ class _Tree:
             _join(worlds[start:end, :1, 0], worlds[end:above, :1])
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
-    def pair(self, other, counts, pairs, *, keep_apart=False):
+    def pair(self, other, counts, pairs, *, keep_separated=False):
         """Enqueues pairs of elements of this tree and of another or the same.
 
-        See :func:`warp_bsc.kernels.pipeline.blocks.pair_block`.
+        See :func:`warp_bsc.kernels.pipeline.wide_bvh.pair_packet`.
 
         Args:
             other: The other tree.
             counts: By :class:`Count`, array of int64.
-            pairs: Queue of the pairs that come near, array of vec2i.
-            keep_apart: Whether to enqueue those as well that an axis separates.
+            pairs: Queue of the candidates that no axis separates, array of vec2i.
+            keep_separated: Whether to enqueue those that an axis separates as well.
         """
         inputs = [
             self._boxes.flatten(),
@@ -234,10 +234,10 @@ class _Tree:
             other._node_worlds.flatten(),
             other._level_starts,
             other is self,
-            keep_apart,
+            keep_separated,
             counts,
         ]
-        launch_over(_pair_blocks, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
+        launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
 
 
 def _join(children, parents):
@@ -287,8 +287,8 @@ class BroadPhaseSimd:
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
         """Enqueues all candidates of the last run."""
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_apart=True)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_apart=True)
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=True)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=True)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""

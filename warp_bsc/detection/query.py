@@ -21,14 +21,14 @@ class QueryResult:
     """Answers to elementary queries, one row each, without gradients: :mod:`warp_bsc.kernels` has those.
 
     Attributes:
-        hit: Whether the query collides, by the method asked for, bool, shape [n].
+        hit: Whether the query collides, by the method, bool, shape [n].
         status: What floating point could certify, whatever the method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
         toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
-            if not asked for.
+            if not wanted.
         coordinates: Where they touch, float64, shape [n, 3]: barycentric coordinates in the face, or (s, r, 0)
-            along the edges; NaN where there is no hit. None if no times were asked for.
+            along the edges; NaN where there is no hit. None if no times were wanted.
         normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other
-            feature, float64, shape [n, 3]; NaN where there is no hit. None if no times were asked for.
+            feature, float64, shape [n, 3]; NaN where there is no hit. None if no times were wanted.
     """
 
     hit: np.ndarray
@@ -110,7 +110,7 @@ def _query(
     points = checked_shape(points, (8, 3), "points")
     n = len(points)
     if n >= 2**29:  # their vertices are numbered by int32
-        raise ValueError(f"at most 2^29 - 1 queries can be asked at once, not {n}")
+        raise ValueError(f"at most 2^29 - 1 queries can be decided at once, not {n}")
     check_finite(points, "points")
     device = wp.get_device(device)
     # a mesh in which each query has four vertices of its own

@@ -3,6 +3,7 @@
 import contextlib
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import warp as wp
 
@@ -18,7 +19,7 @@ class StageTimer:
     def __init__(self, device: wp.Device | None):
         """Starts the first stage, on the device's current stream; without a device nothing is ever measured."""
         self._device = device
-        self._ends: list[tuple[str, wp.Event | float]] = []
+        self._ends: list[tuple[str, Any]] = []
         self._start = None if self._is_idle() else self._now()
 
     @contextlib.contextmanager
@@ -41,7 +42,7 @@ class StageTimer:
     def _is_idle(self) -> bool:
         return self._device is None or self._device.is_capturing
 
-    def _now(self) -> wp.Event | float:
+    def _now(self) -> Any:  # wp.Event, or seconds
         if not self._device.is_cuda:
             return time.perf_counter()
         event = wp.Event(self._device, enable_timing=True)

@@ -1,12 +1,12 @@
-"""Blocks of eight boxes, eight elements each, compared with the vector instructions of a CPU.
+"""A wide BVH of a CPU: packets of eight boxes, compared with SIMD instructions.
 
-Elements sorted along a space-filling curve are cut into blocks of eight. Eight blocks have a node, eight nodes have one
-of the next level, up to one root: a tree whose links are arithmetic. Everything of the same sort lies beside each other
-in eights, so that one box is compared with eight at once.
+Elements sorted along a space-filling curve are cut into packets of eight. Eight packets have a node, eight nodes have
+one of the next level, up to one root: a tree whose links are arithmetic. The same coordinate of all eight lies side by
+side, so that one box is compared with eight at once.
 
-- ``boxes``, float32, 96 a block: for each axis the lowest and the highest coordinate at the start, then at the end.
-- ``elements``, int32, 41 a block: the numbers of the elements, three corners each, their worlds, and which of them have
-  changed, as bits.
+- ``boxes``, float32, 96 a packet: for each axis the lowest and the highest coordinate at the start, then at the end.
+- ``elements``, int32, 41 a packet: the numbers of the elements, three corners each, their worlds, and which of them
+  have changed, as bits.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
 - ``node_worlds``, int32, 16 a node: the first and the last world of the children.
 
@@ -30,10 +30,10 @@ import warp as wp
     auto lowest = [](float a, float b) { return a < b ? a : b; };
     auto highest = [](float a, float b) { return a > b ? a : b; };
 
-    const float* box = boxes.data + 96 * (size_t)block;
-    const int* element = elements.data + 41 * (size_t)block;
+    const float* box = boxes.data + 96 * (size_t)packet;
+    const int* element = elements.data + 41 * (size_t)packet;
 
-    // the block's own box, over all of the time, and its worlds, sorted as they are
+    // the packet's own box, over all of the time, and its worlds, sorted as they are
     Floats lows[3], highs[3];
     float low[3], high[3];
     for (int axis = 0; axis < 3; ++axis) {
@@ -52,12 +52,12 @@ import warp as wp
         last_world = element[32 + lane] > last_world ? element[32 + lane] : last_world;
 
     const int capacity = pairs.shape[0];
-    constexpr int room = 512;
-    int found[2 * room];
+    constexpr int buffered = 512;
+    int found[2 * buffered];
     int count = 0;
     wp::int64 overlapping = 0;
     auto flush = [&]() {
-        const wp::int64 slot = __atomic_fetch_add(&counts.data[near_count], (wp::int64)count, __ATOMIC_RELAXED);
+        const wp::int64 slot = __atomic_fetch_add(&counts.data[queued_count], (wp::int64)count, __ATOMIC_RELAXED);
         for (int i = 0; i < count && slot + i < capacity; ++i) {
             int* at = (int*)pairs.data + 2 * (size_t)(slot + i);
             at[0] = found[2 * i];
@@ -93,7 +93,7 @@ import warp as wp
             unsigned mask = bits(overlap);
             if (!(changed >> lane & 1))
                 mask &= other_changed;
-            if (symmetric && other == block)
+            if (symmetric && other == packet)
                 mask &= ~((2u << lane) - 1u);
             if (!mask)
                 continue;
@@ -103,7 +103,7 @@ import warp as wp
                     shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
             mask &= ~bits(shared);
             overlapping += __builtin_popcount(mask);
-            if (!keep_apart) {
+            if (!keep_separated) {
                 Ints apart = 0;
                 for (int axis = 0; axis < 3; ++axis) {
                     const float* at = box + 32 * axis + lane;
@@ -112,7 +112,7 @@ import warp as wp
                 }
                 mask &= ~bits(apart);
             }
-            if (count > room - 8)
+            if (count > buffered - 8)
                 flush();
             for (; mask; mask &= mask - 1) {
                 const int a = element[lane], b = other_element[__builtin_ctz(mask)];
@@ -137,8 +137,8 @@ import warp as wp
         for (unsigned mask = bits(overlap); mask; mask &= mask - 1) {
             const int lane = __builtin_ctz(mask);
             const wp::int64 index = 8 * (wp::int64)node + lane;
-            // each pair of blocks once: the blocks below one are those from 8^level times its index on
-            if (symmetric && ((index + 1) << (3 * level)) <= block)
+            // each pair of packets once: the packets below one are those from 8^level times its index on
+            if (symmetric && ((index + 1) << (3 * level)) <= packet)
                 continue;
             if (level > 0) {
                 stack[height++] = {level - 1, (int)index};
@@ -153,11 +153,11 @@ import warp as wp
     if (count)
         flush();
     if (overlapping)
-        __atomic_fetch_add(&counts.data[overlap_count], overlapping, __ATOMIC_RELAXED);
+        __atomic_fetch_add(&counts.data[candidate_count], overlapping, __ATOMIC_RELAXED);
 """
 )
-def pair_block(
-    block: int,
+def pair_packet(
+    packet: int,
     boxes: wp.array[wp.float32],
     elements: wp.array[wp.int32],
     corners: int,
@@ -168,17 +168,17 @@ def pair_block(
     other_node_worlds: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
     symmetric: int,
-    keep_apart: int,
+    keep_separated: int,
     counts: wp.array[wp.int64],
-    overlap_count: int,
-    near_count: int,
+    candidate_count: int,
+    queued_count: int,
     pairs: wp.array[wp.vec2i],
 ):
-    """Enqueues the pairs of a block's elements with those of a tree that share no corner and come near.
+    """Enqueues the pairs of a packet's elements with those of a tree that share no corner and that no axis separates.
 
-    A pair whose boxes overlap over the time of the motion is counted, and enqueued unless an axis separates the two at
-    the start and at the end, on the same side; with ``keep_apart`` it is enqueued even then. Pairs of which neither
-    element has changed are left out. With ``symmetric`` both are of one tree, and each pair comes once, the smaller
-    number first.
+    A candidate, a pair whose swept boxes overlap, is counted, and enqueued unless an axis separates the two at the
+    start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. Pairs without a changed
+    element are excluded. With ``symmetric`` both are of one tree, and each pair is found once, the smaller number
+    first.
     """
     ...
