@@ -31,7 +31,7 @@ __all__ = [
     "generate_touching_queries",
 ]
 
-KINDS = ("vertex-face", "edge-edge")
+KINDS: tuple[str, ...] = ("vertex-face", "edge-edge")
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """The modes that are measured, with the bytes of a query and its answer.
