@@ -1,15 +1,156 @@
-"""What all examples share: how they run, and in which of Newton's viewers."""
+"""Base of the examples: options, the collision stage, the loop over frames, the report, and the choice of a viewer."""
+
+import argparse
 
 import newton.examples
+import warp as wp
 from newton.viewer import ViewerNull, ViewerViser
 from rich.console import Console
 from rich.progress import track
 
+import warp_bsc as bsc
+
 ANY_VIEWER = "gl, else viser, else null"
 
 
+class ExampleBase:
+    """A simulation in the format of Newton's examples.
+
+    A derived class calls :meth:`start` at the end of its ``__init__``, and says in ``test_final`` and ``print_report``
+    what its scene should have become.
+
+    Attributes:
+        num_frames: Default of ``--num-frames``.
+        fps: Frames per second.
+        sim_substeps: Steps per frame, even, so that a CUDA graph ends with the states that it began with.
+    """
+
+    num_frames = 60
+    fps = 60
+    sim_substeps = 4
+
+    def __init__(self, viewer, args):
+        self.viewer = viewer
+        self.ccd = args.ccd
+        self.frame_dt = 1.0 / self.fps
+        self.sim_dt = self.frame_dt / self.sim_substeps
+        self.sim_time = 0.0
+        self.frame = 0
+        self.graph = None
+        self.repeated_steps = 0
+
+    def start(self, model, solver, camera, clocks=()):
+        """Puts the collision stage behind a solver, unless ``--no-ccd`` is given, and shows the model.
+
+        Args:
+            model: The model.
+            solver: The inner solver, which needs no contacts.
+            camera: Position [m], pitch and yaw [degrees].
+            clocks: Arrays on the device, besides the states, that a step advances.
+        """
+        self.model = model
+        self.solver = bsc.SolverCCD(solver) if self.ccd else solver
+        self.state_0, self.state_1 = model.state(), model.state()
+        self.control = model.control()
+        self.clocks = clocks
+        self.saved_state, self.saved_clocks = model.state(), [wp.clone(clock) for clock in clocks]
+        self.viewer.set_model(model)
+        position, pitch, yaw = camera
+        self.viewer.set_camera(pos=position, pitch=pitch, yaw=yaw)
+
+    def simulate(self):
+        """Simulates a frame."""
+        for _ in range(self.sim_substeps):
+            self.state_0.clear_forces()
+            self.viewer.apply_forces(self.state_0)
+            self.solver.step(self.state_0, self.state_1, self.control, None, self.sim_dt)
+            self.state_0, self.state_1 = self.state_1, self.state_0
+
+    def step(self):
+        """Simulates a frame, on a GPU from a CUDA graph.
+
+        In a graph the buffers of the stage cannot grow. A frame for which they are too small is simulated again
+        without the graph, which enlarges them, and captured anew.
+        """
+        if not self.launch_graph():
+            self.simulate()
+            self.capture()
+        self.frame += 1
+        self.sim_time += self.frame_dt
+
+    def capture(self):
+        """Captures a frame on a GPU."""
+        self.graph = None
+        if self.model.device.is_cuda:
+            with wp.ScopedCapture() as capture:
+                self.simulate()
+            self.graph = capture.graph
+
+    def launch_graph(self):
+        """Simulates a frame from the graph; returns whether there is a graph and it certified all steps."""
+        if self.graph is None:
+            return False
+        self.saved_state.assign(self.state_0)
+        for saved, clock in zip(self.saved_clocks, self.clocks, strict=True):
+            wp.copy(saved, clock)
+        uncertified = self.count_uncertified()
+        wp.capture_launch(self.graph)
+        uncertified = self.count_uncertified() - uncertified
+        if uncertified == 0:
+            return True
+        self.state_0.assign(self.saved_state)
+        for saved, clock in zip(self.saved_clocks, self.clocks, strict=True):
+            wp.copy(clock, saved)
+        self.repeated_steps += uncertified
+        return False
+
+    def count_uncertified(self):
+        """Returns the number of steps that were not certified, repeated ones included."""
+        return self.solver.report.uncertified_steps if self.ccd else 0
+
+    def render(self):
+        """Shows the frame."""
+        self.viewer.begin_frame(self.sim_time)
+        self.viewer.log_state(self.state_0)
+        self.viewer.end_frame()
+
+    def find_intersections(self):
+        """Returns the pairs of an edge and a face of the deforming meshes that cross now."""
+        mesh = bsc.CollisionMesh(self.model.tri_indices.numpy(), self.model.particle_count, device=self.model.device)
+        return bsc.CollisionDetector(mesh).find_intersections(self.state_0.particle_q)
+
+    def test_final(self):
+        """Checks that the stage certified all steps and left no intersections."""
+        if self.ccd:
+            uncertified = self.count_uncertified() - self.repeated_steps
+            assert uncertified == 0, f"{uncertified} steps are not certified"
+            intersections = self.solver.report.intersections
+            assert len(intersections) == 0, f"{len(intersections)} edges cross faces in the last step"
+
+    def print_report(self):
+        """Prints what the stage did."""
+        if self.ccd:
+            repeated = f"; {self.repeated_steps} of these in frames simulated again" if self.repeated_steps else ""
+            print(f"{self.solver.report}{repeated}")
+
+    @classmethod
+    def create_parser(cls):
+        """Returns the options."""
+        return create_parser(cls.num_frames)
+
+
+def create_parser(num_frames):
+    """Returns Newton's options with a number of frames, and ``--no-ccd``."""
+    parser = newton.examples.create_parser()
+    parser.set_defaults(num_frames=num_frames)
+    parser.add_argument(
+        "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind the solver."
+    )
+    return parser
+
+
 class ViewerProgress(ViewerNull):
-    """Shows nothing but how many frames are done."""
+    """Shows only how many frames are done."""
 
     def __init__(self, num_frames):
         super().__init__(num_frames=num_frames)
@@ -28,22 +169,22 @@ class ViewerProgress(ViewerNull):
 
 
 def main(example_class):
-    """Runs an example as the command line asks, and prints what came of it."""
+    """Runs an example with the options of the command line, and prints its report."""
     viewer, args = open_viewer(example_class.create_parser())
     example = example_class(viewer, args)
     try:
         newton.examples.run(example, args)
     except KeyboardInterrupt:
-        if not isinstance(viewer, ViewerViser):  # which has no other end
+        if not isinstance(viewer, ViewerViser):  # Ctrl-C is the only way to close it
             raise
     example.print_report()
 
 
 def open_viewer(parser):
-    """Opens the viewer that the command line asks for; without one a window, or what is possible, and says so.
+    """Opens the viewer of the command line; by default a window, else a browser, else no viewer, and says which.
 
     Args:
-        parser: The options, which contain those of ``newton.examples.create_parser``.
+        parser: Options that contain those of ``newton.examples.create_parser``.
 
     Returns:
         The viewer and the arguments.
@@ -54,11 +195,11 @@ def open_viewer(parser):
     parser.set_defaults(viewer="gl")
     try:
         return newton.examples.init(parser)
-    except Exception as error:  # pyglet, OpenGL or the display is missing, each of which says so in its own way
+    except Exception as error:  # a missing pyglet, OpenGL or display raises an error of its own type
         missing = f"No window ({' '.join(str(error).split())})"
     parser.set_defaults(viewer="null")
     _, args = newton.examples.init(parser)
-    if not (args.test or args.headless):  # which nobody looks at
+    if not (args.test or args.headless):  # nobody looks at those
         try:
             viewer = ViewerViser(host="localhost", paused=args.paused, verbose=False)
         except ImportError:

@@ -8,7 +8,6 @@ The scene is that of Newton's example ``cloth_twist``. Self-contact of the solve
 layers apart.
 """
 
-import argparse
 import math
 import os
 
@@ -18,12 +17,8 @@ import newton.usd
 import numpy as np
 import warp as wp
 import warp.examples
-from common import main
+from common import ExampleBase, main
 from pxr import Usd
-
-import warp_bsc as bsc
-
-FRAMES_PER_CAPTURE = 6
 
 
 @wp.kernel(enable_backward=False)
@@ -35,7 +30,7 @@ def turn_ends(
     time: wp.array[float],
     particle_q: wp.array[wp.vec3],
 ):
-    """Turns the particles at the ends about the y axis to where they are after the step, each its own way."""
+    """Turns the particles at the ends about the y axis, each end its own way, to their positions after the step."""
     particle = ends[wp.tid()]
     p = rest[particle]
     angle = -wp.sign(p[1]) * angular_velocity * (time[0] + dt)
@@ -44,12 +39,12 @@ def turn_ends(
 
 @wp.kernel(enable_backward=False)
 def advance(dt: float, time: wp.array[float]):
-    """Advances the clock, which is on the device because a CUDA graph repeats the same launches."""
+    """Advances the clock; it is on the device because a CUDA graph repeats the same launches."""
     time[0] = time[0] + dt
 
 
 class SolverTurningVBD(newton.solvers.SolverVBD):
-    """VBD that also moves the ends, so that their motion is a part of the step, which the stage sees as a whole."""
+    """VBD that also moves the ends, so that the stage detects collisions of their motion, too."""
 
     def __init__(self, model, ends, angular_velocity, **options):
         super().__init__(model, **options)
@@ -58,25 +53,21 @@ class SolverTurningVBD(newton.solvers.SolverVBD):
         self.time = wp.zeros(1, dtype=float, device=model.device)
 
     def step(self, state_in, state_out, control, contacts, dt, **options):
-        """Turns the ends, and steps what is between them."""
+        """Turns the ends, and steps the cloth between them."""
         inputs = [self.ends, self.model.particle_q, self.angular_velocity, dt, self.time]
         wp.launch(turn_ends, len(self.ends), inputs=inputs, outputs=[state_in.particle_q])
         wp.launch(advance, 1, inputs=[dt], outputs=[self.time])
         super().step(state_in, state_out, control, contacts, dt, **options)
 
 
-class Example:
+class Example(ExampleBase):
     """The scene, in the format of Newton's examples."""
 
+    num_frames = 150
+    sim_substeps = 10
+
     def __init__(self, viewer, args):
-        self.viewer = viewer
-        self.ccd = args.ccd
-        self.fps = 60
-        self.frame_dt = 1.0 / self.fps
-        self.sim_substeps = 10  # even, so that a CUDA graph ends with the states that it began with
-        self.sim_dt = self.frame_dt / self.sim_substeps
-        self.sim_time = 0.0
-        self.frame = 0
+        super().__init__(viewer, args)
         self.angular_velocity = math.pi / 3.0
 
         stage = Usd.Stage.Open(os.path.join(warp.examples.get_asset_directory(), "square_cloth.usd"))
@@ -101,64 +92,15 @@ class Example:
         for particle in self.ends:
             builder.particle_flags[particle] &= ~int(newton.ParticleFlags.ACTIVE)
         builder.color()
-        self.model = builder.finalize()
+        model = builder.finalize()
 
-        self.inner_solver = self.solver = SolverTurningVBD(
-            self.model, self.ends, self.angular_velocity, iterations=4, particle_enable_self_contact=False
+        solver = SolverTurningVBD(
+            model, self.ends, self.angular_velocity, iterations=4, particle_enable_self_contact=False
         )
-        if self.ccd:
-            self.solver = bsc.SolverCCD(self.inner_solver)
-        self.state_0, self.state_1 = self.model.state(), self.model.state()
-        self.control = self.model.control()
-
-        self.viewer.set_model(self.model)
-        self.viewer.set_camera(pos=wp.vec3(2.25, 0.0, 0.0), pitch=0.0, yaw=-180.0)
-
-    def capture(self):
-        """Captures a frame on a GPU."""
-        self.graph = None
-        if self.model.device.is_cuda:
-            with wp.ScopedCapture() as capture:
-                self.simulate()
-            self.graph = capture.graph
-
-    def simulate(self):
-        """Simulates a frame."""
-        for _ in range(self.sim_substeps):
-            self.state_0.clear_forces()
-            self.viewer.apply_forces(self.state_0)
-            self.solver.step(self.state_0, self.state_1, self.control, None, self.sim_dt)
-            self.state_0, self.state_1 = self.state_1, self.state_0
-
-    def step(self):
-        """Simulates a frame, on a GPU from the graph.
-
-        In a graph the stage's queues cannot grow. Contacts become more from frame to frame, so every few frames one is
-        simulated without, which leaves a quarter of room to spare, and captured anew.
-        """
-        if self.frame % FRAMES_PER_CAPTURE == 0:
-            self.simulate()
-            self.capture()
-        elif self.graph:
-            wp.capture_launch(self.graph)
-        else:
-            self.simulate()
-        self.frame += 1
-        self.sim_time += self.frame_dt
-
-    def render(self):
-        """Shows the frame."""
-        self.viewer.begin_frame(self.sim_time)
-        self.viewer.log_state(self.state_0)
-        self.viewer.end_frame()
-
-    def find_intersections(self):
-        """Edges and faces of the cloth that cross now."""
-        mesh = bsc.CollisionMesh(self.model.tri_indices.numpy(), self.model.particle_count, device=self.model.device)
-        return bsc.CollisionDetector(mesh).find_intersections(self.state_0.particle_q)
+        self.start(model, solver, camera=(wp.vec3(2.25, 0.0, 0.0), 0.0, -180.0), clocks=[solver.time])
 
     def measure_turns(self):
-        """Angles by which the particles of the ends have turned about the y axis [rad], in [0, 2 pi), shape [n]."""
+        """Returns the angles by which the particles of the ends have turned about the y axis [rad], in [0, 2 pi)."""
         rest, q = (
             array.numpy()[self.ends].astype(np.float64) for array in (self.model.particle_q, self.state_0.particle_q)
         )
@@ -166,11 +108,8 @@ class Example:
         return -np.sign(rest[:, 1]) * angles % (2.0 * np.pi)
 
     def test_final(self):
-        """The ends have turned, the cloth has not passed through itself, and the stage kept its promise."""
-        if self.ccd:
-            report = self.solver.report
-            assert report.uncertified_steps == 0, f"{report.uncertified_steps} steps are not certified"
-            assert len(report.intersections) == 0, f"{len(report.intersections)} edges cross faces in the last step"
+        """Checks that all steps are certified, the ends have turned, and the cloth has not passed through itself."""
+        super().test_final()
         turned = self.measure_turns() - self.angular_velocity * self.sim_time
         error = np.abs((turned + np.pi) % (2.0 * np.pi) - np.pi).max()
         assert error < 1.0e-3, f"the ends are {error} rad from where they should be"
@@ -178,20 +117,9 @@ class Example:
         assert len(intersections) == 0, f"{len(intersections)} edges of the cloth cross faces"
 
     def print_report(self):
-        """Prints what the stage did."""
-        if self.ccd:
-            print(self.solver.report)
+        """Prints what the stage did, and how often the cloth crosses itself."""
+        super().print_report()
         print(f"{len(self.find_intersections())} edges of the cloth cross faces")
-
-    @staticmethod
-    def create_parser():
-        """The options."""
-        parser = newton.examples.create_parser()
-        parser.set_defaults(num_frames=150)
-        parser.add_argument(
-            "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind it."
-        )
-        return parser
 
 
 if __name__ == "__main__":

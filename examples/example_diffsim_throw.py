@@ -1,39 +1,37 @@
 """Example Diffsim Throw: finds the throw for which a small cloth bounces off a thin tilted sheet onto a mark.
 
     python examples/example_diffsim_throw.py
-    python examples/example_diffsim_throw.py --no-ccd  # the cloth flies through the sheet, and nothing can be learnt
+    python examples/example_diffsim_throw.py --no-ccd  # the cloth flies through the sheet, and the gradient is zero
 
-Three throws, each in a world of its own, are improved by the gradient of how well they land, which goes back through
-the flight, the bounce off the sheet, with friction and restitution, and the throw. The cloth flies two centimetres a
-step, so that without continuous collision detection it never meets the sheet. It then ends up far from the mark, where
-a bit to the left or to the right makes no difference to how well it lands: the gradient is zero.
+Gradient descent improves three throws, each in a world of its own. The gradient of the loss goes back through the
+flight, the bounce off the sheet, with friction and restitution, and the throw. The cloth flies two centimetres a step,
+so that without continuous collision detection it never meets the sheet. It then lands far from the mark, where the loss
+is flat and its gradient zero.
 """
 
-import argparse
 import itertools
 
 import newton
-import newton.examples
 import numpy as np
 import warp as wp
 import warp.optim
-from common import main
+from common import create_parser, main
 
 import warp_bsc as bsc
 
 MARK = wp.vec3(-0.55, 0.1, 0.75)  # [m]
-RADIUS = 0.3  # how near the mark is a good landing [m]
-STARTS = [(13.5, 0.0, -1.0), (9.5, 1.6, 1.0), (12.5, -1.2, 1.6)]  # throws to begin with [m/s]
+RADIUS = 0.3  # distance from the mark at which the loss grows fastest [m]
+STARTS = [(13.5, 0.0, -1.0), (9.5, 1.6, 1.0), (12.5, -1.2, 1.6)]  # first throws [m/s]
 PATCH_CELLS = 4
 STEPS = 160
-FIRST_RATE, RATE_DECAY = 0.3, 0.94  # [m/s] of the first iteration, and how much of it is left in the next
+FIRST_RATE, RATE_DECAY = 0.3, 0.94  # learning rate of the first iteration [m/s], and its factor per iteration
 
 
 @wp.kernel
 def throw(
     throws: wp.array[wp.vec3], thrown: wp.array[int], particle_world: wp.array[int], particle_qd: wp.array[wp.vec3]
 ):
-    """Gives the particles that are thrown the velocity of the throw of their world."""
+    """Sets the velocity of the thrown particles to the throw of their world."""
     particle = wp.tid()
     velocity = wp.vec3()
     if thrown[particle] == 1:
@@ -57,7 +55,7 @@ def add_to_centre(
 
 @wp.kernel
 def judge(centres: wp.array[wp.vec3], mark: wp.vec3, radius: float, losses: wp.array[float], loss: wp.array[float]):
-    """How badly each throw lands: 0 on the mark, 1 wherever it is far."""
+    """Computes the loss of each throw, 0 on the mark and 1 far from it, and adds it to the total."""
     world = wp.tid()
     value = 1.0 - wp.exp(-0.5 * wp.length_sq(centres[world] - mark) / (radius * radius))
     losses[world] = value
@@ -77,7 +75,7 @@ class Example:
         self.add_cloth(world, PATCH_CELLS, 0.03, wp.vec3(-0.9, 0.0, 0.1), wp.vec3(0.2, 1.0, 0.1), -1.35)
         patch = world.particle_count
         fixed = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
-        # of two triangles, the cloth meets one
+        # a sheet of two triangles; the cloth meets one of them
         self.add_cloth(world, 1, 1.4, wp.vec3(0.0, -0.35, 0.0), wp.vec3(0.0, 1.0, 0.0), -1.05, **fixed)
         builder = newton.ModelBuilder()
         builder.replicate(world, len(STARTS))
@@ -103,17 +101,17 @@ class Example:
         self.loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
         self.optimizer = warp.optim.Adam([self.throws], lr=FIRST_RATE)
         self.loss_history = []
-        self.throw = self.throws.numpy().copy()  # the best so far, in each world
-        self.distance = np.full(len(STARTS), np.inf)  # from the mark that it lands [m]
+        self.throw = self.throws.numpy().copy()  # best so far, in each world
+        self.distance = np.full(len(STARTS), np.inf)  # of its landing from the mark [m]
         self.path = np.zeros((STEPS + 1, len(STARTS), 3))  # of its centre [m]
 
         self.viewer.set_model(model)
         self.viewer.set_camera(pos=wp.vec3(-0.3, -3.2, 0.5), pitch=-5.0, yaw=90.0)
         self.graph = None
-        self.taken_back = 0
+        self.repeated_steps = 0
 
     def add_cloth(self, builder, cells, cell, center, axis, angle, **fixed):
-        """Adds a square of cloth that has so many cells a side, of so many metres, turned about an axis."""
+        """Adds a square of cloth with ``cells`` cells of width ``cell`` [m] along each side, turned about an axis."""
         rotation = wp.quat_from_axis_angle(wp.normalize(axis), angle)
         side = cells * cell
         builder.add_cloth_grid(
@@ -134,7 +132,7 @@ class Example:
         )
 
     def simulate(self):
-        """Simulates the throws, and judges them."""
+        """Simulates the throws, and computes their losses."""
         states, world = self.states, self.model.particle_world
         inputs, outputs = [self.throws, self.thrown, world], [states[0].particle_qd]
         wp.launch(throw, self.model.particle_count, inputs=inputs, outputs=outputs)
@@ -148,14 +146,14 @@ class Example:
         wp.launch(judge, len(STARTS), inputs=[self.centres, MARK, RADIUS], outputs=[self.losses, self.loss])
 
     def differentiate(self):
-        """Simulates the throws, and finds the gradient."""
+        """Simulates the throws, and computes the gradient of the loss."""
         self.tape = wp.Tape()
         with self.tape:
             self.simulate()
         self.tape.backward(self.loss)
 
     def capture(self):
-        """Captures the way forward and back in a graph on a GPU."""
+        """Captures simulation and gradient in a CUDA graph, on a GPU."""
         self.graph = None
         if self.model.device.is_cuda:
             with wp.ScopedCapture() as capture:
@@ -163,21 +161,21 @@ class Example:
             self.graph = capture.graph
 
     def launch_graph(self):
-        """Finds the gradient from the graph; returns whether there is one, and the stage had room for all it found."""
+        """Computes the gradient from the graph; returns whether there is a graph and its buffers were large enough."""
         if self.graph is None:
             return False
         missing = self.count_missing()
         wp.capture_launch(self.graph)
         missing = self.count_missing() - missing
-        self.taken_back += missing
+        self.repeated_steps += missing
         return missing == 0
 
     def count_missing(self):
-        """Steps so far that the stage has not certified, or not taken down."""
+        """Returns the number of steps that the stage has not certified, or not recorded for the gradient."""
         return self.solver.report.uncertified_steps + self.solver.report.lost_gradients if self.ccd else 0
 
     def step(self):
-        """Improves the throws by the gradient; without a graph where the stage has no room yet, which makes it."""
+        """Improves the throws by the gradient, computed without the graph if its buffers are too small."""
         if not self.launch_graph():
             if self.graph:
                 self.tape.zero()
@@ -195,13 +193,13 @@ class Example:
         self.iteration += 1
 
     def centre_paths(self):
-        """Where the centres of the cloths have just been [m], shape [STEPS + 1, worlds, 3]."""
+        """Returns the path of the centre of each cloth in the last simulation [m], shape [STEPS + 1, worlds, 3]."""
         thrown = self.thrown.numpy().astype(bool)
         positions = np.array([state.particle_q.numpy()[thrown] for state in self.states])
         return positions.reshape(len(self.states), len(STARTS), -1, 3).mean(axis=2)
 
     def render(self):
-        """Shows where the throws have just landed, and the paths that they took."""
+        """Shows where the throws land, and their paths."""
         ends = self.centre_paths()[::8].astype(np.float32)
         starts, ends = (wp.array(part.reshape(-1, 3), dtype=wp.vec3) for part in (ends[:-1], ends[1:]))
         self.viewer.begin_frame(float(self.iteration))
@@ -210,30 +208,25 @@ class Example:
         self.viewer.end_frame()
 
     def test_final(self):
-        """All throws reach the mark within two centimetres; without the stage none has moved."""
+        """Checks that all throws land within two centimetres of the mark; without the stage, that none has changed."""
         if self.ccd:
             assert self.distance.max() < 0.02, self.distance
-            assert self.count_missing() == self.taken_back, self.solver.report
+            assert self.count_missing() == self.repeated_steps, self.solver.report
         else:
             assert np.abs(self.throws.numpy() - STARTS).max() < 1e-3, self.throws
             assert self.distance.min() > 1.0, self.distance
             assert np.ptp(self.loss_history, axis=0).max() < 1e-6, self.loss_history
 
     def print_report(self):
-        """Prints what the stage did, and how near the throws came."""
+        """Prints what the stage did, and how far from the mark the throws land."""
         if self.ccd:
             print(self.solver.report)
         print(f"the throws land {', '.join(f'{distance:.3f}' for distance in self.distance)} m from the mark")
 
     @staticmethod
     def create_parser():
-        """The options."""
-        parser = newton.examples.create_parser()
-        parser.add_argument(
-            "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind."
-        )
-        parser.set_defaults(num_frames=60)
-        return parser
+        """Returns the options."""
+        return create_parser(num_frames=60)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,10 @@
     python examples/example_garment.py
     python examples/example_garment.py --no-ccd  # the shirt falls through the mannequin
 
-The solver knows of no contact at all, neither of the shirt with itself nor with the mannequin: what keeps the shirt on
-is the stage alone, friction included.
+The inner solver has no contacts, neither of the shirt with itself nor with the mannequin: the collision stage alone,
+with its friction, keeps the shirt on.
 """
 
-import argparse
 import math
 
 import newton
@@ -15,14 +14,11 @@ import newton.examples
 import newton.usd
 import numpy as np
 import warp as wp
-from common import main
+from common import ExampleBase, main
 from pxr import Usd
 
-import warp_bsc as bsc
-
-FRAMES_PER_CAPTURE = 6
 ANGULAR_FREQUENCY = 0.5 * math.pi  # 1/s, a turn to and fro takes four seconds
-CAPSULES = [  # ends and radius [m], fitted into the shirt with some millimetres to spare
+CAPSULES = [  # ends and radius [m], which fit into the shirt with some millimetres to spare
     ((0.0, 0.06, 0.70), (0.0, 0.06, 1.32), 0.095),  # torso
     ((-0.05, 0.06, 0.70), (-0.05, 0.06, 1.30), 0.075),
     ((0.05, 0.06, 0.70), (0.05, 0.06, 1.30), 0.075),
@@ -49,7 +45,7 @@ def turn_body(
 
 
 class SolverTurningVBD(newton.solvers.SolverVBD):
-    """VBD that also turns the body, so that its motion is a part of the step, which the stage sees as a whole."""
+    """VBD that also turns the body, so that the stage detects collisions of its motion, too."""
 
     def __init__(self, model, amplitude, angular_frequency, **options):
         super().__init__(model, **options)
@@ -62,19 +58,14 @@ class SolverTurningVBD(newton.solvers.SolverVBD):
         wp.launch(turn_body, 1, inputs=[*self.motion, dt, self.time], outputs=[state_out.body_q])
 
 
-class Example:
+class Example(ExampleBase):
     """The scene, in the format of Newton's examples."""
 
+    num_frames = 120
+
     def __init__(self, viewer, args):
-        self.viewer = viewer
+        super().__init__(viewer, args)
         self.angle = args.angle
-        self.ccd = args.ccd
-        self.fps = 60
-        self.frame_dt = 1.0 / self.fps
-        self.sim_substeps = 4  # even, so that a CUDA graph ends with the states that it began with
-        self.sim_dt = self.frame_dt / self.sim_substeps
-        self.sim_time = 0.0
-        self.frame = 0
 
         builder = newton.ModelBuilder()
         body = builder.add_body(is_kinematic=True)
@@ -102,63 +93,19 @@ class Example:
             particle_radius=0.002,
         )
         builder.color()
-        self.model = builder.finalize()
+        model = builder.finalize()
 
-        self.solver = SolverTurningVBD(
-            self.model, self.angle, ANGULAR_FREQUENCY, iterations=10, particle_enable_self_contact=False
+        solver = SolverTurningVBD(
+            model, self.angle, ANGULAR_FREQUENCY, iterations=10, particle_enable_self_contact=False
         )
-        if self.ccd:
-            self.solver = bsc.SolverCCD(self.solver)
-        self.state_0, self.state_1 = self.model.state(), self.model.state()
-        self.control = self.model.control()
-
-        self.viewer.set_model(self.model)
-        self.viewer.set_camera(pos=wp.vec3(0.0, -1.7, 1.3), pitch=-5.0, yaw=90.0)
-
-    def capture(self):
-        """Captures a frame on a GPU."""
-        self.graph = None
-        if self.model.device.is_cuda:
-            with wp.ScopedCapture() as capture:
-                self.simulate()
-            self.graph = capture.graph
-
-    def simulate(self):
-        """Simulates a frame."""
-        for _ in range(self.sim_substeps):
-            self.state_0.clear_forces()
-            self.viewer.apply_forces(self.state_0)
-            self.solver.step(self.state_0, self.state_1, self.control, None, self.sim_dt)
-            self.state_0, self.state_1 = self.state_1, self.state_0
-
-    def step(self):
-        """Simulates a frame, on a GPU from the graph.
-
-        In a graph the stage's queues cannot grow. Contacts become more from frame to frame, so every few frames one is
-        simulated without, which leaves a quarter of room to spare, and captured anew.
-        """
-        if self.frame % FRAMES_PER_CAPTURE == 0:
-            self.simulate()
-            self.capture()
-        elif self.graph:
-            wp.capture_launch(self.graph)
-        else:
-            self.simulate()
-        self.frame += 1
-        self.sim_time += self.frame_dt
-
-    def render(self):
-        """Shows the frame."""
-        self.viewer.begin_frame(self.sim_time)
-        self.viewer.log_state(self.state_0)
-        self.viewer.end_frame()
+        self.start(model, solver, camera=(wp.vec3(0.0, -1.7, 1.3), -5.0, 90.0), clocks=[solver.time])
 
     def find_angle(self, time):
-        """By which angle the mannequin is turned at a time [rad]."""
+        """Returns the angle by which the mannequin is turned at a time [s], in rad."""
         return 0.5 * self.angle * (1.0 - math.cos(ANGULAR_FREQUENCY * time))
 
     def measure_slip(self):
-        """How far the sleeves, on average, are from where they were on the arms at the start [m]."""
+        """Returns the mean distance of the sleeves from where they were on the arms at the start [m]."""
         rest, q = (state.particle_q.numpy().astype(np.float64) for state in (self.model, self.state_0))
         sleeves = np.abs(rest[:, 0]) > 0.25
         angle = self.find_angle(self.sim_time)
@@ -167,11 +114,8 @@ class Example:
         return np.linalg.norm((q - turned)[sleeves], axis=1).mean()
 
     def test_final(self):
-        """The mannequin has turned, the shirt hangs on it still, and the stage kept its promise."""
-        if self.ccd:
-            report = self.solver.report
-            assert report.uncertified_steps == 0, f"{report.uncertified_steps} steps are not certified"
-            assert len(report.intersections) == 0, f"{len(report.intersections)} edges cross faces"
+        """Checks that all steps are certified, the mannequin has turned, and the shirt still hangs on it."""
+        super().test_final()
         *_, z, w = self.state_0.body_q.numpy()[0]
         angle = 2.0 * math.atan2(z, w)
         assert abs(angle - self.find_angle(self.sim_time)) < 1.0e-3, f"the mannequin has turned by {angle} rad"
@@ -182,21 +126,16 @@ class Example:
         assert speed < 2.0, f"the shirt moves at {speed} m/s"
 
     def print_report(self):
-        """Prints what the stage did."""
-        if self.ccd:
-            print(self.solver.report)
+        """Prints what the stage did, and how far the shirt slipped."""
+        super().print_report()
         slip, lowest = self.measure_slip(), self.state_0.particle_q.numpy()[:, 2].min()
         print(f"the sleeves have moved by {slip:.3f} m on the arms, the lowest point of the shirt is at {lowest:.3f} m")
 
-    @staticmethod
-    def create_parser():
-        """The options."""
-        parser = newton.examples.create_parser()
-        parser.set_defaults(num_frames=120)
+    @classmethod
+    def create_parser(cls):
+        """Returns the options."""
+        parser = super().create_parser()
         parser.add_argument("--angle", type=float, default=1.0, help="How far the mannequin turns [rad].")
-        parser.add_argument(
-            "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind it."
-        )
         return parser
 
 

@@ -1,8 +1,14 @@
-"""Device functions to import into one's own Warp kernels.
+"""Device functions for continuous collision detection, to call from any Warp kernel.
 
-``ccd_vertex_face`` and ``ccd_edge_edge`` answer FREE, HIT or UNSURE; ``impact_vertex_face`` and
-``impact_edge_edge`` find the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``.
-The other modules hold one idea of the method each.
+``ccd_vertex_face`` and ``ccd_edge_edge`` return FREE, HIT or UNSURE; ``impact_vertex_face`` and ``impact_edge_edge``
+return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. FREE and HIT are
+certain whatever the options of the calling module, ``fast_math`` among them, and on processors that flush subnormal
+numbers to zero, as long as these round to nearest. Each of the other modules holds one idea of the method.
+
+References:
+    Min Tang, Ruofeng Tong, Zhendong Wang, and Dinesh Manocha. "Fast and Exact Continuous Collision Detection with
+    Bernstein Sign Classification." ACM Transactions on Graphics 33, 6 (2014). https://doi.org/10.1145/2661229.2661237.
+    Sections, equations and algorithms that docstrings cite are those of this paper.
 """
 
 from .ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face

@@ -1,4 +1,4 @@
-"""Continuous collision detection of one query, to be called in any Warp kernel, with or without gradients."""
+"""Continuous collision detection of one query, callable from any Warp kernel, with or without gradients."""
 
 import math
 from typing import Any
@@ -19,11 +19,11 @@ _NAN = wp.constant(wp.float64(math.nan))
 
 @wp.func
 def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
-    """Status of a query that no coordinate axis separates and, if ``timed``, its first contact."""
+    """Returns the status of a query that no coordinate axis separates and, if ``timed``, its first contact."""
     result = Impact()
     result.toi = wp.float64(2.0)
     y = coplanarity(motion)
-    # this cull first: of pairs whose boxes overlap it decides more than the other, which is for flat sheets
+    # this cull first: of the pairs whose boxes overlap it decides more than the other one, which is for flat sheets
     if certified_sign_cubic(y.k, y.bound) != 0 or direction_separates(motion, centroid_direction(motion)):
         return result
     status = classify(motion, y)
@@ -36,18 +36,21 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
 @wp.func
 def _answer(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # time of impact
     timed: bool,
     tolerance: wp.float64,
 ) -> Impact:
-    """Status of a query and, if ``timed``, its first contact, both constants to differentiation."""
+    """Returns the status of a query and, if ``timed``, its first contact; differentiation takes both as constants."""
     result = Impact()
     if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
         result.status = UNSURE
@@ -68,26 +71,29 @@ def _answer(
 @wp.func_grad(_answer)
 def _adjoint_of_answer(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # time of impact
     timed: bool,
     tolerance: wp.float64,
     adj_ret: Impact,
 ):
-    """Nothing, which also keeps Warp from differentiating all that is behind an answer."""
+    """Does nothing, and keeps Warp from differentiating the code behind :func:`_answer`."""
 
 
 @wp.func
 def impact_vertex_face(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, tolerance: wp.float64
 ) -> Impact:
-    """First contact of a moving vertex p with a moving triangle a b c.
+    """Returns the first contact of a moving vertex p with a moving triangle a b c.
 
     Args:
         p0: Vertex at the start, ``vec3`` or ``vec3d``.
@@ -98,14 +104,13 @@ def impact_vertex_face(
         a1: First vertex of the triangle at the end.
         b1: Second vertex of the triangle at the end.
         c1: Third vertex of the triangle at the end.
-        tolerance: Of the time of impact, as a share of the step, from 2^-38 to 1. What is less, or NaN,
-            counts as 2^-38, what is more than 2^-10 as that.
+        tolerance: Tolerance of the time of impact, as a share of the step. It is clamped to [2^-38, 2^-10]; NaN
+            counts as 2^-38.
 
     Returns:
         Status, time of impact, barycentric coordinates and normal, in double precision. The last three are
-        differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.gradients` says. Points that are not finite are UNSURE at time 0, with coordinates and
-        normal NaN.
+        differentiable functions of the points; ``grazing`` is 1 where their gradients are clamped, see
+        :mod:`.gradients`. If a point is not finite, the status is UNSURE, the time 0, coordinates and normal are NaN.
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
@@ -117,7 +122,7 @@ def impact_vertex_face(
 def impact_edge_edge(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, tolerance: wp.float64
 ) -> Impact:
-    """First contact of a moving edge a b with a moving edge c d.
+    """Returns the first contact of a moving edge a b with a moving edge c d.
 
     Args:
         a0: First end of the first edge at the start, ``vec3`` or ``vec3d``.
@@ -128,14 +133,13 @@ def impact_edge_edge(
         b1: Second end of the first edge at the end.
         c1: First end of the second edge at the end.
         d1: Second end of the second edge at the end.
-        tolerance: Of the time of impact, as a share of the step, from 2^-38 to 1. What is less, or NaN,
-            counts as 2^-38, what is more than 2^-10 as that.
+        tolerance: Tolerance of the time of impact, as a share of the step. It is clamped to [2^-38, 2^-10]; NaN
+            counts as 2^-38.
 
     Returns:
         Status, time of impact, parameters along the edges and normal, in double precision. The last three are
-        differentiable functions of the points, with the gradients of the contact itself; ``grazing`` is 1 where these
-        are clamped, as :mod:`.gradients` says. Points that are not finite are UNSURE at time 0, with coordinates and
-        normal NaN.
+        differentiable functions of the points; ``grazing`` is 1 where their gradients are clamped, see
+        :mod:`.gradients`. If a point is not finite, the status is UNSURE, the time 0, coordinates and normal are NaN.
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
@@ -145,11 +149,11 @@ def impact_edge_edge(
 
 @wp.func
 def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any) -> int:
-    """Whether a moving vertex p meets a moving triangle a b c: FREE, HIT or UNSURE.
+    """Returns whether a moving vertex p meets a moving triangle a b c: FREE, HIT or UNSURE.
 
     Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between.
-    Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points
-    that are not finite are UNSURE.
+    Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. If a point is
+    not finite, the status is UNSURE.
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
@@ -158,11 +162,11 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
 
 @wp.func
 def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> int:
-    """Whether a moving edge a b meets a moving edge c d: FREE, HIT or UNSURE.
+    """Returns whether a moving edge a b meets a moving edge c d: FREE, HIT or UNSURE.
 
     Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between.
-    Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. Points that
-    are not finite are UNSURE.
+    Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. If a point is not
+    finite, the status is UNSURE.
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)

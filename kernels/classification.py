@@ -1,4 +1,4 @@
-"""Classification of a query by Bernstein signs: FREE, HIT or UNSURE (paper, Algorithm 1)."""
+"""Classification of a query by Bernstein signs: FREE, HIT or UNSURE (Algorithm 1)."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ _SPLIT = wp.constant(wp.float64(2.5))
 
 @wp.func
 def constant_signs(tests: InsideTests) -> wp.vec4i:
-    """The sign of each inside test over the whole time, 0 where it is not certainly constant."""
+    """Returns the sign of each inside test over the whole time, 0 where it is not certainly constant."""
     return wp.vec4i(
         certified_sign_quadratic(tests.q0, tests.bounds[0]),
         certified_sign_quadratic(tests.q1, tests.bounds[1]),
@@ -27,7 +27,7 @@ def constant_signs(tests: InsideTests) -> wp.vec4i:
 
 @wp.func
 def verdict(signs: wp.vec4i) -> int:
-    """What the signs of the inside tests say of a time at which the four points lie in a plane."""
+    """Returns the status at a time at which the four points lie in a plane, from the signs of the inside tests."""
     low = wp.min(wp.min(signs[0], signs[1]), wp.min(signs[2], signs[3]))
     high = wp.max(wp.max(signs[0], signs[1]), wp.max(signs[2], signs[3]))
     if low < 0 and high > 0:
@@ -37,7 +37,7 @@ def verdict(signs: wp.vec4i) -> int:
 
 @wp.func
 def either(first: int, second: int) -> int:
-    """Status of a query from the statuses of two parts of its time."""
+    """Returns the status of a query from those of two parts of its time."""
     if first == HIT or second == HIT:
         return HIT
     return wp.where(first == FREE and second == FREE, FREE, UNSURE)
@@ -45,7 +45,7 @@ def either(first: int, second: int) -> int:
 
 @wp.func
 def _classify_piece(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: int) -> int:
-    """Status over a time in which the cubic has at most one extremum."""
+    """Returns the status over a time in which the cubic has at most one extremum."""
     if certified_sign_cubic(k, bound) != 0:
         return FREE
     roots = count_roots(k, bound, shape)
@@ -66,18 +66,18 @@ def _classify_piece(k: wp.vec4d, bound: wp.float64, tests: InsideTests, shape: i
 
 @wp.func
 def _half(q: wp.vec3d, a: wp.float64, b: wp.float64, first: bool) -> wp.vec3d:
-    """One part of a quadratic split at t = a / (a + b)."""
+    """Returns one part of a quadratic split at t = a / (a + b)."""
     left, right = split_quadratic(q, a, b)
     return wp.where(first, left, right)
 
 
 @wp.func
 def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
-    """Status of a query whose cubic may have roots from the inside tests given.
+    """Returns the status of a query whose cubic may have roots, from the given inside tests.
 
-    Bounds after splitting at weights with sum s, which are taken as exact: at most 10 roundings of coefficients of
+    Bounds after splitting at weights with sum s, which count as exact: at most 10 roundings of coefficients of
     size s^3 k, below E s^3, so 2.5 s^3 E; likewise 2.5 s^2 F. The weights are scaled to 1 <= s < 4, so that these are
-    no less than E and F, and leave room for what underflows, as those do.
+    no less than E and F, and cover underflow as well, as those do.
     """
     constant = verdict(constant_signs(tests))
     if constant == FREE:
@@ -122,7 +122,7 @@ def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
 
 @wp.func
 def _weakly_inside(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64) -> bool:
-    """Whether inside tests at one time have one weak sign, and not all are zero."""
+    """Returns whether inside tests at one time have one weak sign, and not all are zero."""
     low = wp.min(wp.min(a, b), wp.min(c, d))
     high = wp.max(wp.max(a, b), wp.max(c, d))
     return (low >= _ZERO and high > _ZERO) or (high <= _ZERO and low < _ZERO)
@@ -130,7 +130,7 @@ def _weakly_inside(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64) -
 
 @wp.func
 def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
-    """Whether a query touches at the start or at the end, by the signs that floating point computes."""
+    """Returns whether a query touches at the start or at the end, by the signs that floating point computes."""
     q0 = tests.q0
     q1 = tests.q1
     q2 = tests.q2
@@ -142,7 +142,7 @@ def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
 
 @wp.func
 def _without_zeros(k: wp.vec4d) -> wp.vec4d:
-    """The cubic without its roots at the ends: moved by far less than a rounding to where it goes from, or comes to."""
+    """Returns the cubic with zeros at its ends moved, far less than a rounding, to the sign of the next coefficient."""
     tiny = _TINY * largest(k)
     start = wp.where(k[1] != _ZERO, k[1], wp.where(k[2] != _ZERO, k[2], k[3]))
     end = wp.where(k[2] != _ZERO, k[2], wp.where(k[1] != _ZERO, k[1], k[0]))
@@ -156,14 +156,14 @@ def _without_zeros(k: wp.vec4d) -> wp.vec4d:
 
 @wp.func
 def classify(motion: Motion, y: Coplanarity) -> int:
-    """Status of a query from the signs of its polynomials: FREE, HIT or UNSURE (paper, Algorithm 1).
+    """Returns the status of a query from the signs of its polynomials: FREE, HIT or UNSURE (Algorithm 1).
 
-    Most queries end at constant signs. The others count the roots of Y and determine the signs of the inside tests
-    there; where Y may have two extrema it is split at its inflection first, homogeneously.
+    Constant signs decide most queries. For the others it counts the roots of Y and determines the signs of the inside
+    tests there; where Y may have two extrema it is split at its inflection first, homogeneously.
 
-    Where signs are those that floating point computes, roundoff 0, those that are zero need no subdivision: contact at
-    an end of the step is what the inside tests say there. All that is left open then counts as contact, as it does by
-    the paper's weak inequalities, unless the direction between the closest points at half time separates the features.
+    With roundoff 0, signs are those that floating point computes, and zeros need no subdivision: the inside tests at an
+    end of the step decide contact there. A query that is still open counts as contact, as by the paper's weak
+    inequalities, unless the direction between the closest points at half time separates the features.
     """
     if certified_sign_cubic(y.k, y.bound) != 0:
         return FREE

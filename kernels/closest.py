@@ -1,6 +1,6 @@
 """Closest points of the two features of a query at one time: separating directions, contact coordinates and normal.
 
-Nothing here is certified: a direction may be any, and coordinates are a result rounded like any other.
+None of this is certified: culling accepts any direction, and coordinates are rounded like any other result.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ _FLAT = wp.constant(wp.float64(1.0e-24))
 
 @wp.func
 def _ratio(x: wp.float64, y: wp.float64) -> wp.float64:
-    """The quotient x / y in [0, 1]; 0 where y is zero, the length of a point."""
+    """Returns x / y, clamped to [0, 1]; 0 where y is zero, the squared length of a collapsed edge."""
     if y > _ZERO:
         return wp.clamp(x / y, _ZERO, _ONE)
     return _ZERO
@@ -22,7 +22,7 @@ def _ratio(x: wp.float64, y: wp.float64) -> wp.float64:
 
 @wp.func
 def _closest_vertex_face(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
-    """(beta, gamma) of the point of the triangle 0, u, v that is closest to w."""
+    """Returns (beta, gamma) of the point of the triangle 0, u, v that is closest to w."""
     n = wp.cross(u, v)
     beta = wp.dot(wp.cross(w, v), n)
     gamma = wp.dot(wp.cross(u, w), n)
@@ -44,7 +44,7 @@ def _closest_vertex_face(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
 
 @wp.func
 def _closest_edge_edge(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
-    """(s, r) of the closest points s u and w + r v of two segments."""
+    """Returns (s, r) of the closest points s u and w + r v of two segments."""
     uu = wp.dot(u, u)
     vv = wp.dot(v, v)
     uv = wp.dot(u, v)
@@ -57,7 +57,7 @@ def _closest_edge_edge(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
 
 @wp.func
 def closest_coordinates(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
-    """Coordinates of the closest points: (beta, gamma) of the triangle, or (s, r) along the edges."""
+    """Returns the coordinates of the closest points: (beta, gamma) of the triangle, or (s, r) along the edges."""
     if kind == VERTEX_FACE:
         return _closest_vertex_face(u, v, w)
     return _closest_edge_edge(u, v, w)
@@ -65,7 +65,7 @@ def closest_coordinates(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.
 
 @wp.func
 def between(kind: int, coordinates: wp.vec2d, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec3d:
-    """Vector from the second feature (face, edge c d) to the first (vertex, edge a b) at the given coordinates."""
+    """Returns the vector from the second feature (face, edge c d) to the first (vertex, edge a b) at coordinates."""
     if kind == VERTEX_FACE:
         return w - coordinates[0] * u - coordinates[1] * v
     return coordinates[0] * u - coordinates[1] * v - w
@@ -73,7 +73,7 @@ def between(kind: int, coordinates: wp.vec2d, u: wp.vec3d, v: wp.vec3d, w: wp.ve
 
 @wp.func
 def _to_unit_scale(x: wp.vec3d) -> wp.vec3d:
-    """A vector divided by its max-norm, so that squares do not underflow; zero stays zero."""
+    """Returns a vector divided by its max-norm, so that squares do not underflow; zero stays zero."""
     size = wp.max(wp.abs(x))
     if size > _ZERO:
         return x / size
@@ -82,12 +82,12 @@ def _to_unit_scale(x: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def contact_at(motion: Motion, time: wp.float64):
-    """Where and in which direction the features touch at the time of a contact.
+    """Returns coordinates and normal of a contact at its time.
 
     Returns:
         Coordinates (vertex-face: barycentric in the face; edge-edge: s along a b, r along c d, 0), and the unit
         normal, which points against the velocity of the vertex or of edge a b relative to the other feature.
-        Parallel edges and collapsed triangles have no plane: their normal is the direction of that velocity.
+        Parallel edges and collapsed triangles have no plane: their normal is along that velocity.
     """
     u = (_ONE - time) * motion.u0 + time * motion.u1
     v = (_ONE - time) * motion.v0 + time * motion.v1

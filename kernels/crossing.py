@@ -1,4 +1,4 @@
-"""Whether an edge at rest meets a face, by certified signs of orientations."""
+"""Intersection of an edge and a face at rest, by certified signs of orientations."""
 
 from typing import Any
 
@@ -13,12 +13,11 @@ _LONGEST = wp.constant(wp.float64(1.0e70))
 
 @wp.func
 def _orientation(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d) -> int:
-    """Certified sign of the determinant of three vectors, each with one rounding.
+    """Returns the certified sign of the determinant of three vectors, each with one rounding.
 
     Bound, with P the sum of the sizes of its six products: 3 roundings of the vectors, 2 of the products, 3 of the
-    sums, 8r P to first order. Products of three lose less to underflow than the UNDERFLOW added, also where subnormal
-    numbers are flushed, 2^-1022 in a vector, as long as these are not longer than 1e70; of longer ones no sign is
-    certain.
+    sums, 8r P to first order. Products of three lose less to underflow than the added UNDERFLOW, also where subnormal
+    numbers are flushed, 2^-1022 in a vector, as long as no coordinate exceeds 1e70. If one does, no sign is certain.
     """
     ax = wp.abs(x)
     ay = wp.abs(y)
@@ -35,10 +34,10 @@ def _orientation(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d) -> int:
 
 @wp.func
 def edge_crosses_face(p: Any, q: Any, a: Any, b: Any, c: Any) -> int:
-    """Whether the closed edge p q meets the closed triangle a b c: FREE, HIT or UNSURE.
+    """Returns whether the closed edge p q meets the closed triangle a b c: FREE, HIT or UNSURE.
 
-    The line through p and q passes the sides of the triangle with one orientation where it meets the triangle, and
-    strictly opposite ones mean that it misses. It meets it within the edge where p and q lie on opposite sides.
+    The line through p and q meets the triangle if it passes all sides with one orientation, and misses it if two
+    orientations are strictly opposite. It meets the triangle within the edge if p and q lie on opposite sides.
     """
     ab = double(b) - double(a)
     ac = double(c) - double(a)

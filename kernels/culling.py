@@ -1,4 +1,4 @@
-"""Culls: cheap tests that prove most queries free (paper, 4.3), all sound for linear motion.
+"""Culls: cheap tests that prove most queries FREE (Sec. 4.3), all sound for linear motion.
 
 A **fixed** direction that separates the two features at the start and at the end, on the same side, separates them
 in between, because every difference of two points along it is linear in time.
@@ -19,7 +19,7 @@ DIRECTION_ERROR = wp.constant(wp.float64(10.0))
 
 @wp.func
 def vertex_face_boxes_apart(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any) -> bool:
-    """Whether a coordinate axis separates vertex and triangle."""
+    """Returns whether a coordinate axis separates vertex and triangle."""
     low0 = wp.min(a0, wp.min(b0, c0))
     low1 = wp.min(a1, wp.min(b1, c1))
     high0 = wp.max(a0, wp.max(b0, c0))
@@ -29,7 +29,7 @@ def vertex_face_boxes_apart(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any
 
 @wp.func
 def edge_edge_boxes_apart(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
-    """Whether a coordinate axis separates the edges."""
+    """Returns whether a coordinate axis separates the edges."""
     return boxes_apart(
         wp.min(a0, b0),
         wp.max(a0, b0),
@@ -44,13 +44,13 @@ def edge_edge_boxes_apart(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, 
 
 @wp.func
 def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
-    """Whether a direction certainly separates the features of a motion at both ends, on the same side.
+    """Returns whether a direction certainly separates the features of a motion at both ends, on the same side.
 
     The differences of the points of the two features are w, w - u, w - v (vertex-face) and w, w - u, w + v,
     w - u + v (edge-edge).
 
-    Bound: any direction will do, so it has no error. The products of a dot product have at most 4 roundings of the
-    vector (a motion restricted in time has been interpolated), 1 of the product, 2 of the sum, and 2 of the
+    Bound: any direction is valid, so that it has no error. The products of a dot product have at most 4 roundings of
+    the vector (a motion restricted in time has been interpolated), 1 of the product, 2 of the sum, and 2 of the
     difference: 9r times the sum of the sizes of all products.
     """
     u0 = wp.dot(direction, motion.u0)
@@ -74,7 +74,7 @@ def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
 
 @wp.func
 def centroid_direction(motion: Motion) -> wp.vec3d:
-    """The axis through the centroids of the two features, at half time."""
+    """Returns the direction through the centroids of the two features at half time."""
     w = motion.w0 + motion.w1
     u = motion.u0 + motion.u1
     v = motion.v0 + motion.v1

@@ -1,10 +1,10 @@
 """Gradients of first contacts, by the implicit function theorem.
 
-A contact is a time t and two numbers x, y at which the gap between the features closes,
+A contact is a time t and two coordinates x, y at which the gap between the features closes,
 
     g(t, x, y) = w(t) - x u(t) - y v(t) = 0,
 
-with u, v, w as in :mod:`.polynomials`: x, y are (beta, gamma) of a vertex in a face, (s, -r) of two edges. Moving the
+with u, v, w as in :mod:`.polynomials`: (x, y) is (beta, gamma) of a vertex in a face, (s, -r) of two edges. Moving the
 points changes the contact by
 
     e dt - u dx - v dy + (dw - x du - y dv) = 0,  e = dg/dt,
@@ -13,31 +13,32 @@ the velocity of one feature relative to the other. So for adjoints adj_t, adj_x,
 
     q . e = adj_t,  -q . u = adj_x,  -q . v = adj_y,
 
-and -q, x q, y q are the adjoints of w, u, v at the time of contact. A point has the share 1 - t of its own there at the
-start, and t at the end. With n = u x v, N = n / |n| and the dual vectors u* = v x n / n^2, v* = n x u / n^2,
+and -q, x q, y q are the adjoints of w, u, v at the time of contact. Of the adjoint of a point there, the share 1 - t
+belongs to its start, and t to its end. With n = u x v, N = n / |n| and the dual vectors of u and v,
 
-    q = (adj_t + d . e) / (N . e) N - d,  d = adj_x u* + adj_y v*.
+    q = (adj_t + d . e) / (N . e) N - d,  d = adj_x u* + adj_y v*,  u* = v x n / n^2,  v* = n x u / n^2.
 
 For the time alone q is n / (dY/dt), with Y = w . n: the implicit function theorem for Y(t) = 0. The normal N is a
 function of u and v, hence of the time too, which adds to adj_t.
 
-**At the root.** The time of impact that is returned is a lower bound. Gradients are those at the root of Y that comes
-within the tolerance after it, found to double precision by Newton's method on N . g, with x and y solved for each time.
+**At the root.** The returned time of impact is a lower bound. Gradients are those at the root of Y within the tolerance
+after it, which Newton's method on N . g finds to double precision, with x and y solved for each time.
 
-**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features that slide along each other, or
-rest, or have no plane, being parallel edges or a collapsed triangle; motion in one plane. So the divisors are kept away
-from zero, with sigma = 2^-10, and lengths not counted below f = 2^-22 of the largest coordinate of the relative motion:
+**Grazing.** Gradients grow without bound where dY/dt = n . e goes to zero: features slide along each other, rest, or
+have no plane (parallel edges, a collapsed triangle), or all motion is in one plane. So the divisors are clamped away
+from zero, with sigma = 2^-10, and lengths are at least f = 2^-22 of the largest coordinate of the relative motion:
 
     1 / (N . e)  becomes  N . e / max((N . e)^2, (sigma max(|e|, f))^2),
     1 / n^2      becomes  1 / max(n^2, (sigma max(|u|, f) max(|v|, f))^2).
 
 Gradients of the time are then at most 2^33 over that coordinate, and fade to zero where there is no derivative. Where
-one of the two has an effect, ``grazing`` says so. It also does where the root is not certain: where contact is not
-certain to come within the tolerance, whose gradients are those of a contact at the time of impact with the coordinates
-and the normal there, or where Y both rises and falls within it.
+one of the clamps has an effect, ``grazing`` is 1. It is 1 as well where the root is not certain: where contact within
+the tolerance is not certain, and gradients are those of a contact at the time of impact with the coordinates and the
+normal there; and where Y both rises and falls within the tolerance.
 
-Gradients of points in single precision are rounded to it, and at most 2^100. Where that coordinate is 1e-280 or less,
-or 2^1023 or more, gradients would be out of range: they are zero, and ``grazing`` says so.
+Gradients of points in single precision are rounded to it, and at most 2^100. Where the largest coordinate of the
+relative motion is 1e-280 or less, or 2^1023 or more, gradients would be out of range: they are zero, and ``grazing``
+is 1.
 """
 
 import warp as wp
@@ -59,7 +60,7 @@ _CONVERGED = wp.constant(wp.float64(2.0**-40))
 
 @wp.struct
 class Touch:
-    """A contact and what its gradients are made of, as the module says, in the scale of the motion."""
+    """A contact and the terms of its gradients, see the module, in the scale of the motion."""
 
     t: wp.float64
     x: wp.float64
@@ -69,19 +70,20 @@ class Touch:
     n: wp.vec3d
     velocity: wp.vec3d  # e
     normal: wp.vec3d  # unit normal, N or its opposite
-    area: wp.float64  # |n|^2, kept away from zero
-    approach: wp.float64  # 1 / (normal . e), kept away from infinity
-    grazing: int  # 1 where something had to be kept away
+    area: wp.float64  # |n|^2, clamped away from zero
+    approach: wp.float64  # 1 / (normal . e), clamped away from infinity
+    grazing: int  # 1 where a clamp has an effect
 
 
 @wp.func
 def _square_length(x: wp.vec3d) -> wp.float64:
+    """Returns the squared length of a vector, at least f^2."""
     return wp.max(wp.length_sq(x), _SQUARE_LENGTH)
 
 
 @wp.func
 def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, normal: wp.vec3d, planar: bool) -> Touch:
-    """The touch at a time, at the coordinates and with the normal given or, if ``planar``, those in the plane there."""
+    """Returns the touch at a time, with given coordinates and normal or, if ``planar``, those in the plane there."""
     at = Touch()
     at.t = t
     at.u = mix_vector(motion.u0, motion.u1, t)
@@ -113,7 +115,7 @@ def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, norma
 
 @wp.func
 def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
-    """The contact that was found, at the root in the tolerance after its time of impact."""
+    """Returns the touch of a contact, at the root within the tolerance after its time of impact."""
     x = found.coordinates[0]
     y = -found.coordinates[1]
     if motion.kind == VERTEX_FACE:
@@ -143,34 +145,37 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
 @wp.func
 def with_gradients(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # first contact
     found: Impact,
     tolerance: wp.float64,
 ) -> Impact:
-    """The first contact of a query, given as a constant, as a function of the query's points.
+    """Returns the first contact of a query as a differentiable function of the query's points.
 
     Args:
         kind: VERTEX_FACE or EDGE_EDGE.
-        a0: Points at the start, here and next: p a b c of a vertex and a face, a b c d of two edges.
-        b0: Second point.
-        c0: Third point.
-        d0: Fourth point.
-        a1: Points at the end, here and next.
-        b1: Second point.
-        c1: Third point.
-        d1: Fourth point.
-        found: What was found for these points.
-        tolerance: Of the time of impact, with which it was found.
+        a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
+        b0: Second point at the start.
+        c0: Third point at the start.
+        d0: Fourth point at the start.
+        a1: First point at the end.
+        b1: Second point at the end.
+        c1: Third point at the end.
+        d1: Fourth point at the end.
+        found: First contact of these points.
+        tolerance: Tolerance of its time of impact.
 
     Returns:
-        The same, with ``grazing``; its time, coordinates and normal have gradients.
+        The contact ``found``, with ``grazing``; its time, coordinates and normal have gradients.
     """
     result = found
     result.grazing = 0
@@ -186,14 +191,17 @@ def with_gradients(
 @wp.func_grad(with_gradients)
 def _adjoint_of_with_gradients(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # first contact
     found: Impact,
     tolerance: wp.float64,
     adj_ret: Impact,

@@ -15,7 +15,7 @@ _SMALLEST = wp.constant(wp.float64(2.0**-480))
 _LARGEST = wp.constant(wp.float64(2.0**1023))
 _SMALLEST_WITH_GRADIENT = wp.constant(wp.float64(1.0e-280))
 _LIFT = wp.constant(wp.float64(2.0**600))
-_LIFTED_BIT = wp.constant(wp.float64(2.0**-474))  # the lowest bit there is, times that
+_LIFTED_BIT = wp.constant(wp.float64(2.0**-474))  # the lowest bit of a number, times _LIFT
 _LARGEST_GRADIENT = wp.constant(wp.float64(2.0**100))
 
 
@@ -36,25 +36,25 @@ _LARGEST_GRADIENT = wp.constant(wp.float64(2.0**100))
 """
 )
 def _double(x: wp.float32) -> wp.float64:
-    """The same number in double precision, even where subnormal numbers are taken for zero."""
+    """Returns the same number in double precision, even where subnormal numbers are flushed to zero."""
     ...
 
 
 @wp.func
 def double(x: wp.vec3d) -> wp.vec3d:
-    """The same point in double precision."""
+    """Returns the same point in double precision."""
     return x
 
 
 @wp.func
 def double(x: wp.vec3) -> wp.vec3d:  # noqa: F811, an overload
-    """The same point in double precision, exactly."""
+    """Returns the same point in double precision, exactly."""
     return wp.vec3d(_double(x[0]), _double(x[1]), _double(x[2]))
 
 
 @wp.func_grad(double)
 def _adjoint_of_double(x: wp.vec3, adj_ret: wp.vec3d):
-    """Rounded to single precision, at most 2^100, so that the sum of many does not overflow."""
+    """Adds the gradient in single precision, at most 2^100, so that a sum of many gradients does not overflow."""
     largest = wp.vec3d(_LARGEST_GRADIENT)
     gradient = wp.min(wp.max(adj_ret, -largest), largest)
     wp.adjoint[x] += wp.vec3(float(gradient[0]), float(gradient[1]), float(gradient[2]))
@@ -62,13 +62,13 @@ def _adjoint_of_double(x: wp.vec3, adj_ret: wp.vec3d):
 
 @wp.func
 def doubles(a: Any, b: Any, c: Any, d: Any):
-    """The same points in double precision, exactly."""
+    """Returns the same points in double precision, exactly."""
     return double(a), double(b), double(c), double(d)
 
 
 @wp.func
 def all_finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
-    """Whether all coordinates are finite: the mean of eight is then finite too."""
+    """Returns whether all coordinates are finite: then the mean of eight points is finite as well."""
     start = _EIGHTH * double(a0) + _EIGHTH * double(b0) + _EIGHTH * double(c0) + _EIGHTH * double(d0)
     end = _EIGHTH * double(a1) + _EIGHTH * double(b1) + _EIGHTH * double(c1) + _EIGHTH * double(d1)
     return wp.isfinite(start + end)
@@ -76,11 +76,12 @@ def all_finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1
 
 @wp.func
 def _size(x0: wp.vec3d, x1: wp.vec3d) -> wp.vec3d:
+    """Returns the largest absolute value of each component of two vectors."""
     return wp.max(wp.abs(x0), wp.abs(x1))
 
 
 @wp.func
-def _motion(
+def _scaled(
     kind: int,
     roundoff: wp.float64,
     u0: wp.vec3d,
@@ -89,14 +90,15 @@ def _motion(
     v1: wp.vec3d,
     w0: wp.vec3d,
     w1: wp.vec3d,
-):
-    """Relative motion and its size, the motion scaled by a power of two, which is exact, to coordinates below 2.
+) -> Motion:
+    """Returns a relative motion, scaled exactly, by a power of two, to coordinates below 2.
 
-    It is zero, which nothing can certify, where its size, its largest coordinate, is zero or out of range.
+    The motion is zero, which makes all its signs uncertain, if its size, its largest coordinate, is zero or out of
+    range.
 
-    What is lost where subnormal numbers are flushed, 2^-1022 from each of two points and from their difference, is
-    less than 2^-540 after scaling: of a product of three below 2^-532, less than the UNDERFLOW that bounds add, times
-    the roundoff, 2^-518. Numbers that scaling itself makes subnormal are smaller still.
+    Flushing subnormal numbers to zero loses 2^-1022 in each of two points and in their difference, less than 2^-540
+    after scaling. In a product of three the loss is below 2^-532, less than the UNDERFLOW that bounds add, times the
+    roundoff, 2^-518. Numbers that scaling makes subnormal are smaller still.
     """
     motion = Motion()
     motion.kind = kind
@@ -105,8 +107,9 @@ def _motion(
     v_size = _size(v0, v1)
     w_size = _size(w0, w1)
     size = wp.max(wp.max(u_size, wp.max(v_size, w_size)))
+    motion.size = size
     if not (size >= _SMALLEST and size < _LARGEST):
-        return motion, size
+        return motion
     scale = inverse_power_of_two(size)
     motion.u0 = scale * u0
     motion.u1 = scale * u1
@@ -118,23 +121,24 @@ def _motion(
     motion.v_size = scale * v_size
     motion.w_size = scale * w_size
     motion.scale = scale
-    return motion, size
+    return motion
 
 
 @wp.func
 def _out_of_range(x: wp.vec3d, size: wp.float64) -> bool:
-    """Whether points like this, and a motion of that size, need :func:`_rescaled` ones."""
+    """Returns whether a motion of that size, of points in double precision, needs :func:`_rescaled` points."""
     return not (size >= _SMALLEST and size < _LARGEST)
 
 
 @wp.func
 def _out_of_range(x: wp.vec3, size: wp.float64) -> bool:
-    """Never: what differs in single precision does by 2^-149 or more."""
+    """Returns False: different numbers in single precision differ by at least 2^-149."""
     return False
 
 
 @wp.func
 def _rescaled_coordinate(x: wp.float64, size: wp.float64) -> wp.float64:
+    """Returns a coordinate of a :func:`_rescaled` point."""
     if size > _ONE:
         return _QUARTER * x
     bits = wp.cast(x, wp.uint64)
@@ -149,11 +153,11 @@ def _rescaled_coordinate(x: wp.float64, size: wp.float64) -> wp.float64:
 
 @wp.func
 def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
-    """A point of a motion of a size that is out of range, in the scale in which all differences are in range.
+    """Returns a point of a motion whose size is out of range, in a scale in which all differences are in range.
 
-    A quarter, so that differences do not overflow; or times 2^600, bit by bit, because processors may be told to take
-    subnormal numbers for zero. There all that is 2^-400 or more stays as it is: the numbers next to it are farther
-    away than the size, so that only the same number is subtracted from it.
+    Large coordinates are divided by four, so that differences do not overflow. Small ones are multiplied by 2^600, bit
+    by bit, because processors may flush subnormal numbers to zero. Among these, coordinates of 2^-400 or more stay as
+    they are: the next numbers are farther away than the size of the motion, so that only equal ones are subtracted.
     """
     return wp.vec3d(
         _rescaled_coordinate(x[0], size), _rescaled_coordinate(x[1], size), _rescaled_coordinate(x[2], size)
@@ -161,94 +165,73 @@ def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def _scale_of_rescaled(scale: wp.float64, size: wp.float64) -> wp.float64:
-    """The scale of a motion of rescaled points; 0 where gradients would be out of range."""
-    return wp.where(size > _SMALLEST_WITH_GRADIENT and size < _ONE, _LIFT * scale, _ZERO)
-
-
-@wp.func
-def _vertex_face(
-    p0: wp.vec3d,
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    p1: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    roundoff: wp.float64,
-):
-    return _motion(VERTEX_FACE, roundoff, b0 - a0, b1 - a1, c0 - a0, c1 - a1, p0 - a0, p1 - a1)
-
-
-@wp.func
-def _edge_edge(
+def _motion_of_kind(
+    kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
+    # rounding
     roundoff: wp.float64,
-):
-    return _motion(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
+) -> Motion:
+    """Returns the scaled relative motion of a query, whose points are in double precision."""
+    if kind == VERTEX_FACE:
+        return _scaled(VERTEX_FACE, roundoff, c0 - b0, c1 - b1, d0 - b0, d1 - b1, a0 - b0, a1 - b1)
+    return _scaled(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
 
 
 @wp.func
 def vertex_face_motion(
     p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of a vertex and a triangle; of finite coordinates only."""
+    """Returns the relative motion of a vertex and a triangle with finite coordinates.
+
+    The motion is zero, so that culls do not decide it, if its size is out of range. :func:`relative_motion` rescales
+    the points then; in culls that would cost registers.
+    """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    motion, size = _vertex_face(p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
-    if _out_of_range(p0, size):
-        motion, _ = _vertex_face(
-            _rescaled(p, size),
-            _rescaled(a, size),
-            _rescaled(b, size),
-            _rescaled(c, size),
-            _rescaled(to_p, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            roundoff,
-        )
-        motion.scale = _scale_of_rescaled(motion.scale, size)
-    return motion
+    return _motion_of_kind(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
 
 
 @wp.func
 def edge_edge_motion(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of two edges; of finite coordinates only."""
+    """Returns the relative motion of two edges with finite coordinates, zero as in :func:`vertex_face_motion`."""
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    motion, size = _edge_edge(a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
-    if _out_of_range(a0, size):
-        motion, _ = _edge_edge(
-            _rescaled(a, size),
-            _rescaled(b, size),
-            _rescaled(c, size),
-            _rescaled(d, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            _rescaled(to_d, size),
-            roundoff,
-        )
-        motion.scale = _scale_of_rescaled(motion.scale, size)
-    return motion
+    return _motion_of_kind(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
 
 
 @wp.func
 def relative_motion(
     kind: int, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Relative motion of a query of either kind, in the order of its points; of finite coordinates only."""
-    if kind == VERTEX_FACE:
-        return vertex_face_motion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-    return edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+    """Returns the relative motion of a query with finite coordinates, of either kind and at any scale."""
+    from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
+    size = motion.size
+    if _out_of_range(a0, size):
+        motion = _motion_of_kind(
+            kind,
+            _rescaled(from_a, size),
+            _rescaled(from_b, size),
+            _rescaled(from_c, size),
+            _rescaled(from_d, size),
+            _rescaled(to_a, size),
+            _rescaled(to_b, size),
+            _rescaled(to_c, size),
+            _rescaled(to_d, size),
+            roundoff,
+        )
+        in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
+        motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
+    return motion

@@ -1,4 +1,4 @@
-"""The polynomials of a query: coplanarity and inside tests in Bernstein form, with error bounds (paper, 3.4 and 3.5).
+"""Polynomials of a query: coplanarity and inside tests in Bernstein form, with error bounds (Sec. 3.4 and 3.5).
 
 One form serves both queries. Vertex p against triangle a b c: u = b - a, v = c - a, w = p - a. Edge a b against edge
 c d: u = b - a, v = d - c, w = c - a. Each is linear in t, so the normal n = u x v is quadratic and the coplanarity
@@ -15,7 +15,7 @@ or of (w x v)_i, n_i - (w x v)_i, (w x u)_i and n_i - (w x u)_i. This is the pap
 degree four in t and without the factor k0^2 that its reduction to degree two costs, which vanishes for resting
 contact.
 
-What certified signs say, for **any** axis and at any time at which Y = 0 (n = 0 included):
+Certified signs decide contact for **any** axis and at any time at which Y = 0 (n = 0 included):
 
 - two of these quadratics have strictly opposite signs: no contact at that time. If n != 0, all are multiples of n_i
   with factors that contact makes nonnegative. If n = 0, then n_i = 0 and contact makes all of them zero: the two edges
@@ -54,12 +54,13 @@ class Motion:
     w_size: wp.vec3d
     kind: int  # VERTEX_FACE or EDGE_EDGE
     roundoff: wp.float64  # ROUNDOFF, or 0 for the signs that floating point computes
-    scale: wp.float64  # by which coordinates are scaled, a power of two; 0 where gradients are out of its range
+    size: wp.float64  # the largest coordinate before scaling
+    scale: wp.float64  # factor of the scaling, a power of two; 0 where gradients are out of range
 
 
 @wp.struct
 class Coplanarity:
-    """The cubic Y, the normal n that it comes from, and the bound on the error of each coefficient of Y."""
+    """The cubic Y, the bound on the error of its coefficients, and the Bernstein coefficients of the normal n."""
 
     k: wp.vec4d
     bound: wp.float64
@@ -70,7 +71,7 @@ class Coplanarity:
 
 @wp.struct
 class InsideTests:
-    """The quadratics that have one weak sign at contact, with the bound on the error of each one's coefficients."""
+    """The four quadratics that share a weak sign at contact, and the bounds on the errors of their coefficients."""
 
     q0: wp.vec3d
     q1: wp.vec3d
@@ -81,19 +82,19 @@ class InsideTests:
 
 @wp.func
 def cross_middle(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d) -> wp.vec3d:
-    """Middle Bernstein coefficient of x(t) cross y(t): the paper's n-hat, without its cancellation."""
+    """Returns the middle Bernstein coefficient of x(t) cross y(t): the paper's n-hat, without its cancellation."""
     return _HALF * (wp.cross(x0, y1) + wp.cross(x1, y0))
 
 
 @wp.func
 def _cross_size(x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
-    """Bound on the components of a cross product from the sizes of its factors' components."""
+    """Returns bounds on the components of a cross product, from the sizes of the components of its factors."""
     return wp.vec3d(x[1] * y[2] + x[2] * y[1], x[2] * y[0] + x[0] * y[2], x[0] * y[1] + x[1] * y[0])
 
 
 @wp.func
 def coplanarity(motion: Motion) -> Coplanarity:
-    """Y(t) = w . n as a cubic in Bernstein form (paper, equation 11).
+    """Returns Y(t) = w . n as a cubic in Bernstein form (Eq. 11).
 
     Bound, with r the roundoff and P the determinant of the sizes of u, v, w with all six terms added (their
     permanent), which bounds every k: the components of u, v, w have one rounding each. A component of n sums at
@@ -117,13 +118,13 @@ def coplanarity(motion: Motion) -> Coplanarity:
 
 @wp.func
 def component(x: wp.vec3d, axis: int) -> wp.float64:
-    """x[axis] by selection: an index that varies would put x into local memory on a GPU."""
+    """Returns x[axis] by selection: a variable index would put x into local memory on a GPU."""
     return wp.where(axis == 0, x[0], wp.where(axis == 1, x[1], x[2]))
 
 
 @wp.func
 def _cross_component(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d, axis: int) -> wp.vec3d:
-    """Bernstein coefficients of the component of x(t) cross y(t) along an axis."""
+    """Returns the Bernstein coefficients of the component of x(t) cross y(t) along an axis."""
     j = wp.where(axis == 2, 0, axis + 1)
     k = wp.where(j == 2, 0, j + 1)
     x0j = component(x0, j)
@@ -143,7 +144,7 @@ def _cross_component(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d, axi
 
 @wp.func
 def largest_axis(x: wp.vec3d) -> int:
-    """The axis along which x is largest in absolute value."""
+    """Returns the axis along which x is largest in absolute value."""
     ax = wp.abs(x[0])
     ay = wp.abs(x[1])
     az = wp.abs(x[2])
@@ -152,9 +153,9 @@ def largest_axis(x: wp.vec3d) -> int:
 
 @wp.func
 def inside_tests(motion: Motion, y: Coplanarity, axis: int) -> InsideTests:
-    """The quadratics of the inside tests along an axis.
+    """Returns the quadratics of the inside tests along an axis.
 
-    Vertex-face: beta, gamma, n - beta - gamma, and n itself, which decides where one of the others changes sign.
+    Vertex-face: beta, gamma, n - beta - gamma, and n, which decides where one of the others changes sign.
     Edge-edge: s, n - s, r, n - r.
 
     Bounds, as in :func:`coplanarity`, with P the sum of the sizes of a component's two products: 5r P for a cross

@@ -1,11 +1,11 @@
-"""Root counting and sign determination: signs at the roots of a cubic without finding them (paper, 4.1 and 4.2).
+"""Root counting and sign determination: signs at the roots of a cubic, without the roots (Sec. 4.1 and 4.2).
 
-All functions take a cubic Y with the bound on the error of its coefficients, whose signs at both ends are certain, and
-which has at most one extremum between them. They answer 0 where the sign is not certain.
+All functions take a cubic Y, whose signs at both ends are certain and which has at most one extremum between them, and
+the bound on the error of its coefficients. Signs that they return are 0 where they are not certain.
 
 Bounds are in terms of E (of Y's coefficients, at most k in size) and F (of a quadratic's, at most q in size). Because
-E >= 13 r k and F >= 5 r q in :mod:`polynomials`, with r the roundoff, they swallow the roundings of what is
-computed here: rounding a number of size c k costs c r k <= c E / 13.
+E >= 13 r k and F >= 5 r q in :mod:`polynomials`, with r the roundoff, they cover the roundings of this
+module: rounding a number of size c k costs c r k <= c E / 13.
 """
 
 import warp as wp
@@ -14,12 +14,11 @@ from .bernstein import divide_cubic, evaluate_cubic, evaluate_quadratic
 from .signs import UNDERFLOW, certified_sign, certified_sign_quadratic
 
 MONOTONE = wp.constant(0)
-"""Curve without extremum (the paper's case c)."""
+"""Curve without extremum (case c)."""
 ONE_EXTREMUM = wp.constant(1)
-"""Curve with one extremum (the paper's case b)."""
+"""Curve with one extremum (case b)."""
 TWO_EXTREMA = wp.constant(2)
-"""Curve that may have two extrema, with its inflection between them (the paper's case a, as far as it needs
-splitting)."""
+"""Curve that may have two extrema, with its inflection between them (case a, as far as it needs splitting)."""
 UNKNOWN = wp.constant(-1)
 
 _QUARTER = wp.constant(wp.float64(0.25))
@@ -39,20 +38,20 @@ _DIVISION_K = wp.constant(wp.float64(896.0))
 
 @wp.func
 def largest(k: wp.vec4d) -> wp.float64:
-    """Max-norm of a vector."""
+    """Returns the max-norm of a vector."""
     return wp.max(wp.max(wp.abs(k[0]), wp.abs(k[1])), wp.max(wp.abs(k[2]), wp.abs(k[3])))
 
 
 @wp.func
 def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
-    """How many extrema a cubic has in [0, 1]: MONOTONE, ONE_EXTREMUM, TWO_EXTREMA, or UNKNOWN.
+    """Returns how many extrema a cubic has in [0, 1]: MONOTONE, ONE_EXTREMUM, TWO_EXTREMA, or UNKNOWN.
 
-    The derivative is a quadratic with coefficients d. Its ends differ in sign: one root, with or without inflection
-    (the paper splits at every inflection, but only two extrema need it). They agree: none if d1 agrees too or the
-    discriminant d1^2 - d0 d2 is negative.
+    The derivative is a quadratic with coefficients d. If its ends differ in sign, it has one root, with or without
+    inflection (the paper splits at every inflection, but only two extrema need it). If they agree, it has none where d1
+    agrees as well or the discriminant d1^2 - d0 d2 is negative.
 
     Bounds: of a difference, 2E and a rounding of size 2k; of the discriminant, 4 * 2.5E d for d the largest
-    difference, 10E^2 <= 4E d, and roundings of size d^2 <= 2kd: below 24E d, but for underflow.
+    difference, 10E^2 <= 4E d, and roundings of size d^2 <= 2kd: below 24E d, apart from underflow.
     """
     d0 = k[1] - k[0]
     d1 = k[2] - k[1]
@@ -74,19 +73,19 @@ def curve_class(k: wp.vec4d, bound: wp.float64) -> int:
 
 @wp.func
 def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
-    """Number of roots in [0, 1] of a cubic that is MONOTONE or has ONE_EXTREMUM: 0, 1, 2, or UNKNOWN (paper, Figure 3).
+    """Returns the number of roots in [0, 1] of a MONOTONE or ONE_EXTREMUM cubic: 0, 1, 2, or UNKNOWN (Figure 3).
 
     The sign at the extremum t, the root of Y' = H with Bernstein coefficients d, decides between none and two. There Y
     is the quadratic G = (k0, k1, k2) as well, because Y(t) = (1 - t) G(t) + t (G + H)(t) and H(t) = 0. Eliminating the
     leading coefficient gives A Y = T with A = e1 - e0 and T linear: T_0 = A k0 - e0 d0, T_1 = A k3 - e1 d2; sign
-    determination for T against H then says the sign of T at t. Where A is small, T vanishes with it, but then H is
+    determination for T against H then gives the sign of T at t. Where A is small, T vanishes with it, but then H is
     nearly its chord, which differs from H by |A| / 4 at most, and Y at the root t' of the chord is close: with s =
     |d0| + |d2|, |t - t'| <= |A| / 4s, and |Y'| = 3 |H| <= 3 |A| / 2 between, so that |Y(t) - Y(t')| <= 3/8 A^2 / s.
 
     Bounds: the cubic with the computed coefficients is within E of Y on [0, 1], so it suffices that its sign at its own
     extremum exceeds E; its differences have roundings only (a sixth of E against s >= 5E), hence 7/16 for 3/8. Of
     A, 10E; of T, with e within 4.6E and E <= k: (10 + 8 + 10) E k + (4 * 2.2 + 2 * 4.6 + 10.2) E k and roundings of
-    size 32k^2, 2.5E k: below 64E k, but for underflow. Of H at the root of T, as in :func:`linear_signs`.
+    size 32k^2, 2.5E k: below 64E k, apart from underflow. Of H at the root of T, as in :func:`linear_signs`.
     """
     end_signs = certified_sign(k[0], bound) * certified_sign(k[3], bound)
     if end_signs < 0:
@@ -100,7 +99,7 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     d1 = k[2] - k[1]
     d2 = k[3] - k[2]
     if certified_sign(d0, _DIFFERENCE * bound) == start:
-        return 0  # leads away from zero before it turns
+        return 0  # Y moves away from zero before it turns
     a = wp.abs(d0)
     b = wp.abs(d2)
     sum = a + b
@@ -121,7 +120,7 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
     s1 = certified_sign(t1, t_bound)
     at_extremum = wp.where(s0 == s1, s0, 0)
     if s0 * s1 < 0:
-        # H changes sign once: its sign at the root of T says on which side of its own root that lies
+        # H changes sign once: its sign at the root of T tells on which side of the root of H that lies
         ta = wp.abs(t0)
         tb = wp.abs(t1)
         side_bound = (ta + tb) * (_SIX * bound * (ta + tb) + _SLOPE_CROSSING * size * t_bound) + UNDERFLOW * bound
@@ -138,19 +137,19 @@ def count_roots(k: wp.vec4d, bound: wp.float64, shape: int) -> int:
 def linear_signs(
     line: wp.vec2d, line_bound: wp.float64, k: wp.vec4d, bound: wp.float64, size: wp.float64, roots: int
 ) -> wp.vec2i:
-    """Signs of a linear polynomial at the roots of Y, first and last (paper, Sign Determination Theorems I and II).
+    """Returns the signs of a line at the first and the last root of Y (Sign Determination Theorems I and II).
 
-    With the line's ends of opposite sign, its root t' = a / (a + b), a = |l0|, b = |l1|, and which side of the
-    roots of Y it lies on follows from the sign of Y(t'), and, if Y has two roots outside which it lies, from the
-    sign of Y'(t'). Any function that stays within ``line_bound`` = F of the line will do for the line: it has the
-    line's sign beyond the roots of all lines with ends within F.
+    If the line's ends have opposite signs, its root is t' = a / (a + b) with a = |l0|, b = |l1|. The sign of Y(t')
+    tells on which side of the roots of Y it lies or, if Y has two roots and t' is not between them, the sign of Y'(t')
+    does. Any function that stays within ``line_bound`` = F of the line may replace the line: it has the line's sign
+    beyond the roots of all lines with ends within F.
 
     Bound of Y(t') times (a + b)^3: Y is known to within E, with roundings 2E; moving the ends by F moves t' by at most
     F / (a + b - 2F), along a cubic whose computed coefficients give it a slope of at most 6k, and a sign that is
-    certain in spite of 8k F / (a + b) implies 8F < a + b, which makes 8k F / (a + b) enough. Of Y'(t') / 3
-    likewise: 5E, and for a slope of at most 8k, 16k F / (a + b). If one end's sign is uncertain, it is at most 2F in
-    truth. With the other end b >= 8F, the root of every such line lies at 2F / (F + b) <= 4F / (4F + b) at most: a =
-    4F is tried, and only the other end's sign can follow.
+    certain in spite of 8k F / (a + b) implies 8F < a + b, which makes 8k F / (a + b) enough. Of Y'(t') / 3 likewise:
+    5E, and for a slope of at most 8k, 16k F / (a + b). If one end's sign is uncertain, its exact value is at most 2F.
+    With the other end b >= 8F, the roots of all these lines lie at 2F / (F + b) <= 4F / (4F + b) at most: a = 4F takes
+    their place, and only the other end's sign can follow.
     """
     s0 = certified_sign(line[0], line_bound)
     s1 = certified_sign(line[1], line_bound)
@@ -185,10 +184,10 @@ def linear_signs(
 def quadratic_signs(
     q: wp.vec3d, q_bound: wp.float64, k: wp.vec4d, bound: wp.float64, size: wp.float64, roots: int
 ) -> wp.vec2i:
-    """Signs of a quadratic at the roots of Y, first and last (paper, 4.2).
+    """Returns the signs of a quadratic at the first and the last root of Y (Sec. 4.2).
 
-    Three attempts: the sign of all its coefficients; its chord, from which it differs by D t (1 - t), at most |D| /
-    4, with D = q0 - 2 q1 + q2; and the division D^2 Y = L q + K, by which q = -K / L at a root of Y.
+    It makes three attempts: the sign of all its coefficients; its chord, from which it differs by D t (1 - t), at most
+    |D| / 4, with D = q0 - 2 q1 + q2; and the division D^2 Y = L q + K, by which q = -K / L at a root of Y.
 
     Bounds, of the differences d, e and the leading coefficients D, A of q and Y: 2.5F, 5E, 6F, 11E, with |d| <= 2q,
     |e| <= 4k, |D| <= 4q, |A| <= 8k and, where a sign is certain at all, E <= k and F <= q. Of L = 3 e D - 2 d A, of

@@ -1,8 +1,8 @@
-"""Time of impact by subdivision with certified signs (paper, 5.5), which also decides much that classification cannot.
+"""Time of impact by subdivision with certified signs (Sec. 5.5), which also decides queries that classification cannot.
 
-Classification asks for signs at roots, and a polynomial of a high degree stands behind each. Over a short interval the
-signs of the coefficients of degree two and three are enough, so that halving the step certifies what is not degenerate
-to within rounding, and finds the first contact on the way.
+Classification needs signs at roots, each the sign of a polynomial of a high degree. Over a short interval the signs of
+coefficients of degree two and three are enough, so that subdivision certifies all queries that are not degenerate to
+within rounding, and finds the first contact on the way.
 """
 
 import warp as wp
@@ -16,18 +16,18 @@ from .roots import largest
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 
 MAX_VISITS = wp.constant(256)
-"""Intervals visited after which a query is given up."""
+"""Number of intervals after which the search stops, undecided."""
 
 LEAST_DIGITS = 10
-"""Binary digits that times have at least, however large the tolerance."""
+"""Fewest binary digits of a time of impact, however large the tolerance."""
 
 FINEST = wp.constant(wp.float64(2.0**-8))
-"""Length of the intervals that are given up if they stay undecided, as a share of the tolerance."""
+"""Length of the shortest intervals, as a share of the tolerance."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
-_PLANAR = wp.constant(wp.float64(64.0))  # such an interval in lengths
+_PLANAR = wp.constant(wp.float64(64.0))  # longest interval that ends the search where Y is zero, in tolerances
 _NEWTON_STEPS = wp.constant(12)
 _NEWTON_END = wp.constant(wp.float64(2.0**-40))
 _CUBIC_ERROR = wp.constant(wp.float64(2.0))
@@ -38,10 +38,10 @@ _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 
 @wp.struct
 class Impact:
-    """First contact of a query. Where the status is UNSURE, there is none before ``toi``.
+    """The first contact of a query; if the status is UNSURE, there is none before ``toi``.
 
-    Coordinates and normal are those at the contact, to rounding and the square of the tolerance; where ``localized``
-    is 0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed triangle, which have
+    Coordinates and normal are those at the contact, up to rounding and the square of the tolerance; if ``localized`` is
+    0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed triangle, which have
     no plane, is along the velocity; where that is zero too, it is (0, 0, 1).
     """
 
@@ -50,28 +50,28 @@ class Impact:
     toi: wp.float64  # time of impact, a lower bound in [0, 1]; 2 where the status is FREE
     coordinates: wp.vec3d  # vertex-face: barycentric coordinates in the face; edge-edge: (s, r, 0) along the edges
     normal: wp.vec3d  # unit contact normal, against the motion of the vertex or first edge relative to the other
-    grazing: int  # 1 where gradients are not those of the contact but clamped, see :mod:`.gradients`
+    grazing: int  # 1 where gradients are clamped, or the contact is not certain, see :mod:`.gradients`
 
 
 @wp.func
 def clamped_tolerance(tolerance: wp.float64) -> wp.float64:
-    """The tolerance asked for, in the range of those that are used, [2^-38, 2^-10]; 2^-38 for what is not a number.
+    """Returns the tolerance clamped to [2^-38, 2^-10]; 2^-38 for NaN.
 
-    Times are exact down to the one. More than the other would save nothing, for the search goes straight to the root,
-    but leave contacts at which the cubic is not linear.
+    Times are exact down to the lower limit. A tolerance above the upper one would save nothing, because the search goes
+    straight to the root, but leave intervals in which the cubic is not linear.
     """
     return wp.where(tolerance > _SMALLEST_TOLERANCE, wp.min(tolerance, _LARGEST_TOLERANCE), _SMALLEST_TOLERANCE)
 
 
 @wp.func
 def mix_vector(x0: wp.vec3d, x1: wp.vec3d, t: wp.float64) -> wp.vec3d:
-    """Position at time t of a point that moves from x0 to x1."""
+    """Returns the position at time t of a point that moves from x0 to x1."""
     return (_ONE - t) * x0 + t * x1
 
 
 @wp.func
 def restrict_motion(motion: Motion, start: wp.float64, end: wp.float64) -> Motion:
-    """The part of a motion between two times; sizes stay those of the whole."""
+    """Returns the part of a motion between two times; its sizes are those of the whole motion."""
     part = Motion()
     part.u0 = mix_vector(motion.u0, motion.u1, start)
     part.u1 = mix_vector(motion.u0, motion.u1, end)
@@ -89,7 +89,7 @@ def restrict_motion(motion: Motion, start: wp.float64, end: wp.float64) -> Motio
 
 @wp.func
 def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float64, end: wp.float64) -> int:
-    """Status over a part of the time: HIT if contact certainly occurs in it, FREE if certainly not.
+    """Returns the status over a part of the time: HIT if contact certainly occurs in it, FREE if certainly not.
 
     The cubic k is Y restricted to that part.
 
@@ -126,7 +126,7 @@ def status_between(motion: Motion, y: Coplanarity, k: wp.vec4d, start: wp.float6
 
 @wp.func
 def approximate_root(k: wp.vec4d) -> wp.float64:
-    """A root of a cubic that has opposite signs at 0 and at 1, by Newton's method, kept in place by bisection."""
+    """Returns a root of a cubic with opposite signs at 0 and at 1, by Newton's method with bisection as a safeguard."""
     low = _ZERO
     high = _ONE
     t = k[0] / (k[0] - k[3])
@@ -151,14 +151,14 @@ def approximate_root(k: wp.vec4d) -> wp.float64:
 
 @wp.func
 def approximate_extremum(k: wp.vec4d) -> wp.float64:
-    """Where in [0, 1] a cubic with one sign at 0 and at 1 turns back from zero; 0 or 1 if nowhere."""
+    """Returns where in [0, 1] a cubic with one sign at 0 and at 1 turns back from zero; 0 or 1 if nowhere."""
     d0 = k[1] - k[0]
     d1 = k[2] - k[1]
     d2 = k[3] - k[2]
     discriminant = d1 * d1 - d0 * d2
     if discriminant <= _ZERO:
         return _ZERO
-    # the root of the derivative d at which that rises where Y is positive, falls where Y is negative
+    # the root at which the derivative d rises if Y is positive, or falls if Y is negative
     root = wp.where(k[0] > _ZERO, wp.sqrt(discriminant), -wp.sqrt(discriminant))
     b = d0 - d1
     if b * root >= _ZERO:
@@ -168,7 +168,7 @@ def approximate_extremum(k: wp.vec4d) -> wp.float64:
 
 @wp.func
 def where_to_look(k: wp.vec4d) -> wp.float64:
-    """A time at which a cubic is about zero, or nearest to it, not certified; 0 or 1 if there is none between."""
+    """Returns an uncertified time in (0, 1) at which a cubic is about zero or nearest to it; 0 or 1 if none."""
     if k[0] * k[3] < _ZERO:
         return approximate_root(k)
     return approximate_extremum(k)
@@ -176,46 +176,45 @@ def where_to_look(k: wp.vec4d) -> wp.float64:
 
 @wp.func
 def power_of_two(x: wp.float64) -> wp.float64:
-    """The largest power of two up to a positive number."""
+    """Returns the largest power of two that is at most a positive number."""
     return wp.cast((wp.cast(x, wp.uint64) >> wp.uint64(52)) << wp.uint64(52), wp.float64)
 
 
 @wp.func
 def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64):
-    """Time before which there is certainly no contact, by asking one interval after the other, earlier ones first.
+    """Returns a time before which there is certainly no contact, from one interval after the other, in order of time.
 
-    An interval that is certainly free is left behind, and the other half or one twice as long comes next. An undecided
-    one is made shorter: so that it ends half the tolerance before a root of Y, where all is free as a rule, and the
-    interval of the tolerance's length that comes next certainly contains contact; or before Y turns back from zero;
-    else by half.
+    After an interval that is certainly free comes the other half, or one twice as long. An undecided interval becomes
+    shorter: it ends half the tolerance before a root of Y, so that it is usually free and the next one, as long as the
+    tolerance, certainly contains contact; or before Y turns back from zero; or it is halved.
 
-    The search ends at the first interval that certainly contains contact and is short enough, which makes its start the
-    time of impact to within the tolerance; or at one that stays undecided, after which nothing is known. That is one of
-    the shortest length; or one of the tolerance's in which already the shortest around the root is undecided; or the
-    whole step if the features may touch at the start and the shortest there is undecided; or one in which Y is zero as
-    far as can be told, so that no part of it certainly contains contact, and which is short enough for a bound.
+    The search ends at the first interval that certainly contains contact and is short enough: its start is the time of
+    impact to within the tolerance. Or it ends at an interval that stays undecided, with an unknown status from there
+    on. That interval has the shortest length; or the length of the tolerance, with an undecided shortest interval
+    around the root; or it is the whole step, if the features may touch at the start and the shortest interval there is
+    undecided; or Y is zero in it to within its bound, so that no part of it certainly contains contact, and it is short
+    enough for a lower bound of the time.
 
     All times are multiples of the shortest length, a power of two, and hence exact.
 
     Args:
-        motion: The query.
-        y: Its coplanarity.
-        status: What classification found: a HIT need not be asked for the whole step.
-        tolerance: Of the time, as a share of the step, see :func:`clamped_tolerance`.
+        motion: Motion of the query.
+        y: Coplanarity of the query.
+        status: Status from classification; if it is HIT, the search does not test the whole step again.
+        tolerance: Tolerance of the time, as a share of the step, see :func:`clamped_tolerance`.
 
     Returns:
-        Status (FREE, HIT, UNSURE), time, exact in double precision, 2 if FREE, and the end of the interval that the
-        search ended at.
+        Status (FREE, HIT, UNSURE); time, exact in double precision, 2 if FREE; end of the last interval.
     """
     length = power_of_two(clamped_tolerance(tolerance))
     shortest = FINEST * length
     start = _ZERO
     end = _ONE
     root = _ZERO
-    ahead = bool(False)  # whether there may be a root half the tolerance behind the end of the interval
+    ahead = bool(False)  # whether a root may be half the tolerance after the end of the interval
     passing = bool(False)  # whether the interval is the one around that root
     halved = bool(False)  # whether the interval is half of an undecided one
-    probing = bool(False)  # whether the shortest interval around the root is asked in place of the interval
+    probing = bool(False)  # whether the shortest interval around the root is tested in place of the interval
     probed = certified_sign(y.k[0], y.bound) != 0
     answer = status
     k = y.k
@@ -272,18 +271,18 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
 
 @wp.func
 def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -> Impact:
-    """First contact of a query that classification found to be HIT or UNSURE.
+    """Returns the first contact of a query that is HIT or UNSURE by classification.
 
     Args:
-        motion: The query.
-        y: Its coplanarity.
-        status: What classification found.
-        tolerance: Of the time of impact, as a share of the step, see :func:`clamped_tolerance`.
+        motion: Motion of the query.
+        y: Coplanarity of the query.
+        status: Status from classification.
+        tolerance: Tolerance of the time of impact, as a share of the step, see :func:`clamped_tolerance`.
     """
     result = Impact()
     found, toi, end = first_contact(motion, y, status, tolerance)
     if status == HIT and found == FREE:
-        # cannot be, unless signs are those that floating point computes: then all that is known is that it starts at 0
+        # possible only with signs that floating point computes, roundoff 0: then the only lower bound is 0
         found = UNSURE
         toi = _ZERO
     result.status = wp.where(found == UNSURE, status, found)
@@ -294,7 +293,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
 
     time = toi
     if found == HIT:
-        # between the ends of so short an interval the cubic is all but linear, and its signs there are opposite
+        # the interval is so short that the cubic is nearly linear in it, and its signs at the ends are opposite
         k = restrict_cubic(y.k, toi, end)
         time = mix(toi, end, k[0] / (k[0] - k[3]))
     coordinates, normal = contact_at(motion, time)

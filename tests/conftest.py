@@ -1,10 +1,12 @@
-"""Settings of the test run: one device for all tests, quiet Warp, repeatable hypothesis."""
+"""Settings of the test run: one device for all tests, what tests need, quiet Warp, repeatable hypothesis."""
 
 import os
 
 import hypothesis
 import pytest
 import warp as wp
+from benchmark_data import data_folder
+from chromium import CHROMIUM
 from guarded_memory import guard_memory
 
 wp.config.log_level = wp.LOG_WARNING
@@ -27,16 +29,27 @@ def pytest_configure(config):
         wp.config.mode = "debug"
 
 
+def _find_device():
+    """The device that all tests run on: ``WARP_BSC_DEVICE``, or Warp's default."""
+    return wp.get_device(os.environ.get("WARP_BSC_DEVICE") or wp.get_preferred_device())
+
+
 def pytest_collection_modifyitems(items):
-    """Skips the tests that need a GPU where there is none."""
-    if not wp.is_cuda_available():
-        for item in items:
-            if item.get_closest_marker("gpu"):
-                item.add_marker(pytest.mark.skip(reason="needs a GPU"))
+    """Skips the tests whose markers name something that is missing."""
+    present = {
+        "gpu": (_find_device().is_cuda, "needs a GPU"),
+        "data": (data_folder(), "needs the public benchmark data: set WARP_BSC_DATA to its folder"),
+        "browser": (CHROMIUM, "needs Chromium (Debian's package is called chromium)"),
+    }
+    missing = {marker: pytest.mark.skip(reason=reason) for marker, (found, reason) in present.items() if not found}
+    for item in items:
+        for marker, skip in missing.items():
+            if item.get_closest_marker(marker):
+                item.add_marker(skip)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def device():
-    """The device that all tests run on: ``WARP_BSC_DEVICE``, or Warp's default."""
-    wp.set_device(os.environ.get("WARP_BSC_DEVICE") or wp.get_preferred_device())
+    """The device that all tests run on."""
+    wp.set_device(_find_device())
     return wp.get_device()

@@ -19,15 +19,11 @@ KINDS = ("vertex_face", "edge_edge")
 COLLIDES = {"vertex_face": checker.vertex_face, "edge_edge": checker.edge_edge}
 TOI = {"vertex_face": checker.vertex_face_toi, "edge_edge": checker.edge_edge_toi}
 
-needs_data = pytest.mark.skipif(
-    benchmark_data.data_folder() is None, reason="no test data: set WARP_BSC_DATA to its folder"
-)
-
 
 # --- Benchmark queries ---
 
 
-@needs_data
+@pytest.mark.data
 @pytest.mark.parametrize(
     ("load", "queries", "collisions"), [("load_queries", 2324, 308), ("load_cloth_funnel_queries", 355, 134)]
 )

@@ -47,16 +47,21 @@ def test_the_collisions_of_the_scene_are_real():
     scene = Scene(ROOT / "assets" / "cloth_twist.usd")
     segment, _, _ = scene.interval(0)
     detector = bsc.CollisionDetector(bsc.CollisionMesh(segment.faces, segment.vertex_count))
-    confirmed = 0
+    neighbours = np.zeros((segment.vertex_count,) * 2, dtype=bool)
+    neighbours[tuple(detector.mesh.edges.T)] = True
+    neighbours |= neighbours.T
+    confirmed = one_ring_apart = 0
     for index in range(len(scene.times) - 1):
         _, x0, x1 = scene.interval(index)
         c = detector.detect(x0, x1)
         corners = np.concatenate([c.vertex_face[:, :1], segment.faces[c.vertex_face[:, 1]]], axis=1)
         confirmed += checker.vertex_face(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
+        one_ring_apart += neighbours[corners[:, :1, None], corners[:, None, 1:]].any(axis=(1, 2)).sum()
         corners = detector.mesh.edges[c.edge_edge].reshape(-1, 4)
         confirmed += checker.edge_edge(np.concatenate([x0[corners], x1[corners]], axis=1)).sum()
+        one_ring_apart += neighbours[corners[:, :2, None], corners[:, None, 2:]].any(axis=(1, 2)).sum()
         assert len(detector.find_intersections(x0))  # the cloth is through itself at rest, too
-    assert confirmed == 33
+    assert confirmed == one_ring_apart == 33
 
 
 @pytest.mark.skipif(not (ROOT / ".ci" / "run").exists(), reason="not a checkout")
@@ -67,7 +72,15 @@ def test_continuous_integration_runs_the_command_of_the_readme():
 
 def test_files_that_the_readme_names_exist():
     quoted = re.findall(r"`((?:kernels|warp_bsc|assets|examples)/[\w./]+)`", README)
-    linked = re.findall(r"\]\((\w[\w./]+)\)", README)
+    linked = re.findall(r"\]\(([\w.][\w./]+)\)", README)
     assert len(quoted) > 5 and len(linked) > 5
     for name in quoted + linked:
         assert (ROOT / name).exists(), name
+
+
+def test_pictures_of_the_measurements_exist():
+    page = ROOT / "warp_bsc" / "bench" / "README.md"
+    linked = re.findall(r"\]\((\.\./[\w./]+)\)", page.read_text())
+    assert len(linked) > 3
+    for name in linked:
+        assert (page.parent / name).exists(), name

@@ -1,1 +1,1 @@
-"""Exact arithmetic on the device: wide integers, and what is decided with them."""
+"""Exact arithmetic on the device: wide integers, signs at algebraic numbers, and the first contact of a query."""

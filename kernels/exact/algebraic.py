@@ -1,29 +1,29 @@
-"""Signs and order of algebraic numbers: roots of quadratics and cubics, in exact integers (paper, 4.1 and 4.2).
+"""Signs and order of algebraic numbers: roots of quadratics and cubics, in exact integers (Sec. 4.1 and 4.2).
 
-A polynomial over the step is taken in z = t / (1 - t), which maps the inside of the step to z > 0: the Bernstein
+Polynomials over the step are functions of z = t / (1 - t), which maps the inside of the step to z > 0: the Bernstein
 coefficients of a cubic times 1, 3, 3, 1 are its coefficients in z, and the sign of its value is the same. The ends
-t = 0 and t = 1 are z = 0 and infinity, where the signs of the first and of the last coefficient count.
+t = 0 and t = 1 are z = 0 and infinity, where the polynomial has the signs of its first and last coefficient.
 
-**Number of positive roots.** Descartes: as many as changes of sign along the coefficients, or fewer by an even number.
-So 0 and 1 change say it. Two or three changes allow at most one or no negative root, so that all roots are real, with
-multiplicity, where the discriminant is not negative, and else two of them are not.
+**Number of positive roots.** By Descartes' rule it is the number of sign changes along the coefficients, or less by an
+even number. So 0 and 1 changes give the number. With two or three changes a cubic has at most one or no negative root:
+if its discriminant is not negative, all roots are real, with multiplicity, and otherwise two are not.
 
 **Sign at a root of a quadratic** q = c0 + c1 z + a z^2. Division gives a^2 P = L q + K with K = K1 z + K0 linear; the
 sign of P at a root is that of K. Let g = a P - p3 z q, quadratic. Then
 
     K1 = a g1 - c1 g2,  K0 = a g0 - c0 g2,  K1^2 q(-K0 / K1) = a (K0^2 - K1 J)  with J = c1 g0 - c0 g1,
 
-because c1 K0 - c0 K1 = a J. Where the root -K0 / K1 of K lies is told by the sign of q there, and by the side of
-the turning point -c1 / 2a it is on. The leading factor a is divided out of q(-K0 / K1), so that this needs the
-degree in the coefficients that the resultant of P and g has, the least possible but for a.
+because c1 K0 - c0 K1 = a J. The sign of q at the root -K0 / K1 of K, and the side of the turning point -c1 / 2a that
+it is on, tell where that root lies. Division of q(-K0 / K1) by the leading factor a leaves the degree in the
+coefficients that the resultant of P and g has, the least possible apart from a.
 
 If a = 0, 1 / z in place of z exchanges the two ends of all polynomials, and q has one positive root at most.
 
-**Order of a point and the roots of a cubic** (or quadratic) f that all are real, a1 <= a2 <= a3: with the sign of f at
-infinity positive, f rises to a maximum, falls to a minimum and rises again, one root on each piece. The piece that a
-point is on is told by the signs of f' and f'' there (Thom's encoding), its side of the root on that piece by the sign
-of f. A quadratic is such a cubic without the first piece, a1 being at minus infinity. So the signs of f, f' and f'' at
-the roots of q tell the order of the roots of f and of q, and hence the sign of q at the roots of f.
+**Order of a point and the roots of a cubic** (or quadratic) f whose roots a1 <= a2 <= a3 are real: with the sign of f
+at infinity positive, f rises to a maximum, falls to a minimum and rises again, one root on each piece. The signs of f'
+and f'' at a point tell on which piece it is (Thom's encoding), and the sign of f on which side of the root there. A
+quadratic is a cubic without the first piece, with a1 at minus infinity. So the signs of f, f' and f'' at the roots of q
+tell the order of the roots of f and of q, and hence the sign of q at the roots of f.
 
 Widths: with coefficients of q below 2^(2B+2), the outer ones below 2^(2B+1), and of P below 2^(3B+5), as those of
 :mod:`polygon` are, which derives the constants, g is below 2^(5B+6), K and J are below 2^(7B+9), and K0^2 - K1 J is
@@ -44,7 +44,7 @@ _9 = wp.constant(wp.uint64(9))
 
 @wp.func
 def sign_changes(s0: int, s1: int, s2: int, s3: int) -> int:
-    """How often the sign changes along a sequence, zeros left out."""
+    """Returns how often the sign changes along a sequence, without its zeros."""
     last = s0
     changes = wp.where(s1 * last < 0, 1, 0)
     last = wp.where(s1 != 0, s1, last)
@@ -55,13 +55,13 @@ def sign_changes(s0: int, s1: int, s2: int, s3: int) -> int:
 
 @wp.func
 def last_sign(s0: int, s1: int, s2: int, s3: int) -> int:
-    """The last sign of a sequence that is not zero: of a polynomial beyond its largest root."""
+    """Returns the last sign of a sequence that is not zero: that of a polynomial beyond its largest root."""
     return wp.where(s3 != 0, s3, wp.where(s2 != 0, s2, wp.where(s1 != 0, s1, s0)))
 
 
 @wp.func(inline=False)
 def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
-    """Number of positive roots of a quadratic, with multiplicity: 0, 1 or 2; 0 for the zero polynomial."""
+    """Returns the number of positive roots of a quadratic, with multiplicity: 0, 1 or 2; 0 for the zero polynomial."""
     changes = sign_changes(sign(c0), sign(c1), sign(c2), 0)
     if changes == 2:
         return wp.where(sign(minor(c1, c1, times(c0, _4), c2)) >= 0, 2, 0)
@@ -70,11 +70,11 @@ def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
 
 @wp.func(inline=False)
 def count_cubic_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
-    """Number of positive roots of a cubic, with multiplicity: 0 to 3; 0 for the zero polynomial.
+    """Returns the number of positive roots of a cubic, with multiplicity: 0 to 3; 0 for the zero polynomial.
 
-    The discriminant is (4 h0 h2 - h1^2) / 3 with the coefficients h of the Hessian. It is homogeneous: a cubic that
-    ends in zeros has roots at 0 or at infinity, apart from the positive ones, and its discriminant has the sign of
-    theirs.
+    The discriminant is (4 h0 h2 - h1^2) / 3 with the coefficients h of the Hessian. It is homogeneous: a cubic whose
+    first or last coefficients are zero has roots at 0 or at infinity, and its discriminant has the sign of that of the
+    other roots.
     """
     changes = sign_changes(sign(c0), sign(c1), sign(c2), sign(c3))
     if changes < 2:
@@ -87,7 +87,7 @@ def count_cubic_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
 
 @wp.func
 def remainder(p0: Any, p1: Any, p2: Any, p3: Any, q0: Any, q1: Any, q2: Any):
-    """K0, K1 and J of the module docstring, for the cubic P and the quadratic q."""
+    """Returns K0, K1 and J of the module docstring, for the cubic P and the quadratic q."""
     g0 = product(q2, p0)
     g1 = minor(q2, p1, p3, q0)
     g2 = minor(q2, p2, p3, q1)
@@ -96,7 +96,7 @@ def remainder(p0: Any, p1: Any, p2: Any, p3: Any, q0: Any, q1: Any, q2: Any):
 
 @wp.func(inline=False)
 def _signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, a: Any, roots: int) -> wp.vec2i:
-    """As :func:`signs_at_roots`, for a quadratic that has a leading coefficient a."""
+    """Returns :func:`signs_at_roots` of a quadratic whose leading coefficient a is not zero."""
     k0, k1, j = remainder(p0, p1, p2, p3, c0, c1, a)
     s0 = sign(k0)
     s1 = sign(k1)
@@ -104,7 +104,7 @@ def _signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, a: Any
         s = wp.where(s1 != 0, s1, s0)
         return wp.vec2i(s, s)
     inside = sign(minor(k0, k0, k1, j))  # negative where the root of K lies between the roots of q
-    if roots == 1:  # and the other one is not positive
+    if roots == 1:  # the other root is not positive
         return wp.vec2i(-inside * s1, -inside * s1)
     if inside < 0:
         return wp.vec2i(-s1, s1)
@@ -117,17 +117,17 @@ def _signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, a: Any
 
 @wp.func
 def signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, c2: Any, roots: int) -> wp.vec2i:
-    """Signs of a cubic P at the positive roots of a quadratic q, the smaller one first; of one root, twice.
+    """Returns the signs of a cubic P at the positive roots of a quadratic q, the smaller one first; of one root, twice.
 
     Args:
-        p0: Coefficients of P in z, here and next.
-        p1: Of z.
-        p2: Of z^2.
-        p3: Of z^3.
-        c0: Coefficients of q in z, here and next.
-        c1: Of z.
-        c2: Of z^2.
-        roots: How many positive roots q has, with multiplicity, 1 or 2.
+        p0: Constant coefficient of P.
+        p1: Coefficient of z in P.
+        p2: Coefficient of z^2 in P.
+        p3: Coefficient of z^3 in P.
+        c0: Constant coefficient of q.
+        c1: Coefficient of z in q.
+        c2: Coefficient of z^2 in q.
+        roots: Number of positive roots of q, with multiplicity, 1 or 2.
     """
     if sign(c2) != 0:
         return _signs_at_roots(p0, p1, p2, p3, c0, c1, c2, roots)
@@ -136,13 +136,15 @@ def signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, c2: Any
 
 @wp.func
 def order(roots: int, value: int, slope: int, bend: int) -> wp.vec3i:
-    """Where a point lies among the roots a1 <= a2 <= a3 of a cubic: the signs of its distances from each.
+    """Returns the signs of the point minus each of the roots a1 <= a2 <= a3 of a cubic.
 
     Args:
-        roots: How many of them are positive: the last ones, with multiplicity. If it is one, the others are not asked.
+        roots: Number of positive roots, which are the last ones, with multiplicity. If it is one, ``slope`` and
+        ``bend``
+            have no effect.
         value: Sign of the cubic at the point, times its sign at infinity.
-        slope: The same of its derivative.
-        bend: The same of its second derivative.
+        slope: Sign of its derivative there, times the same.
+        bend: Sign of its second derivative there, times the same.
     """
     if roots == 1:
         return wp.vec3i(1, 1, value)
@@ -159,18 +161,18 @@ def order(roots: int, value: int, slope: int, bend: int) -> wp.vec3i:
 def signs_at_cubic_roots(
     c0: Any, c1: Any, c2: Any, turns: int, v0: Any, v1: Any, v2: Any, v3: Any, roots: int
 ) -> wp.vec3i:
-    """Signs of a quadratic q at the roots a1 <= a2 <= a3 of a cubic, of which the last ones are positive and asked for.
+    """Returns the signs of a quadratic q at the roots a1 <= a2 <= a3 of a cubic, valid at the positive ones, the last.
 
     Args:
-        c0: Coefficients of q in z, here and next.
-        c1: Of z.
-        c2: Of z^2.
-        turns: How many positive roots q has, with multiplicity.
-        v0: Coefficients of the cubic in z, here and next.
-        v1: Of z.
-        v2: Of z^2.
-        v3: Of z^3.
-        roots: How many positive roots the cubic has, with multiplicity, at least 1.
+        c0: Constant coefficient of q.
+        c1: Coefficient of z in q.
+        c2: Coefficient of z^2 in q.
+        turns: Number of positive roots of q, with multiplicity.
+        v0: Constant coefficient of the cubic.
+        v1: Coefficient of z in the cubic.
+        v2: Coefficient of z^2 in the cubic.
+        v3: Coefficient of z^3 in the cubic.
+        roots: Number of positive roots of the cubic, with multiplicity, at least 1.
     """
     s = last_sign(sign(c0), sign(c1), sign(c2), 0)
     signs = wp.vec3i(s, s, s)
@@ -184,7 +186,7 @@ def signs_at_cubic_roots(
         zero = subtract(v0, v0)
         slope = end * signs_at_roots(v1, times(v2, _2), times(v3, _3), zero, c0, c1, c2, turns)
         bend = end * signs_at_roots(v2, times(v3, _3), zero, zero, c0, c1, c2, turns)
-    # the sign is the last one beyond all roots of q, and changes at each of them
+    # beyond all roots of q its sign is the last one, and it changes at each root
     signs = wp.cw_mul(signs, -order(roots, value[0], slope[0], bend[0]))
     if turns == 2:
         signs = wp.cw_mul(signs, -order(roots, value[1], slope[1], bend[1]))
@@ -193,7 +195,7 @@ def signs_at_cubic_roots(
 
 @wp.func(inline=False)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
-    """Sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
+    """Returns the sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
     m1 = subtract(p1, times(p0, _3))
     m2 = add(subtract(p2, times(p1, _2)), times(p0, _3))
     m3 = subtract(add(p3, p1), add(p2, p0))
@@ -204,18 +206,18 @@ def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: i
 
 @wp.func(inline=False)
 def root_time(c0: Any, c1: Any, c2: Any, c3: Any, roots: int, index: int, digits: int) -> wp.float64:
-    """The last multiple of 2^-digits that is not after a root of a cubic, as a time t in [0, 1).
+    """Returns the last multiple of 2^-digits that is not after a root of a cubic, as a time t in [0, 1).
 
-    With coefficients below 2^(3B+5), what is computed is below 2^(3B+9+3 digits).
+    With coefficients below 2^(3B+5), all integers here are below 2^(3B+9+3 digits).
 
     Args:
-        c0: Coefficients of the cubic in z, here and next.
-        c1: Of z.
-        c2: Of z^2.
-        c3: Of z^3.
-        roots: How many positive roots it has, with multiplicity.
-        index: Which of its roots a1 <= a2 <= a3, counted from 0, the last ones being the positive ones.
-        digits: At most 38.
+        c0: Constant coefficient of the cubic.
+        c1: Coefficient of z in the cubic.
+        c2: Coefficient of z^2 in the cubic.
+        c3: Coefficient of z^3 in the cubic.
+        roots: Number of its positive roots, with multiplicity.
+        index: Index of the root among a1 <= a2 <= a3, from 0; the positive roots are the last ones.
+        digits: Binary digits of the time, at most 38.
     """
     end = last_sign(sign(c0), sign(c1), sign(c2), sign(c3))
     zero = subtract(c0, c0)

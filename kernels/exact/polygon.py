@@ -1,10 +1,10 @@
-"""The polygon of a query around the origin, in wide integers, and the polynomials that its corners make.
+"""The polygon of a query around the origin, in wide integers, and polynomials of its corners.
 
-Scaling an axis changes no answer. So along each axis coordinates are integers once they are divided by their lowest
-set bit, and so are the corners: B bits, |x| < 2^B, the axis with the most of them counting. Then, in z = t / (1 - t),
+Scaling an axis changes no status. So coordinates are divided along each axis by their lowest set bit, which makes them
+and the corners integers of B bits on the widest axis, |x| < 2^B. Then, in z = t / (1 - t),
 the outer coefficients of a component of C_e have two products of coordinates, below 2^(2B+1), and the middle one has
 four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt(3) 2^3B by Hadamard's inequality, thus
-2^(3B+3), and the inner ones are three of them each, below 15.6 * 2^3B. With these, in units of the power of 2^B,
+2^(3B+3), and the inner ones are sums of three, below 15.6 * 2^3B. With these, in units of a power of 2^B,
 
     g   = a P - p3 z q      52      < 2^6,   5B: 2 * 15.6 + 5.2 * 4
     K0                      124.8   < 2^7,   7B: 2 * 10.4 + 2 * 52, of V' as well
@@ -15,12 +15,12 @@ four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt
     discriminant of V       1.2e6   < 2^21, 12B
     turning point minus root        < 2^11,  9B
 
-and one bit more for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
-8 L, all fits for
+and one bit for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
+8 L limbs, everything fits for
 
     B <= min((512 L - 18) / 14, (256 L - 11) / 7):  35 bits in one limb, 71 in two, 291 in eight.
 
-Single precision never takes more than 278, its whole range.
+Single precision takes at most 278, its whole range.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ from ..polynomials import VERTEX_FACE
 from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
 BITS = {1: 35, 2: 71, 8: 291}
-"""Largest B by the number of limbs of a coordinate."""
+"""Largest B for each number of limbs of a coordinate."""
 
 _FROM_POINTS = """
     // both points of the difference that each corner is; 0 to 3: the points of the query in order
@@ -84,30 +84,34 @@ for _limbs in BITS:
     @wp.func_native(snippet=_FROM_POINTS)
     def make_polygon(
         edges: bool,
+        # points at the start
         a0: wp.vec3d,
         b0: wp.vec3d,
         c0: wp.vec3d,
         d0: wp.vec3d,
+        # points at the end
         a1: wp.vec3d,
         b1: wp.vec3d,
         c1: wp.vec3d,
         d1: wp.vec3d,
+        # scale
         exponents: wp.vec3i,
+        # out
         polygon: wp.array[_Integer],
     ):
-        """Fills the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
+        """Writes the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
 
         Args:
             edges: Whether it is an edge-edge query; the polygon of a vertex-face query has its last corner twice.
-            a0: The four points in order, at the start.
-            b0: Second point.
-            c0: Third point.
-            d0: Fourth point.
-            a1: The same points at the end.
-            b1: Second point.
-            c1: Third point.
-            d1: Fourth point.
-            exponents: By axis, exponent of a power of two that all coordinates are multiples of.
+            a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
+            b0: Second point at the start.
+            c0: Third point at the start.
+            d0: Fourth point at the start.
+            a1: First point at the end.
+            b1: Second point at the end.
+            c1: Third point at the end.
+            d1: Fourth point at the end.
+            exponents: Exponent for each axis of a power of two that divides all coordinates.
             polygon: Array of 24 integers to write to.
         """
         ...
@@ -115,13 +119,13 @@ for _limbs in BITS:
 
 @wp.func
 def coordinate(polygon: wp.array[Any], corner: int, end: int, axis: int):
-    """A coordinate of a corner at the start (0) or at the end (1)."""
+    """Returns a coordinate of a corner at the start (0) or at the end (1)."""
     return polygon[(end * 4 + corner) * 3 + axis]
 
 
 @wp.func
 def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
-    """Exponents of the lowest bits of two points, by axis."""
+    """Returns the exponents of the lowest bits of two points, for each axis."""
     return wp.min(
         wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2])),
         wp.vec3i(lowest_bit(y[0]), lowest_bit(y[1]), lowest_bit(y[2])),
@@ -130,7 +134,7 @@ def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 @wp.func
 def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
-    """Powers of two that the difference of two points is below, by axis."""
+    """Returns exponents e such that the difference of two points is below 2^e, for each axis."""
     return wp.vec3i(
         top_bit_of_difference(x[0], y[0]), top_bit_of_difference(x[1], y[1]), top_bit_of_difference(x[2], y[2])
     )
@@ -138,7 +142,7 @@ def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 @wp.func
 def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
-    """Powers of two that the corners of the polygon are below at one time, by axis."""
+    """Returns exponents e such that the corners of the polygon at one time are below 2^e, for each axis."""
     if kind == VERTEX_FACE:
         return wp.max(_top(a, b), wp.max(_top(a, c), _top(a, d)))
     return wp.max(wp.max(_top(c, a), _top(c, b)), wp.max(_top(d, a), _top(d, b)))
@@ -147,16 +151,18 @@ def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp
 @wp.func
 def spread(
     kind: int,
+    # points at the start
     a0: wp.vec3d,
     b0: wp.vec3d,
     c0: wp.vec3d,
     d0: wp.vec3d,
+    # points at the end
     a1: wp.vec3d,
     b1: wp.vec3d,
     c1: wp.vec3d,
     d1: wp.vec3d,
 ):
-    """The power of two to divide by along each axis, and the bits B of the corners after it."""
+    """Returns the exponent of the power of two to divide each axis by, and the bits B of the corners after that."""
     lowest = wp.min(wp.min(_lowest(a0, b0), _lowest(c0, d0)), wp.min(_lowest(a1, b1), _lowest(c1, d1)))
     bits = wp.max(_widest(kind, a0, b0, c0, d0), _widest(kind, a1, b1, c1, d1)) - lowest
     return lowest, wp.max(wp.max(bits), 0)
@@ -164,7 +170,7 @@ def spread(
 
 @wp.func(inline=False)
 def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
-    """Coefficients in z of a component of the cross product of two corners."""
+    """Returns the coefficients in z of a component of the cross product of two corners."""
     j = wp.where(axis == 2, 0, axis + 1)
     k = wp.where(j == 2, 0, j + 1)
     x0j = coordinate(polygon, first, 0, j)
@@ -184,7 +190,7 @@ def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
 
 @wp.func(inline=False)
 def volume(polygon: wp.array[Any], last: int):
-    """Coefficients in z of the cubic V, for the number of the last corner."""
+    """Returns the coefficients in z of the cubic V, given the index of the last corner."""
     n0, n1, n2 = cross_component(polygon, 1, last, 0)
     start = coordinate(polygon, 0, 0, 0)
     end = coordinate(polygon, 0, 1, 0)
@@ -207,7 +213,7 @@ def volume(polygon: wp.array[Any], last: int):
 
 @wp.func
 def sign_at_end(polygon: wp.array[Any], first: int, second: int, axis: int, end: int) -> int:
-    """Sign of a component of the cross product of two corners at the start or at the end."""
+    """Returns the sign of a component of the cross product of two corners at the start (0) or at the end (1)."""
     j = wp.where(axis == 2, 0, axis + 1)
     k = wp.where(j == 2, 0, j + 1)
     xj = coordinate(polygon, first, end, j)

@@ -1,7 +1,7 @@
 """Wide integers: vectors of 64-bit limbs, the lowest first, in two's complement.
 
 Sums and products wrap around at the width of their type, as those of built-in integers do, so that a result is exact
-wherever it fits, whatever has happened on the way. Whoever computes proves that it fits.
+if it fits, whether or not intermediate results do. Callers prove that it fits.
 
 Nearly all arithmetic of exact predicates is a two by two determinant, :func:`minor`, of numbers of some width, with a
 result twice as wide, or as wide as the wider factors.
@@ -10,11 +10,11 @@ result twice as wide, or as wide as the wider factors.
 import warp as wp
 
 LIMBS = (1, 2, 4, 8, 16, 32, 64)
-"""Widths that there are, in limbs, each twice the one before."""
+"""Available widths, in limbs, each twice the one before."""
 
 
-def integer(limbs):
-    """The type of integers of so many limbs."""
+def integer(limbs: int) -> type:
+    """Returns the type of integers of ``limbs`` 64-bit limbs."""
     return wp.types.vector(length=limbs, dtype=wp.uint64)
 
 
@@ -161,8 +161,8 @@ _SHIFT = """
 """
 
 
-def _returning(snippet, limbs):
-    """A snippet with the type that it returns filled in."""
+def _returning(snippet: str, limbs: int) -> str:
+    """Returns a snippet preceded by the definition of its return type."""
     return f"    using ret_type = wp::vec_t<{limbs}, wp::uint64>;{snippet}"
 
 
@@ -172,54 +172,54 @@ for _limbs in LIMBS:
 
     @wp.func_native(snippet=_SIGN)
     def sign(a: _Single) -> int:
-        """Sign of an integer: -1, 0 or 1."""
+        """Returns the sign of an integer: -1, 0 or 1."""
         ...
 
     @wp.func_native(snippet=_returning(_ADD, _limbs))
     def add(a: _Single, b: _Single) -> _Single:
-        """The sum a + b."""
+        """Returns the sum a + b."""
         ...
 
     @wp.func_native(snippet=_returning(_SUBTRACT, _limbs))
     def subtract(a: _Single, b: _Single) -> _Single:
-        """The difference a - b."""
+        """Returns the difference a - b."""
         ...
 
     @wp.func_native(snippet=_returning(_TIMES, _limbs))
     def times(a: _Single, factor: wp.uint64) -> _Single:
-        """The product of an integer and a factor that is not negative."""
+        """Returns the product of an integer and a factor that is not negative."""
         ...
 
     @wp.func_native(snippet=_returning(_SHIFT, _limbs))
     def shift(a: _Single, bits: int) -> _Single:
-        """The integer times 2^bits."""
+        """Returns the integer times 2^bits."""
         ...
 
     if _limbs < LIMBS[-1]:
 
         @wp.func_native(snippet=_returning(_WIDEN, 2 * _limbs))
         def widen(a: _Single) -> _Double:
-            """The same integer, twice as wide."""
+            """Returns the same integer, twice as wide."""
             ...
 
         @wp.func_native(snippet=_returning(_PRODUCT, 2 * _limbs))
         def product(a: _Single, b: _Single) -> _Double:
-            """The product a b, twice as wide as its factors."""
+            """Returns the product a b, twice as wide as its factors."""
             ...
 
         @wp.func_native(snippet=_returning(_PRODUCT, 2 * _limbs))
         def product(a: _Double, b: _Single) -> _Double:  # noqa: F811 (an overload)
-            """The product a b, as wide as its wider factor."""
+            """Returns the product a b, as wide as its wider factor."""
             ...
 
         @wp.func_native(snippet=_returning(_MINOR, 2 * _limbs))
         def minor(a: _Single, b: _Single, c: _Single, d: _Single) -> _Double:
-            """The determinant a b - c d, twice as wide as its factors."""
+            """Returns the determinant a b - c d, twice as wide as its factors."""
             ...
 
         @wp.func_native(snippet=_returning(_MINOR, 2 * _limbs))
         def minor(a: _Double, b: _Single, c: _Double, d: _Single) -> _Double:  # noqa: F811 (an overload)
-            """The determinant a b - c d, as wide as its wider factors."""
+            """Returns the determinant a b - c d, as wide as its wider factors."""
             ...
 
 
@@ -242,7 +242,7 @@ for _limbs in LIMBS:
 """
 )
 def lowest_bit(x: wp.float64) -> int:
-    """Exponent of the lowest set bit of a finite number: the largest e for which x is a multiple of 2^e; 4096 of 0."""
+    """Returns the exponent of the lowest set bit of a finite number: 2^e is its largest divisor; 4096 for 0."""
     ...
 
 
@@ -264,10 +264,10 @@ def lowest_bit(x: wp.float64) -> int:
 """
 )
 def top_bit_of_difference(x: wp.float64, y: wp.float64) -> int:
-    """An e with |x - y| < 2^e for finite numbers, the smallest one unless it is tiny; 8192 where they are too large.
+    """Returns an e with |x - y| < 2^e for finite numbers, the smallest unless it is tiny; 8192 if they are too large.
 
-    It is -4096 where the numbers are the same. Rounding takes no difference below 2^e to it but as far as 2^e itself,
-    which counts as below 2^(e + 1). What a difference of 2^-969 or more has lost where subnormal numbers are flushed,
-    all of the one number, is less than the lowest bit of the other.
+    It is -4096 if the numbers are the same. Rounding takes a difference below 2^e at most to 2^e itself, which counts
+    as below 2^(e + 1). Where subnormal numbers are flushed, a difference of 2^-969 or more may lose one of its numbers,
+    which is less than the lowest bit of the other.
     """
     ...

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from benchmark_data import data_folder, load_queries
+from benchmark_data import load_queries
 from generators import GENERATORS
 
 from warp_bsc import checker
@@ -61,7 +61,8 @@ def test_what_never_moves_is_answered(kind):
             assert (answer(method, kind, queries).find_hits() == touches).all(), method
 
 
-@pytest.mark.skipif(data_folder() is None, reason="no test data: set WARP_BSC_DATA to its folder")
+@pytest.mark.slow
+@pytest.mark.data
 def test_hand_made_queries():
     """Wang et al. 2021: El Topo's solver has 242 false positives and 2 false negatives there."""
     positives, negatives = dict.fromkeys(METHODS, 0), dict.fromkeys(METHODS, 0)

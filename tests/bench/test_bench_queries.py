@@ -19,6 +19,7 @@ def measure(capsys, device, *arguments):
     return output.out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_true(kind, device):
     measured = benchmark_queries(kind, count=1000, device=device, repeat=1)

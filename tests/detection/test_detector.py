@@ -111,14 +111,13 @@ def test_flat_cloth_does_not_hit_itself(motion, dtype):
 
 @pytest.fixture(scope="module")
 def cloth_funnel():
-    if data_folder() is None:
-        pytest.skip("no test data beside the project")
     first, second = (
         trimesh.load(data_folder() / "frames" / "cloth-funnel" / f"{frame}.ply", process=False) for frame in (227, 228)
     )
     return np.array(first.vertices), np.array(second.vertices), np.array(first.faces)
 
 
+@pytest.mark.data
 def test_cloth_funnel_has_the_known_collisions(cloth_funnel, broad_phase):
     x0, x1, faces = cloth_funnel
     c = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)), method="exact").detect(x0, x1)
@@ -126,6 +125,7 @@ def test_cloth_funnel_has_the_known_collisions(cloth_funnel, broad_phase):
     assert (len(c.vertex_face), len(c.edge_edge), c.certified) == (27, 107, True)
 
 
+@pytest.mark.data
 def test_answers_are_the_same_on_every_run_and_device(cloth_funnel):
     x0, x1, faces = cloth_funnel
     devices = ["cpu", *(device.alias for device in wp.get_cuda_devices()[:1])]

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 import warp as wp
-from benchmark_data import data_folder, load_cloth_funnel_queries, load_queries
+from benchmark_data import load_cloth_funnel_queries, load_queries
 from certify import KINDS, judge
 from generators import GENERATORS
 
 import warp_bsc as bsc
 from warp_bsc import checker
-
-needs_data = pytest.mark.skipif(data_folder() is None, reason="no test data beside the project")
 
 CROSSING = np.array(
     [
@@ -43,14 +41,14 @@ def benchmark_queries():
     }
 
 
-@needs_data
+@pytest.mark.data
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_is_right_on_the_benchmark(benchmark_queries, kind):
     points, truth = benchmark_queries[kind]
     assert np.array_equal(query(kind, points, method="exact").hit, truth)
 
 
-@needs_data
+@pytest.mark.data
 @pytest.mark.parametrize("kind", KINDS)
 def test_benchmark_certificates_and_times_are_right(benchmark_queries, kind):
     points, truth = benchmark_queries[kind]
@@ -59,7 +57,7 @@ def test_benchmark_certificates_and_times_are_right(benchmark_queries, kind):
     assert (verdict.wrong, verdict.missed, verdict.exact_wrong, verdict.late, verdict.early) == (0, 0, 0, 0, 0)
 
 
-@needs_data
+@pytest.mark.data
 def test_conservative_and_float_err_no_more_than_promised():
     false_positives = false_negatives = computed_wrong = 0
     for _, kind, points, truth in load_queries():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from benchmark_data import data_folder, load_cloth_funnel_queries, load_queries
+from benchmark_data import load_cloth_funnel_queries, load_queries
 from certify import KINDS
 from exact_queries import decide_exactly
 from generators import GENERATORS, _weights, _with_gap
@@ -18,8 +18,6 @@ from warp_bsc.kernels.exact import algebraic
 from warp_bsc.kernels.exact.algebraic import remainder
 from warp_bsc.kernels.exact.polygon import BITS, coordinate, cross_component, make_polygon, spread, volume
 from warp_bsc.kernels.exact.wide_integers import integer, minor, subtract, times
-
-needs_data = pytest.mark.skipif(data_folder() is None, reason="no test data beside the project")
 
 
 def assert_true(kind, points, limbs, *, least=1.0):
@@ -95,7 +93,7 @@ def test_answers_do_not_depend_on_names_scales_or_the_direction_of_time(kind, co
     assert np.array_equal(decide_exactly(kind, points * scale, 1)[0] < 2.0, hit)
 
 
-@needs_data
+@pytest.mark.data
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_to_the_benchmark_are_true(kind):
     for _, k, points, truth in [*load_queries(), *load_cloth_funnel_queries()]:

@@ -1,5 +1,7 @@
 """Device functions called in a user's own kernel, with that module's own compile options."""
 
+import sys
+
 import numpy as np
 import pytest
 import warp as wp
@@ -63,6 +65,14 @@ def test_times_of_impact_in_a_user_kernel_have_gradients(device):
 def ask_fast(p: wp.array2d[wp.vec3], status: wp.array[int]):
     i = wp.tid()
     status[i] = ccd_vertex_face(p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7])
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="no CUDA compiler")
+def test_conversions_to_double_precision_keep_subnormal_numbers_with_fast_math(tmp_path):
+    wp.compile_aot_module(ask_fast.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (code,) = (path.read_text() for path in tmp_path.rglob("*.ptx"))
+    assert code.count("cvt.f64.f32") == 24
+    assert "cvt.ftz" not in code
 
 
 def test_subnormal_numbers_count_in_single_precision_with_fast_math(device):

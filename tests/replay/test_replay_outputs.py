@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import CHROMIUM
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
 from stages import FALLING, FLOOR, add_floor, add_mesh, falling, moved, new_stage, save
 
@@ -653,10 +654,6 @@ def test_page_where_little_is_there(tmp_path, visible):
     assert (view is None) == (visible == "invisible")
 
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian's package is called chromium)")
-
-
 def browse(page, profile, *options):
     """What headless Chromium prints, and what the page wrote to its console."""
     command = [
@@ -669,7 +666,7 @@ def browse(page, profile, *options):
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
-@needs_chromium
+@pytest.mark.browser
 def test_page_in_chromium(tmp_path):
     scene = tmp_path / "cloth_twist.usd"
     shutil.copy(ASSETS / scene.name, scene)
@@ -691,7 +688,7 @@ def test_page_in_chromium(tmp_path):
     assert ((red > 0.7) & (green < 0.75) & (blue < 0.4)).sum() > 30  # contacts
 
 
-@needs_chromium
+@pytest.mark.browser
 def test_hostile_names_do_nothing_in_chromium(tmp_path):
     page = replay(hostile_stage(tmp_path))[3]
     dom, console = browse(page, tmp_path / "profile", "--dump-dom")

@@ -3,6 +3,9 @@
 ``python tests/support/certify.py --count 4000`` prints the share of queries that floating point could not certify,
 generator by generator, and exits with status 1 if a certified answer or a time of impact is wrong.
 
+``python tests/support/certify.py --method user --count 400`` calls ``impact_*`` from a user's kernel, in a module with
+the default options, with tolerances in their range and out of it.
+
 ``python tests/support/certify.py --method exact --count 4000`` asks exact arithmetic in every width about every query,
 also what floating point could decide, and leaves out the generators whose queries it nearly always can.
 """
@@ -22,12 +25,14 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.kernels import impact_edge_edge, impact_vertex_face
 from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")
 TOLERANCE = 2.0**-20
 EASY = ("uniform", "mostly_hits")
 COSTLY = "subnormal_and_huge"  # for the checker, in double precision
+TOLERANCES = (0.0, np.nan, -1.0, 1e-300, 2.0**-38, 2.0**-20, 0.5, 1.0, 2.0, np.inf)
 
 
 @dataclass
@@ -151,16 +156,114 @@ def certify_exact(count, seed):
     return sums[-1]
 
 
+def user_kernel(point):
+    """A kernel that asks for first contacts, for one type of point, in this module as users have theirs."""
+
+    @wp.kernel(enable_backward=False)
+    def ask(
+        edges: bool,
+        x: wp.array2d[point],
+        tolerance: wp.float64,
+        status: wp.array[int],
+        localized: wp.array[int],
+        toi: wp.array[wp.float64],
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+    ):
+        i = wp.tid()
+        if edges:
+            contact = impact_edge_edge(
+                x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
+            )
+        else:
+            contact = impact_vertex_face(
+                x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
+            )
+        status[i] = contact.status
+        localized[i] = contact.localized
+        toi[i] = contact.toi
+        coordinates[i] = contact.coordinates
+        normal[i] = contact.normal
+
+    return ask
+
+
+USER_KERNELS = {np.float32: user_kernel(wp.vec3), np.float64: user_kernel(wp.vec3d)}
+
+
+def judge_user(kind, points, tolerance, interval):
+    """Compares what a user's kernel finds with the truth.
+
+    Args:
+        kind: "vertex_face" or "edge_edge".
+        points: Queries, shape [n, 8, 3].
+        tolerance: Any number.
+        interval: The doubles around each first contact, NaN where there is none, shape [n, 2].
+
+    Returns:
+        Numbers of queries: unsure, wrong, late, early, and with coordinates or a normal that are none.
+    """
+    n, dtype = len(points), points.dtype.type
+    x = wp.array(points, dtype=wp.vec3 if dtype is np.float32 else wp.vec3d)
+    outputs = [wp.zeros(n, dtype=t) for t in (int, int, wp.float64, wp.vec3d, wp.vec3d)]
+    wp.launch(USER_KERNELS[dtype], n, inputs=[kind == "edge_edge", x, tolerance], outputs=outputs)
+    status, localized, toi, coordinates, normal = (output.numpy() for output in outputs)
+    truth = ~np.isnan(interval[:, 0])
+    used = tolerance if tolerance > 2.0**-38 else 2.0**-38
+    found = status != 0
+    inside = (coordinates > -1e-14).all(axis=1) & (coordinates < 1.0 + 1e-14).all(axis=1)
+    if kind == "vertex_face":
+        inside &= np.abs(coordinates.sum(axis=1) - 1.0) < 1e-14
+    else:
+        inside &= coordinates[:, 2] == 0.0
+    inside &= np.abs(np.linalg.norm(normal, axis=1) - 1.0) < 1e-14
+    inside &= (toi >= 0.0) & (toi <= 1.0)
+    return np.array(
+        [
+            (status == 2).sum(),
+            ((status == 0) & truth).sum() + ((status == 1) & ~truth).sum() + ((status == 0) & (toi != 2.0)).sum(),
+            (truth & (toi > interval[:, 1])).sum(),
+            (truth & (localized == 1) & (toi < interval[:, 0] - used)).sum(),
+            (found & ~inside).sum(),
+        ]
+    )
+
+
+def certify_user(count, seed):
+    """Judges a user's kernel at every tolerance, prints a table and counts what is wrong."""
+    table = Table("Tolerance", box=box.SIMPLE_HEAD, padding=0, show_edge=False)
+    for column in ("Queries", "Unsure", "Wrong", "Late", "Early", "No contact"):
+        table.add_column(column, justify="right", no_wrap=True)
+    console = Console()
+    jobs = [(name, dtype) for name in GENERATORS for dtype in (np.float32, np.float64)]
+    sums = np.zeros((len(TOLERANCES), 5), dtype=int)
+    total = 0
+    for name, dtype in track(jobs, console=console, description="certifying"):
+        number = max(1, count // 50) if name == COSTLY else count
+        for kind in KINDS:
+            points = GENERATORS[name](np.random.default_rng([seed, *name.encode()]), number, kind, dtype)
+            interval = getattr(checker, f"{kind}_toi")(points)
+            total += number
+            sums += [judge_user(kind, points, tolerance, interval) for tolerance in TOLERANCES]
+    for tolerance, (unsure, *others) in zip(TOLERANCES, sums, strict=True):
+        table.add_row(f"{tolerance:.3g}", f"{total}", f"{unsure / total:.2%}", *map(str, others))
+    console.print(table)
+    failures = sums[:, 1:].sum()
+    console.print(f"{total * len(TOLERANCES)} queries, {failures} failures")
+    return failures
+
+
 def main():
     """Judges every generator and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=1000, help="queries for each generator, kind and type")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--method", choices=["all", "exact"], default="all")
+    parser.add_argument("--method", choices=["all", "exact", "user"], default="all")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    if arguments.method == "exact":
-        return 1 if certify_exact(arguments.count, arguments.seed) else 0
+    if arguments.method != "all":
+        certify = certify_exact if arguments.method == "exact" else certify_user
+        return 1 if certify(arguments.count, arguments.seed) else 0
     table = Table("Generator", box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     for column in ("Type", "Queries", "Colliding", "Unsure", "Wrong", "Late", "Early", "Float wrong"):
         table.add_column(column, justify="right", no_wrap=True)

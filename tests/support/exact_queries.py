@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
-from warp_bsc.kernels.exact.decision import decide_in
+from warp_bsc.kernels.exact.first_contact import decide_in
 from warp_bsc.kernels.exact.polygon import spread
 
 

@@ -11,7 +11,7 @@ from ..detection.narrow_phase import TOLERANCE
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from ..kernels.exact.decision import NONE, decide_in
+from ..kernels.exact.first_contact import NONE, decide_in
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity

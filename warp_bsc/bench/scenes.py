@@ -85,8 +85,8 @@ def paper_scenes() -> list[str]:
     for path in paths:
         if not path.exists():
             raise FileNotFoundError(
-                f"{path}: no such file: the paper's scenes come with a checkout of the project, where examples/"
-                f"example_{path.stem}.py makes this one; or name other scenes, such as cloth:20000"
+                f"{path}: no such file: the paper's scenes come with a checkout of the project, where "
+                f"examples/paper/example_{path.stem}.py makes this one; or name other scenes, such as cloth:20000"
             )
     return [str(path) for path in paths]
 

@@ -15,6 +15,9 @@ _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _NEAR = wp.constant(int(Count.NEAR))
 
 _CHUNK = wp.constant(16)
+_CHUNK_SLOTS = wp.constant(wp.int64(16))
+"""Slots of face pairs that a thread takes at once, in both types: Warp reads a constant that a kernel both converts and
+uses as it is before it is set."""
 
 _KERNEL = {"enable_backward": False, "module": "unique"}
 
@@ -54,7 +57,7 @@ def _pair_faces(
         if wanted:
             if slot == end:
                 slot = take_slots(count, 0, _CHUNK)
-                end = slot + wp.int64(_CHUNK)
+                end = slot + _CHUNK_SLOTS
             write(wp.vec2i(face, other), pairs, slot)
             slot += wp.int64(1)
     while slot < end:

@@ -12,9 +12,9 @@ import math
 import warp as wp
 
 from ..kernels.closest import contact_at
-from ..kernels.exact.decision import NONE, TOO_WIDE, decide_in
+from ..kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
-from ..kernels.motion import double, edge_edge_motion, vertex_face_motion
+from ..kernels.motion import double, relative_motion
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
@@ -32,17 +32,6 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 def _kernel(dtype, limbs):
     """The kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)
-
-    @wp.func
-    def motion_of(kind: int, x0: wp.array[dtype], x1: wp.array[dtype], v: wp.vec4i):
-        roundoff = wp.float64(0.0)
-        if kind == VERTEX_FACE:
-            return vertex_face_motion(
-                x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]], roundoff
-            )
-        return edge_edge_motion(
-            x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]], roundoff
-        )
 
     @wp.kernel(**_KERNEL)
     def decide_contacts(
@@ -97,7 +86,19 @@ def _kernel(dtype, limbs):
             if timed:
                 # where floating point has given up is a lower bound too
                 time = wp.max(time, toi[i])
-                at, direction = contact_at(motion_of(kind, x0, x1, v), time)
+                motion = relative_motion(
+                    kind,
+                    x0[v[0]],
+                    x0[v[1]],
+                    x0[v[2]],
+                    x0[v[3]],
+                    x1[v[0]],
+                    x1[v[1]],
+                    x1[v[2]],
+                    x1[v[3]],
+                    wp.float64(0.0),
+                )
+                at, direction = contact_at(motion, time)
                 localized[i] = True
                 toi[i] = time
                 coordinates[i] = at

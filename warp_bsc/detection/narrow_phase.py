@@ -19,10 +19,10 @@ from ..kernels.culling import (
     edge_edge_boxes_apart,
     vertex_face_boxes_apart,
 )
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
 from ..kernels.pipeline.queues import append, is_filled, take_slot
-from ..kernels.polynomials import coplanarity
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .exact_stage import launch_exact_stage
@@ -108,6 +108,7 @@ _OPEN = wp.constant(int(Count.OPEN))
 @functools.cache
 def _kernels(kind, dtype):
     """The kernels for one kind of pair and one type of position, each in a module of its own."""
+    number = VERTEX_FACE if kind == "vertex_face" else EDGE_EDGE
     motion_of = vertex_face_motion if kind == "vertex_face" else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if kind == "vertex_face" else edge_edge_boxes_apart
 
@@ -192,7 +193,7 @@ def _kernels(kind, dtype):
         pair = survivors[i]
         a0, b0, c0, d0 = four_points(x0, elements, pair)
         a1, b1, c1, d1 = four_points(x1, elements, pair)
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+        motion = relative_motion(number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         answer = classify(motion, coplanarity(motion))
         if answer != FREE:
             slot = take_slot(counts, _CONTACTS)
@@ -236,7 +237,7 @@ def _kernels(kind, dtype):
         if timed or answer != HIT:
             a0, b0, c0, d0 = four_points(x0, elements, pair)
             a1, b1, c1, d1 = four_points(x1, elements, pair)
-            motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            motion = relative_motion(number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             result = impact(motion, coplanarity(motion), answer, tolerance)
             answer = result.status
             status[i] = wp.int8(answer)
@@ -266,7 +267,7 @@ def _kernels(kind, dtype):
         i = wp.tid()
         a0, b0, c0, d0 = four_points(x0, elements, contacts[i])
         a1, b1, c1, d1 = four_points(x1, elements, contacts[i])
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+        motion = relative_motion(number, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         at, direction = contact_at(motion, toi[i])
         coordinates[i] = at
         normal[i] = direction

@@ -1,6 +1,6 @@
 """Draws one moment of each scene of the paper, side by side.
 
-    python examples/draw_scenes.py assets scenes.png
+    python examples/figures/scenes.py assets scenes.png
 
 Needs matplotlib (``pip install matplotlib``).
 """
@@ -18,24 +18,24 @@ from PIL import Image
 from warp_bsc.usd.scene import Scene
 
 PIXELS = 360
-"""Width and height of the picture of a scene; four times as many are computed."""
+"""Height of the picture of a scene; it is computed with twice as many along each side."""
 _CAPTION_PIXELS = 50
 _SHADOW_PIXELS = 1000
 _RIGID, _SMALL_PARTS = "#cfc6b8", "#4a4a4f"
 
 
 class View(NamedTuple):
-    """How a scene is drawn.
+    """The view of a scene.
 
     Attributes:
-        interval: Of the recording, whose start is drawn.
-        color: Of what deforms.
-        elevation: Of the eye [degrees].
-        azimuth: Of the eye [degrees].
-        centre: What is in the middle of the picture [m].
+        interval: Interval of the recording whose start is drawn.
+        color: Color of the largest deforming part.
+        elevation: Elevation of the eye [degrees].
+        azimuth: Azimuth of the eye [degrees].
+        centre: Position in the middle of the picture [m].
         extent: Height of the picture [m].
-        width: Of the picture, as a share of its height.
-        opened: Whether what is rigid is drawn only where it is behind the z axis.
+        width: Width of the picture over its height.
+        opened: Whether rigid meshes are drawn only behind the z axis.
     """
 
     interval: int
@@ -58,15 +58,15 @@ VIEWS = {
 
 
 def rasterise(corners, pixels):
-    """What of some triangles is in front.
+    """Returns which triangle is in front at each pixel.
 
     Args:
-        corners: In pixels, to the right and down, and the distance, shape [n, 3, 3].
+        corners: Corners of the triangles, to the right and down [pixels], and their distances, shape [n, 3, 3].
         pixels: Height and width of the picture.
 
     Returns:
-        Distance, infinite where there is nothing, and triangle, -1 there, of each pixel, shape ``pixels``, and the
-        pixel's barycentric coordinates, shape [*pixels, 3].
+        Distance and triangle of each pixel, shape ``pixels``, infinite and -1 where there is no triangle, and its
+        barycentric coordinates, shape [*pixels, 3].
     """
     depth, triangle = np.full(pixels, np.inf), np.full(pixels, -1)
     coordinates = np.zeros((*pixels, 3))
@@ -89,7 +89,7 @@ def rasterise(corners, pixels):
 
 
 def axes_of(elevation, azimuth):
-    """Directions to the right, down and away from an eye [degrees], the rows of a matrix."""
+    """Returns the directions to the right, down and away from an eye at angles [degrees], as rows of a matrix."""
     e, a = np.radians([elevation, azimuth])
     away = -np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
@@ -97,12 +97,12 @@ def axes_of(elevation, azimuth):
 
 
 def project(axes, points, view, extent, pixels):
-    """Points in pixels of a square picture."""
+    """Returns points in pixels of a square picture, and their distances from the eye."""
     return (points - view.centre) @ axes.T * (pixels / extent) + (0.5 * pixels, 0.5 * pixels, 0.0)
 
 
 def shade(x, faces, colors, view):
-    """A picture of triangles with light from the upper left and the shadows that they cast, shape [h, w, 3]."""
+    """Returns a picture of triangles with light from the upper left and shadows, shape [h, w, 3]."""
     normals = np.zeros_like(x)
     across = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
     np.add.at(normals, faces, across[:, None])
@@ -122,7 +122,7 @@ def shade(x, faces, colors, view):
     normal = (normals[corner] * weight).sum(axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     normal *= np.sign(normal @ -eye[2])[:, None]
-    # a little towards the lamp, so that what is lit does not shade itself
+    # a little towards the lamp, so that lit triangles do not shade themselves
     lifted = project(lamp, position - 6.0e-3 * extent * lamp[2], view, lamp_extent, _SHADOW_PIXELS)
     column, row = np.clip(np.round(lifted[:, :2]).astype(int), 0, _SHADOW_PIXELS - 1).T
     outside = ((lifted[:, :2] < 0.0) | (lifted[:, :2] >= _SHADOW_PIXELS)).any(axis=1)
@@ -139,7 +139,7 @@ def shade(x, faces, colors, view):
 
 
 def parts(faces, vertex_count):
-    """A number for each vertex, the same where faces join vertices."""
+    """Returns a number for each vertex, the same for all vertices that faces connect."""
     label = np.arange(vertex_count)
     while True:
         least = label[faces].min(axis=1)
@@ -152,7 +152,7 @@ def parts(faces, vertex_count):
 
 
 def picture_of(scene, view):
-    """The picture of a scene of which the first mesh deforms and all others are rigid."""
+    """Returns the picture of a scene, whose mesh named "triangles" deforms and whose other meshes are rigid."""
     segment, x, _ = scene.interval(view.interval)
     x, faces = x.astype(float), segment.faces
     soft = np.zeros(len(faces), dtype=bool)
@@ -168,7 +168,7 @@ def picture_of(scene, view):
 
 
 def main():
-    """Draws what the command line asks for."""
+    """Reads the command line, and draws the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="Where the recordings are, named after the scenes.")
     parser.add_argument("picture", help="File to write, .png.")

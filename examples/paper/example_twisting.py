@@ -1,23 +1,23 @@
 """Example Twisting: a cloth lies on a ball, which turns and winds it up, while the floor holds its corners back.
 
-    python examples/example_twisting.py
-    python examples/example_twisting.py --triangles 50000  # the largest of the paper, better on a GPU
-    python examples/example_twisting.py --no-ccd           # the cloth falls through ball and floor
+    python examples/paper/example_twisting.py
+    python examples/paper/example_twisting.py --triangles 50000  # the largest of the paper, better on a GPU
+    python examples/paper/example_twisting.py --no-ccd           # the cloth falls through ball and floor
 
-The first benchmark of the paper. Nothing but friction carries the cloth: the solver knows no contacts, the stage does.
+The first benchmark of the paper. Only friction carries the cloth, all of it from the collision stage: the
+inner solver has no contacts.
 """
 
 import math
 
 import numpy as np
 import warp as wp
-from common import main
-from paper_scene import PaperScene, add_collider, add_square_cloth, lathe
+from paper_scene import PaperScene, add_collider, add_square_cloth, lathe, main
 
 SIZE = 2.3  # m, of the cloth
 RADIUS = 0.3  # m, of the ball
 HEIGHT = 0.38  # m, of its centre above the floor
-START, RAMP = 0.5, 0.5  # s, when the ball begins to turn, and until it has its speed
+START, RAMP = 0.5, 0.5  # s, when the ball begins to turn, and how long it takes to reach its speed
 SPEED = wp.constant(4.0)  # rad/s
 START_TIME, RAMP_TIME = wp.constant(START), wp.constant(RAMP)
 CENTRE = wp.constant(wp.vec3(0.0, 0.0, HEIGHT))
@@ -27,7 +27,7 @@ CENTRE = wp.constant(wp.vec3(0.0, 0.0, HEIGHT))
 def turn_ball(time: wp.array[float], body_q: wp.array[wp.transform]):
     """Turns the ball about the upright axis."""
     t = wp.max(time[0] - START_TIME, 0.0)
-    # the speed grows evenly, then stays
+    # the speed grows linearly, then stays
     angle = SPEED * wp.where(t < RAMP_TIME, 0.5 * t * t / RAMP_TIME, t - 0.5 * RAMP_TIME)
     body_q[0] = wp.transform(CENTRE, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
 
@@ -36,8 +36,7 @@ class Example(PaperScene):
     """The scene, in the format of Newton's examples."""
 
     triangles = 5000
-    frames = 150
-    sim_substeps = 4
+    num_frames = 150
     motion = turn_ball
     camera = (wp.vec3(1.5, -1.5, 1.1), -25.0, 135.0)
 
@@ -54,11 +53,11 @@ class Example(PaperScene):
         self.cells = add_square_cloth(builder, triangles, SIZE, HEIGHT + RADIUS + 0.01)
 
     def measure(self):
-        """How far the cloth is twisted, and how much of it is below the floor."""
+        """Returns how far the cloth is twisted, and how high and low it reaches."""
         q = self.positions()
         grid = q.reshape(self.cells + 1, self.cells + 1, 3)
         middle, corners = self.cells // 2, []
-        first = round(0.15 * self.cells)  # so many cells from the pole the angle is told well enough
+        first = round(0.15 * self.cells)  # closer to the pole the angle is too inaccurate
         for i in (-1, 1):
             for j in (-1, 1):
                 steps = np.arange(first, min(middle, self.cells - middle) + 1)
@@ -72,7 +71,7 @@ class Example(PaperScene):
         }
 
     def test_scene(self, measured):
-        """The cloth is on the ball and above the floor, and twisted."""
+        """Checks that the cloth is on the ball and above the floor, and twisted."""
         twist, top, lowest = measured.values()
         assert HEIGHT + RADIUS - 0.01 < top < HEIGHT + RADIUS + 0.1, f"the top of the cloth is at {top} m"
         assert lowest > 0.0, f"the cloth is at {lowest} m, below the floor"

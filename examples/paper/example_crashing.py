@@ -1,12 +1,13 @@
 """Example Crashing: the hollow body of a car, with a thin wall of tetrahedra, runs into a rigid wall.
 
-    python examples/example_crashing.py
-    python examples/example_crashing.py --triangles 1100000  # as in the paper, needs a GPU
-    python examples/example_crashing.py --no-ccd             # the car passes through the wall and itself
+    python examples/paper/example_crashing.py
+    python examples/paper/example_crashing.py --triangles 1100000  # as in the paper, needs a GPU
+    python examples/paper/example_crashing.py --no-ccd             # the car passes through the wall and itself
 
 The fifth benchmark of the paper. The wall of the body, of a rubber that is too soft to stop it early, is one layer of
-tetrahedra thick; hood, front and floor fold up onto each other, and the wheels are pressed into the body. Nothing but
-the stage stops the car and keeps its folds apart. It lasts a tenth of a second, in which gravity does not matter.
+tetrahedra thick; hood, front and floor fold up onto each other, and the wheels are pressed into the body. Only the
+collision stage stops the car and keeps its folds apart. The crash lasts a tenth of a second, in which gravity does not
+matter.
 """
 
 import math
@@ -14,12 +15,11 @@ import math
 import newton
 import numpy as np
 import warp as wp
-from common import main
-from paper_scene import PaperScene, add_collider
+from paper_scene import PaperScene, add_collider, main
 
 LENGTH, HALF_WIDTH, FLOOR = 4.2, 0.86, 0.25  # m
 ROOF = [(0.0, 0.68), (0.04, 0.78), (0.26, 0.88), (0.41, 1.36), (0.5, 1.4), (0.7, 1.38), (0.85, 0.98), (1.0, 0.92)]
-"""Where along the body, from 0 to 1, its upper side has which height [m]."""
+"""Profile of the upper side of the body: position along it, from 0 to 1, and height [m]."""
 BELT = 0.9  # m, above which the cabin is narrower
 THICKNESS = 0.02  # m, of the wall of the body
 WHEELS = [(0.19, 1.0), (0.19, -1.0), (0.8, 1.0), (0.8, -1.0)]  # where along the body, and on which side
@@ -35,7 +35,7 @@ class Example(PaperScene):
     """The scene, in the format of Newton's examples."""
 
     triangles = 14000
-    frames = 60
+    num_frames = 60
     fps = 500
     sim_substeps = 8
     iterations = 5
@@ -43,13 +43,13 @@ class Example(PaperScene):
     camera = (wp.vec3(-2.0, -5.0, 2.2), -15.0, 65.0)
 
     def count_substeps(self, triangles):
-        """Steps a frame: the stage corrects only what the solver did, so that sound should pass no more than a cell."""
+        """Returns the steps per frame: sound should pass at most one cell a step, as contacts come after the solver."""
         sound = math.sqrt(3.0 * STIFFNESS / DENSITY)
         return max(self.sim_substeps, 2 * math.ceil(0.5 * self.frame_dt * sound / size_cell(triangles)))
 
     def build(self, builder, triangles):
         """Adds the wall, the body and the wheels."""
-        # a box through whose front the car comes
+        # the wall is a box, whose front the car hits
         corners = np.array([[x, y, z] for x in (-0.3, 0.0) for y in (-1.4, 1.4) for z in (0.0, 1.8)])
         sides = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
         add_collider(builder, -1, corners, [*sides, [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], 0.3)
@@ -63,44 +63,44 @@ class Example(PaperScene):
             add_shell(builder, vertices + centre, tets)
 
     def measure(self):
-        """How much of the car is left."""
+        """Returns how far the car is crushed."""
         q, rest = self.positions(), self.model.particle_q.numpy().astype(np.float64)
         corners = q[self.model.tet_indices.numpy()]
         volumes = np.linalg.det(corners[:, 1:] - corners[:, :1])
         rear = q[:, 0] > q[:, 0].max() - 0.5
         return {
-            "length of the car, of that before": np.ptp(q[:, 0]) / np.ptp(rest[:, 0]),
+            "length of the car over that before": np.ptp(q[:, 0]) / np.ptp(rest[:, 0]),
             "distance to the wall [m]": q[:, 0].min(),
             "speed of its rear [m/s]": -self.state_0.particle_qd.numpy()[rear, 0].mean(),
             "share of the tetrahedra that are inverted": (volumes <= 0.0).mean(),
         }
 
     def test_scene(self, measured):
-        """The car is crushed before the wall."""
+        """Checks that the car is crushed in front of the wall."""
         length, distance, *_ = measured.values()
         assert length < 0.75, f"the car has {length:.1%} of its length"
         assert 0.0 < distance < 0.05, f"the car is {distance} m from the wall"
 
 
 def size_cell(triangles):
-    """Length of a cell [m], which has two triangles outside and two inside."""
+    """Returns the width of a cell [m], which has two triangles outside and two inside."""
     return math.sqrt(4.0 * AREA / triangles)
 
 
 def count_cells(lengths, cell):
-    """How many cells of a length [m] there are along each side of a box, at least 2."""
+    """Returns the number of cells of a width [m] along each side of a box, at least 2."""
     return [max(round(length / cell), 2) for length in lengths]
 
 
 def shell(cells, at, openings=None):
-    """The wall of a hollow box that is bent into a shape, as tetrahedra.
+    """Returns the wall of a hollow box, bent into a shape, as tetrahedra.
 
     Args:
-        cells: How many along each side of the box, shape [3].
-        at: Function that bends: parameters in [-1, 1] and how far inside the surface they are [m], both for
-            many points, to positions [m].
-        openings: Function of the corners of cells [m], shape [n, 4, 3], and of the parameters of their centres, shape
-            [n, 3]: where there is no wall.
+        cells: Number of cells along each side of the box, shape [3].
+        at: Function that bends the box: takes parameters in [-1, 1], shape [n, 3], and a depth below the surface [m],
+            and returns positions [m].
+        openings: Function that says where there is no wall: takes corners of cells [m], shape [n, 4, 3], and
+            parameters of their centres, shape [n, 3].
 
     Returns:
         Positions [m], shape [n, 3], and tetrahedra, shape [m, 4].
@@ -135,7 +135,7 @@ def shell(cells, at, openings=None):
 
 
 def body_at(parameters, depth):
-    """Positions on the body of the car, or so far inside [m], see :func:`shell`."""
+    """Returns positions on the body of the car, or ``depth`` [m] inside, see :func:`shell`."""
     u, v, w = np.moveaxis(parameters, -1, 0)
     u, v = (1.0 - 2.0 * depth / LENGTH) * u, (1.0 - depth / HALF_WIDTH) * v
     along = 0.5 * (u + 1.0)
@@ -150,7 +150,7 @@ def body_at(parameters, depth):
 
 
 def body_openings(corners, centres):
-    """Windows and wheel arches."""
+    """Returns which cells are in windows or wheel arches."""
     along, v, w = 0.5 * (centres[:, 0] + 1.0), np.abs(centres[:, 1]), 0.5 * (centres[:, 2] + 1.0)
     side, top, bottom = v == 1.0, w == 1.0, w == 0.0
     cabin = ((along > 0.37) & (along < 0.54)) | ((along > 0.575) & (along < 0.74))
@@ -166,9 +166,9 @@ def body_openings(corners, centres):
 
 
 def wheel_at(parameters, depth):
-    """Positions on a wheel, or so far inside [m], see :func:`shell`."""
+    """Returns positions on a wheel, or ``depth`` [m] inside, see :func:`shell`."""
     u, v, w = np.moveaxis(parameters, -1, 0)
-    # squares become circles of the same perimeter of the square, all rays staying
+    # squares become circles: points on a square keep their share of its perimeter
     largest = np.maximum(np.abs(u), np.abs(w))
     angle = np.where(np.abs(u) >= np.abs(w), 0.25 * np.pi * w / np.where(u == 0.0, 1.0, u), 0.0)
     other = 0.5 * np.pi - 0.25 * np.pi * u / np.where(w == 0.0, 1.0, w)
@@ -182,12 +182,12 @@ def wheel_at(parameters, depth):
 def add_shell(builder, vertices, tets):
     """Adds a body of tetrahedra that runs towards the wall.
 
-    The same as ``builder.add_soft_mesh``, which adds one tetrahedron at a time: minutes for two million of them.
+    It is equivalent to ``builder.add_soft_mesh``, which takes minutes for two million tetrahedra.
 
     Args:
         builder: The builder.
         vertices: Positions [m], shape [n, 3].
-        tets: Vertices of the tetrahedra, of positive volume, shape [m, 4].
+        tets: Vertices of the tetrahedra, whose volumes are positive, shape [m, 4].
     """
     sides = np.swapaxes(vertices[tets[:, 1:]] - vertices[tets[:, :1]], 1, 2)  # in columns
     mass = np.zeros(len(vertices))

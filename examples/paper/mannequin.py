@@ -24,20 +24,20 @@ ARM = [  # path [m] and radius of the left one, over the head
     *[((0.39, 0.0, 1.56), 0.036), ((0.39, 0.0, 1.64), 0.034), ((0.34, 0.0, 1.74), 0.03), ((0.27, 0.0, 1.83), 0.024)],
     *[((0.2, 0.0, 1.89), 0.03), ((0.15, 0.0, 1.92), 0.014)],
 ]
-SETTLING, RAMP = wp.constant(0.3), wp.constant(0.5)  # s, before the dance, and until it is in full swing
+SETTLING, RAMP = wp.constant(0.3), wp.constant(0.5)  # s, rest before the dance, and time until it is in full swing
 
 
 @wp.kernel(enable_backward=False)
 def dance(time: wp.array[float], rate: float, turn: float, sway: float, stride: float, body_q: wp.array[wp.transform]):
-    """Writes where trunk and legs are.
+    """Writes the poses of trunk and legs.
 
     Args:
         time: One clock [s].
-        rate: Turns to and fro a second.
-        turn: How far the trunk turns [rad], to each side.
-        sway: How far it goes [m], to each side.
-        stride: How far each leg swings [rad], to the front and to the back.
-        body_q: Trunk, and left and right leg if there are any.
+        rate: Turns to and fro per second [Hz].
+        turn: Angle that the trunk turns to each side [rad].
+        sway: Distance that it moves to each side [m].
+        stride: Angle that each leg swings to the front and to the back [rad].
+        body_q: Poses of the trunk and, if there are any, of the left and right leg.
     """
     t = wp.max(time[0] - SETTLING, 0.0)
     ease = wp.clamp(t / RAMP, 0.0, 1.0)
@@ -54,7 +54,7 @@ def dance(time: wp.array[float], rate: float, turn: float, sway: float, stride: 
 
 
 def tube(path, segments=16):
-    """A closed tube along points (position, radius) in the plane of x and z: positions and faces."""
+    """Returns positions and faces of a closed tube along points (position, radius) in the plane of x and z."""
     centre = np.array([point for point, _ in path])
     radius = np.array([radius for _, radius in path])
     along = np.gradient(centre, axis=0)
@@ -73,7 +73,7 @@ def tube(path, segments=16):
 
 
 def add_mannequin(builder, friction, below):
-    """Adds the trunk, with head and arms, and what is below it, as the first bodies of the model, for :func:`dance`.
+    """Adds the trunk with head and arms, and legs or a petticoat, as the first bodies of the model, for :func:`dance`.
 
     Args:
         builder: The builder.

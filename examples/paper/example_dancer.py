@@ -1,20 +1,19 @@
 """Example Dancer: a wide skirt swings around a dancer who turns to and fro and steps.
 
-    python examples/example_dancer.py
-    python examples/example_dancer.py --triangles 10000  # the largest of the paper
-    python examples/example_dancer.py --no-ccd           # the skirt passes through the dancer and itself
+    python examples/paper/example_dancer.py
+    python examples/paper/example_dancer.py --triangles 10000  # the largest of the paper
+    python examples/paper/example_dancer.py --no-ccd           # the skirt passes through the dancer and itself
 
-The third benchmark of the paper. The waist of the skirt is fastened to the dancer; nothing but the stage keeps the rest
-off the body, and its folds apart.
+The third benchmark of the paper. The waist of the skirt is fastened to the dancer; only the collision stage keeps the
+rest off the body, and its folds apart.
 """
 
 import math
 
 import numpy as np
 import warp as wp
-from common import main
 from mannequin import FLATNESS, WAIST_HEIGHT, WAIST_RADIUS, add_mannequin, dance
-from paper_scene import PaperScene, add_cloth, grid_faces
+from paper_scene import PaperScene, add_cloth, grid_faces, main
 
 LENGTH = 0.58  # m, of the skirt
 FLARE = math.radians(72.0)  # between the axis and the skirt at rest, a wide cone
@@ -25,7 +24,7 @@ class Example(PaperScene):
     """The scene, in the format of Newton's examples."""
 
     triangles = 5000
-    frames = 120
+    num_frames = 120
     motion = dance
     motion_inputs = (0.9, 1.3, 0.08, 0.45)  # rate, turn, sway and stride
     camera = (wp.vec3(1.5, -1.9, 1.2), -8.0, 128.0)
@@ -45,7 +44,7 @@ class Example(PaperScene):
         self.carried = range(columns)
 
     def measure(self):
-        """How the skirt hangs, and how much its hem is folded."""
+        """Returns how low the skirt hangs, and how much its hem is folded."""
         q = self.positions()
         hem = q[self.hem]
         angle = np.unwrap(np.arctan2(hem[:, 1], hem[:, 0]))
@@ -57,7 +56,7 @@ class Example(PaperScene):
         }
 
     def test_scene(self, measured):
-        """The skirt hangs from the waist, around the legs, in folds."""
+        """Checks that the skirt hangs from the waist, around the legs, in folds."""
         hem, lowest, back = measured.values()
         assert lowest > WAIST_HEIGHT - LENGTH - 0.05, f"the skirt hangs down to {lowest} m"
         assert hem < WAIST_HEIGHT - 0.2, f"the hem is at {hem} m"

@@ -1,29 +1,39 @@
-"""What the five scenes of the paper share: options, a solver that moves what is driven, the loop, and the last test.
+"""Base of the five scenes of the paper: options, a solver that moves bodies, checks, and parts to build scenes from.
 
-A scene is a class ``Example`` that derives from :class:`PaperScene` and says in ``build`` what is there, in ``motion``
-how its bodies move, and in ``measure`` and ``test_scene`` what should have come of it.
+A scene is a class ``Example`` that derives from :class:`PaperScene`: ``build`` adds its parts, ``motion`` moves its
+bodies, ``measure`` and ``test_scene`` say what it should have become.
 """
 
-import argparse
 import math
+import sys
+from pathlib import Path
 
 import newton
-import newton.examples
 import numpy as np
 import warp as wp
 
-import warp_bsc as bsc
+sys.path.append(str(Path(__file__).parents[1]))  # for common.py, whichever script of this folder runs
+from common import ExampleBase, create_parser, main
 
-__all__ = ["PaperScene", "SolverDrivenVBD", "add_cloth", "add_collider", "add_square_cloth", "grid_faces", "lathe"]
+__all__ = [
+    "PaperScene",
+    "SolverDrivenVBD",
+    "add_cloth",
+    "add_collider",
+    "add_square_cloth",
+    "grid_faces",
+    "lathe",
+    "main",
+]
 
 FEWEST_TRIANGLES = 1000
 RECORDED_FPS = 60
-"""Frames a second of a recording: where a scene has more, it is shown in slow motion."""
+"""Frames per second of a recording; a scene that has more is shown in slow motion."""
 
 
 @wp.kernel(enable_backward=False)
 def advance(dt: float, time: wp.array[float]):
-    """Advances the clock, which is on the device because a CUDA graph repeats the same launches."""
+    """Advances the clock; it is on the device because a CUDA graph repeats the same launches."""
     time[0] = time[0] + dt
 
 
@@ -35,26 +45,26 @@ def carry(
     body_q: wp.array[wp.transform],
     particle_q: wp.array[wp.vec3],
 ):
-    """Puts the particles that are fastened to the first body to where it is."""
+    """Moves the particles that are fastened to the first body with it."""
     particle = carried[wp.tid()]
     local = wp.transform_point(wp.transform_inverse(rest_body_q[0]), rest[particle])
     particle_q[particle] = wp.transform_point(body_q[0], local)
 
 
 class SolverDrivenVBD(newton.solvers.SolverVBD):
-    """VBD that also moves bodies and what is fastened to them, as a part of the step that the stage sees as a whole."""
+    """VBD that also moves bodies and particles fastened to them, so that the stage detects their collisions, too."""
 
     def __init__(self, model, motion, motion_inputs, carried, **options):
-        """Fastens particles.
+        """Fastens particles to the first body.
 
         Args:
             model: The model.
             motion: Kernel that writes the poses of all bodies at a time: ``time``, its inputs, ``body_q``; or None.
-            motion_inputs: Its inputs.
+            motion_inputs: Inputs of the kernel.
             carried: Particles that move with the first body, int, shape [n].
             options: As for VBD.
         """
-        # it leaves the bodies to others, so that both states keep the poses that they are given
+        # VBD itself does not move the bodies: both states keep the poses that ``motion`` writes
         super().__init__(
             model, particle_enable_self_contact=False, integrate_with_external_rigid_solver=True, **options
         )
@@ -63,7 +73,7 @@ class SolverDrivenVBD(newton.solvers.SolverVBD):
         self.time = wp.zeros(1, dtype=float, device=model.device)
 
     def step(self, state_in, state_out, control, contacts, dt, **options):
-        """Moves what is driven, and steps the rest."""
+        """Moves the bodies and the particles fastened to them, and steps the others."""
         device = self.model.device
         wp.launch(advance, 1, inputs=[dt], outputs=[self.time], device=device)
         if self.motion:
@@ -75,26 +85,22 @@ class SolverDrivenVBD(newton.solvers.SolverVBD):
         super().step(state_in, state_out, control, contacts, dt, **options)
 
 
-class PaperScene:
-    """A scene, in the format of Newton's examples.
+class PaperScene(ExampleBase):
+    """A scene of the paper, in the format of Newton's examples.
 
     Attributes:
         triangles: Default of ``--triangles``.
-        frames: Default of ``--num-frames``.
-        fps: Frames a second.
-        sim_substeps: Steps a frame of a mesh as large as the default, see :meth:`count_substeps`.
-        iterations: Of VBD.
+        sim_substeps: Steps per frame at the default number of triangles, see :meth:`count_substeps`.
+        iterations: Iterations of VBD.
         gravity: Acceleration [m/s^2].
         camera: Position [m], pitch and yaw [degrees].
         motion: Kernel that moves the bodies, see :class:`SolverDrivenVBD`.
-        motion_inputs: What it takes.
+        motion_inputs: Inputs of the kernel.
         carried: Particles that move with the first body.
     """
 
     triangles = 5000
-    frames = 120
-    fps = 60
-    sim_substeps = 4
+    num_frames = 120
     iterations = 10
     gravity = (0.0, 0.0, -9.81)
     camera = (wp.vec3(1.6, -1.6, 1.0), -20.0, 135.0)
@@ -105,95 +111,31 @@ class PaperScene:
     def __init__(self, viewer, args):
         if args.triangles < FEWEST_TRIANGLES:
             raise ValueError(f"--triangles must be at least {FEWEST_TRIANGLES}, not {args.triangles}")
-        self.viewer = viewer
-        self.ccd = args.ccd
         self.frame_dt = 1.0 / self.fps
         self.sim_substeps = self.count_substeps(args.triangles)
-        self.sim_dt = self.frame_dt / self.sim_substeps
-        self.sim_time = 0.0
-        self.frame = 0
-        self.graph = None
+        super().__init__(viewer, args)
 
         builder = newton.ModelBuilder(gravity=self.gravity)
         self.build(builder, args.triangles)
         for particle in self.carried:
             builder.particle_flags[particle] &= ~int(newton.ParticleFlags.ACTIVE)
         builder.color()
-        self.model = builder.finalize()
-        self.solver = SolverDrivenVBD(
-            self.model, self.motion, self.motion_inputs, self.carried, iterations=self.iterations
-        )
-        if self.ccd:
-            self.solver = bsc.SolverCCD(self.solver)
-        self.state_0, self.state_1 = self.model.state(), self.model.state()
-        self.control = self.model.control()
-        self.saved_state, self.saved_time = self.model.state(), wp.clone(self.solver.time)
-        self.taken_back = 0
-
-        self.viewer.set_model(self.model)
-        position, pitch, yaw = self.camera
-        self.viewer.set_camera(pos=position, pitch=pitch, yaw=yaw)
+        model = builder.finalize()
+        solver = SolverDrivenVBD(model, self.motion, self.motion_inputs, self.carried, iterations=self.iterations)
+        self.start(model, solver, self.camera, clocks=[solver.time])
 
     def count_substeps(self, triangles):
-        """Steps a frame of a mesh of about so many triangles; even, so that a CUDA graph ends where it began.
+        """Returns the steps per frame of a mesh of about ``triangles`` triangles, an even number.
 
-        The solver carries forces over so many cells a step: where these are smaller, steps are shorter in proportion.
-        Cloth would else be stretched by its weight.
+        The solver carries forces over a fixed number of cells per step, so that smaller cells need shorter steps:
+        otherwise cloth stretches under its weight.
         """
         finer = max(math.sqrt(triangles / self.triangles), 1.0)
         return 2 * math.ceil(0.5 * self.sim_substeps * finer)
 
     def build(self, builder, triangles):
-        """Adds what there is, of about so many triangles."""
+        """Adds the parts of the scene, whose deforming meshes have about ``triangles`` triangles."""
         raise NotImplementedError
-
-    def simulate(self):
-        """Simulates a frame."""
-        for _ in range(self.sim_substeps):
-            self.state_0.clear_forces()
-            self.viewer.apply_forces(self.state_0)
-            self.solver.step(self.state_0, self.state_1, self.control, None, self.sim_dt)
-            self.state_0, self.state_1 = self.state_1, self.state_0
-
-    def step(self):
-        """Simulates a frame, on a GPU from a graph.
-
-        In a graph the stage's queues cannot grow. Where they were too small, the frame is simulated again without,
-        which makes them larger, and captured anew.
-        """
-        if not self.launch_graph():
-            self.simulate()
-            self.capture()
-        self.frame += 1
-        self.sim_time += self.frame_dt
-
-    def capture(self):
-        """Captures a frame on a GPU."""
-        self.graph = None
-        if self.model.device.is_cuda:
-            with wp.ScopedCapture() as capture:
-                self.simulate()
-            self.graph = capture.graph
-
-    def launch_graph(self):
-        """Simulates a frame from the graph; returns whether there is one, and all of its steps are certified."""
-        if self.graph is None:
-            return False
-        self.saved_state.assign(self.state_0)
-        wp.copy(self.saved_time, self.solver.time)
-        uncertified = self.count_uncertified()
-        wp.capture_launch(self.graph)
-        uncertified = self.count_uncertified() - uncertified
-        if uncertified == 0:
-            return True
-        self.state_0.assign(self.saved_state)
-        wp.copy(self.solver.time, self.saved_time)
-        self.taken_back += uncertified
-        return False
-
-    def count_uncertified(self):
-        """Steps that were not certified, those that were taken back included."""
-        return self.solver.report.uncertified_steps if self.ccd else 0
 
     def render(self):
         """Shows the frame."""
@@ -202,60 +144,46 @@ class PaperScene:
         self.viewer.end_frame()
 
     def positions(self):
-        """Positions of the particles now [m], float64, shape [n, 3]."""
+        """Returns the positions of the particles [m], float64, shape [n, 3]."""
         return self.state_0.particle_q.numpy().astype(np.float64)
 
-    def find_intersections(self):
-        """Edges and faces of what deforms that cross now."""
-        mesh = bsc.CollisionMesh(self.model.tri_indices.numpy(), self.model.particle_count, device=self.model.device)
-        return bsc.CollisionDetector(mesh).find_intersections(self.state_0.particle_q)
-
     def measure(self):
-        """What has come of the scene, a number for each name."""
+        """Returns quantities that show what the scene has become, by name."""
         raise NotImplementedError
 
     def test_scene(self, measured):
-        """The scene is what it is called."""
+        """Checks that the scene has become what its name says, by its measured quantities."""
         raise NotImplementedError
 
     def test_final(self):
-        """The scene is what it is called, and the stage kept its promise."""
-        if self.ccd:
-            report = self.solver.report
-            uncertified = self.count_uncertified() - self.taken_back
-            assert uncertified == 0, f"{uncertified} steps are not certified"
-            assert len(report.intersections) == 0, f"{len(report.intersections)} edges cross faces"
+        """Checks that all steps are certified, nothing intersects, and the scene has become what its name says."""
+        super().test_final()
         assert np.isfinite(self.positions()).all(), "positions are not finite"
         intersections = self.find_intersections()
-        assert len(intersections) == 0, f"{len(intersections)} edges of what deforms cross faces of it"
+        assert len(intersections) == 0, f"{len(intersections)} edges of deforming meshes cross their faces"
         self.test_scene(self.measure())
 
     def print_report(self):
-        """Prints what the stage did, and what came of it."""
+        """Prints what the stage did, and what the scene has become."""
         print(f"{self.model.tri_count} triangles, {self.frame} frames of {self.sim_substeps} steps")
-        if self.ccd:
-            print(f"{self.solver.report}, {self.taken_back} of which were taken back")
+        super().print_report()
         for name, value in self.measure().items():
             print(f"{name}: {value:.3f}")
 
     @classmethod
     def create_parser(cls):
-        """The options."""
-        parser = newton.examples.create_parser()
-        parser.set_defaults(num_frames=cls.frames)
+        """Returns the options."""
+        parser = create_parser(cls.num_frames)
         parser.add_argument("--triangles", type=int, default=cls.triangles, help="About how many triangles.")
-        parser.add_argument(
-            "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind it."
-        )
         return parser
 
 
 def add_collider(builder, body, vertices, faces, friction):
-    """Adds a rigid mesh, which recordings contain as the triangles that they are.
+    """Adds a rigid mesh; recordings contain its triangles as they are.
 
     Args:
         builder: The builder.
-        body: The body that it moves with, -1 for none.
+        body: Body that the mesh moves with, -1 for none.
         vertices: Positions [m], shape [n, 3].
         faces: Shape [m, 3].
         friction: Coefficient.
@@ -271,11 +199,11 @@ def add_square_cloth(builder, triangles, size, height):
     Args:
         builder: The builder.
         triangles: About how many.
-        size: Of a side [m].
-        height: Where it is [m].
+        size: Length of a side [m].
+        height: Height of the cloth [m].
 
     Returns:
-        Cells along a side; rows of particles follow each other.
+        Number of cells along a side. Particles are stored row by row.
     """
     cells = max(round(math.sqrt(0.5 * triangles)), 8)
     side = size * (np.arange(cells + 1) / cells - 0.5)
@@ -291,7 +219,7 @@ def add_cloth(builder, vertices, faces, *, bending=1.0e-4):
         builder: The builder.
         vertices: Positions at rest [m], shape [..., 3].
         faces: Shape [n, 3].
-        bending: Stiffness of the edges against it [J].
+        bending: Bending stiffness of the edges [J].
     """
     builder.add_cloth_mesh(
         pos=wp.vec3(),
@@ -311,15 +239,15 @@ def add_cloth(builder, vertices, faces, *, bending=1.0e-4):
 
 
 def grid_faces(rows, columns, *, around=False):
-    """Faces of a grid of vertices, row after row, each cell cut along alternating diagonals.
+    """Returns the faces of a grid of vertices stored row by row, its cells cut along alternating diagonals.
 
     Args:
         rows: Vertices in a column.
         columns: Vertices in a row.
-        around: Whether rows are closed.
+        around: Whether the last vertex of a row is joined to its first.
 
     Returns:
-        Shape [n, 3].
+        Vertices of the faces, shape [n, 3].
     """
     vertex = np.arange(rows * columns).reshape(rows, columns)
     if around:
@@ -332,7 +260,7 @@ def grid_faces(rows, columns, *, around=False):
 
 
 def lathe(profile, segments):
-    """Turns a profile around the z axis.
+    """Returns the surface of revolution of a profile about the z axis.
 
     Args:
         profile: Radius and height [m] from bottom to top, the first and last radius 0 where the surface is closed,

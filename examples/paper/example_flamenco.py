@@ -1,11 +1,11 @@
 """Example Flamenco: a long dress with four layers of ruffles swings around a dancer.
 
-    python examples/example_flamenco.py
-    python examples/example_flamenco.py --triangles 49000  # as in the paper, better on a GPU
-    python examples/example_flamenco.py --no-ccd           # the layers pass through each other and the dancer
+    python examples/paper/example_flamenco.py
+    python examples/paper/example_flamenco.py --triangles 49000  # as in the paper, better on a GPU
+    python examples/paper/example_flamenco.py --no-ccd           # the layers pass through each other and the dancer
 
 The benchmark of the paper with a flamenco dancer. The skirt is fastened at the waist, each ruffle is sewn to it at
-every second vertex of its upper border, and lies over the next one below. Nothing but the stage keeps all of them
+every second vertex of its upper border, and lies over the next one below. Only the collision stage keeps all of them
 apart.
 """
 
@@ -14,24 +14,23 @@ from itertools import pairwise
 
 import numpy as np
 import warp as wp
-from common import main
 from mannequin import FLATNESS, WAIST_HEIGHT, WAIST_RADIUS, add_mannequin, dance
-from paper_scene import PaperScene, add_cloth, grid_faces
+from paper_scene import PaperScene, add_cloth, grid_faces, main
 
 SKIRT = [(0.2, 0.42), (0.45, 0.31), (0.7, 0.23), (0.93, 0.182), (WAIST_HEIGHT, WAIST_RADIUS)]  # height and radius [m]
 SEAMS = [0.7, 0.56, 0.42, 0.28]  # m, heights of the upper borders of the ruffles
 RUFFLE = 0.165  # m, height of a ruffle
 GAP, BULGE, WAVE = 0.006, 0.025, 0.028  # m, of a ruffle off the skirt at the seam, more at its hem, and waves there
 WAVES = 16  # around
-COLUMNS, CELL = 64, 0.0375  # around the skirt, and height of its cells [m], at the size of which there are
-COARSE_TRIANGLES = 7168  # triangles
+COLUMNS, CELL = 64, 0.0375  # around the skirt, and height of its cells [m], of a dress of COARSE_TRIANGLES
+COARSE_TRIANGLES = 7168
 
 
 class Example(PaperScene):
     """The scene, in the format of Newton's examples."""
 
     triangles = 8500
-    frames = 90
+    num_frames = 90
     motion = dance
     motion_inputs = (1.3, 1.1, 0.15, 0.0)  # rate, turn, sway and stride
     camera = (wp.vec3(1.6, -2.2, 1.1), -8.0, 126.0)
@@ -72,7 +71,7 @@ class Example(PaperScene):
         self.carried = range(columns)
 
     def measure(self):
-        """How the ruffles hang and swing."""
+        """Returns how the ruffles hang and swing."""
         q = self.positions()
         lengths = []
         for hem in self.hems:
@@ -81,14 +80,14 @@ class Example(PaperScene):
             lengths.append(length / np.linalg.norm(np.ptp(ring[:, :2], axis=0)) * math.sqrt(2.0) / math.pi)
         heights = [q[hem, 2].mean() for hem in self.hems]
         return {
-            "length of the hems, of that of circles of their width": min(lengths),
+            "length of the shortest hem over that of a circle of its width": min(lengths),
             "smallest distance between the heights of two hems [m]": -np.diff(heights).max(),
             "lowest particle [m]": q[:, 2].min(),
             "mean speed [m/s]": np.linalg.norm(self.state_0.particle_qd.numpy(), axis=1).mean(),
         }
 
     def test_scene(self, measured):
-        """The ruffles hang in layers, all wavy, and swing."""
+        """Checks that the ruffles hang in layers, all wavy, and swing."""
         length, distance, lowest, speed = measured.values()
         assert length > 1.2, f"a hem is {length} times as long as a circle of its width"
         assert distance > 0.05, f"two hems are {distance} m from each other in height"
@@ -97,7 +96,7 @@ class Example(PaperScene):
 
 
 def revolve(height, offset, columns):
-    """Vertices around the z axis, so far outside the skirt at heights [m], shape [rows, columns, 3]."""
+    """Returns vertices around the z axis, ``offset`` [m] outside the skirt, shape [rows, columns, 3]."""
     angle = 2.0 * np.pi * np.arange(columns) / columns
     radius = np.interp(height, *np.transpose(SKIRT))[:, None] + offset
     x, y = radius * np.cos(angle), FLATNESS * radius * np.sin(angle)

@@ -2,9 +2,9 @@
 
     warp-bsc bench --device cpu --json cpu.json
     warp-bsc bench --device cuda:0 --json gpu.json
-    python examples/draw_benchmarks.py cpu.json gpu.json benchmarks.png
+    python examples/figures/benchmarks.py cpu.json gpu.json benchmarks.png
 
-Of one run, ``warp-bsc bench --figure`` draws the same. Needs matplotlib (``pip install matplotlib``).
+``warp-bsc bench --figure`` draws the same for one run. Needs matplotlib (``pip install matplotlib``).
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Exact decision of a query in wide integers: first contact, with every degenerate case (paper, BSC-exact).
+"""Exact first contact of a query in wide integers, in all degenerate cases (BSC-exact).
 
-One question
-------------
+Formulation
+-----------
 The differences of points of the two features fill a triangle with the corners p - a, p - b, p - c (vertex-face), or a
 parallelogram with the corners c - a, c - b, d - b, d - a in this order (edge-edge). The features meet when this polygon
 contains the origin. Its corners move linearly. Let
@@ -9,7 +9,7 @@ contains the origin. Its corners move linearly. Let
     V = P . (Q x R)  for its first, second and last corner: a cubic, zero when polygon and origin are in one plane;
     C_e = A x B  for each of its edges, from corner A to the next one B: three quadratics, by axis.
 
-Those are, up to sign, the coplanarity Y and the inside tests of :mod:`polynomials`: the areas of the triangles that the
+They are, up to sign, the coplanarity Y and the inside tests of :mod:`polynomials`: the areas of the triangles that the
 origin forms with the edges. At a time at which V = 0:
 
 - for any axis, if components of two C_e have strictly opposite signs, there is no contact;
@@ -19,19 +19,19 @@ origin forms with the edges. At a time at which V = 0:
 
 An edge contains the origin when C_e = 0, so that A and B are parallel, and A_i B_i <= 0 along every axis i.
 
-The times to look at
---------------------
-If V is not identically zero, these are its roots. Those inside the step are compared with the roots of the components
-of C_e, see :mod:`algebraic`, which gives the components' signs. Where all are zero, all edges are asked for **any**
-contact with the origin during the step, each of which is contact of the features as well.
+Times of contact
+----------------
+If V is not identically zero, contact is possible at its roots. The order of those inside the step and of the roots of
+the components of C_e gives the signs of the components, see :mod:`algebraic`. If all are zero at a root, the search
+continues with **any** contact of an edge with the origin during the step, which is contact of the features as well.
 
-If V is identically zero, the motion is planar, in a plane that may turn: the first contact is at t = 0, or with an
-edge. For were the polygon not collapsed then, and the origin strictly inside, it would have been inside before. So the
-start is looked at, and all edges are asked.
+If V is identically zero, the motion is planar, in a plane that may turn. The first contact is then at t = 0 or on an
+edge: an origin that is strictly inside a polygon that has not collapsed was inside before. So the search tests the
+start and all edges.
 
-An edge asks likewise. If a component of C_e is not identically zero, contact is at a root of it, at which the other two
-are zero and A_i B_i <= 0. If all are, A and B are parallel all the time, and A . B, which is positive at the start if
-there is no contact, is so until the first contact.
+For an edge, if a component of C_e is not identically zero, contact is at a root of it at which the other two components
+are zero and A_i B_i <= 0. If all components are identically zero, A and B are parallel all the time; A . B is positive
+at the start, unless there is contact, and stays positive until the first contact.
 """
 
 import functools
@@ -48,7 +48,7 @@ NONE = wp.constant(wp.float64(2.0))
 """Time of impact where there is no contact."""
 
 TOO_WIDE = wp.constant(wp.float64(-1.0))
-"""In place of a time of impact: the exponents of the query are too far apart for the width asked for."""
+"""In place of a time of impact: the exponents of the query are too far apart for the width of the integers."""
 
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -56,13 +56,13 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.func
 def _next(corner: int, corners: int) -> int:
-    """The corner after another one."""
+    """Returns the corner after a corner."""
     return wp.where(corner + 1 == corners, 0, corner + 1)
 
 
 @wp.func(inline=False)
 def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
-    """Whether a polygon in a plane with the origin at an end of the step contains it: 1, 0, or -1 if collapsed."""
+    """Returns whether a polygon coplanar with the origin at an end of the step contains it: 1, 0; -1 if collapsed."""
     axis = int(0)
     while axis < 3:
         low = int(0)
@@ -83,7 +83,7 @@ def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
 
 @wp.func(inline=False)
 def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: int) -> bool:
-    """Whether the edge between two corners contains the origin at one end of the step."""
+    """Returns whether the edge between two corners contains the origin at one end of the step."""
     axis = int(0)
     while axis < 3:
         if sign_at_end(polygon, first, second, axis, end) != 0:
@@ -98,20 +98,20 @@ def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: i
 def _between_at_roots(
     polygon: wp.array[Any], first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int
 ):
-    """Whether the edge contains the origin at the positive roots of a component of its cross product.
+    """Returns whether an edge contains the origin at the positive roots of a component of its cross product.
 
     Args:
         polygon: The polygon.
         first: Corner at which the edge starts.
         second: Corner at which it ends.
-        axis: Of the component.
-        c0: Coefficients of the component in z, here and next.
-        c1: Of z.
-        c2: Of z^2.
-        roots: How many positive roots it has, with multiplicity, 1 or 2.
+        axis: Axis of the component.
+        c0: Constant coefficient of the component.
+        c1: Coefficient of z in the component.
+        c2: Coefficient of z^2 in the component.
+        roots: Number of its positive roots, with multiplicity, 1 or 2.
 
     Returns:
-        Two Booleans, for the smaller root first; of one root, twice.
+        Two Booleans, for the smaller root first; for a single root, twice the same.
     """
     at_first = bool(True)
     at_second = bool(True)
@@ -140,7 +140,7 @@ def _between_at_roots(
 
 @wp.func(inline=False)
 def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -> wp.float64:
-    """When an edge of the polygon first contains the origin: a multiple of 2^-digits not after it, or NONE.
+    """Returns when an edge of the polygon first contains the origin, rounded down to a multiple of 2^-digits, or NONE.
 
     Args:
         polygon: The polygon.
@@ -166,7 +166,7 @@ def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -
                     return root_time(c0, c1, c2, subtract(c0, c0), roots, index, digits)
             return result
         axis += 1
-    # parallel all the time: A . B, a quadratic
+    # A and B are parallel all the time: the roots of A . B, a quadratic
     a0 = coordinate(polygon, first, 0, 0)
     a1 = coordinate(polygon, first, 1, 0)
     b0 = coordinate(polygon, second, 0, 0)
@@ -203,22 +203,22 @@ def _component_signs(
     roots: int,
     constant: bool,
 ) -> wp.vec3i:
-    """Signs of a component of the cross product of an edge's corners at the roots of V.
+    """Returns the signs of a component of the cross product of an edge's corners at the roots of V.
 
     Args:
         polygon: The polygon.
         first: Corner at which the edge starts.
         second: Corner at which it ends.
-        axis: Of the component.
-        v0: Coefficients of V in z, here and next.
-        v1: Of z.
-        v2: Of z^2.
-        v3: Of z^3.
-        roots: How many positive roots V has, with multiplicity.
-        constant: Whether to answer for those components only that have no positive root, or only for those that do.
+        axis: Axis of the component.
+        v0: Constant coefficient of V.
+        v1: Coefficient of z in V.
+        v2: Coefficient of z^2 in V.
+        v3: Coefficient of z^3 in V.
+        roots: Number of positive roots of V, with multiplicity.
+        constant: True to return signs only of a component that has no positive root, False only of one that has.
 
     Returns:
-        The signs at the roots a1 <= a2 <= a3 of V, of which the last ones are positive; zeros where not asked.
+        Signs at the roots a1 <= a2 <= a3 of V, whose positive ones are the last; zeros for other components.
     """
     c0, c1, c2 = cross_component(polygon, first, second, axis)
     turns = count_quadratic_roots(c0, c1, c2)
@@ -229,12 +229,12 @@ def _component_signs(
 
 @wp.func
 def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits: int) -> wp.float64:
-    """Whether a query collides, and when first: a multiple of 2^-digits not after it, closer than that to it, or NONE.
+    """Returns the time of the first contact of a query, rounded down to a multiple of 2^-digits, or NONE.
 
     Args:
         kind: VERTEX_FACE or EDGE_EDGE.
         polygon: The polygon of the query, of at most BITS.
-        timed: Whether the time is asked for; else it is any time at most 1 where the query collides.
+        timed: Whether the time matters; if not, any time of at most 1 stands for contact.
         digits: Binary digits of the time, at most 38.
     """
     corners = wp.where(kind == VERTEX_FACE, 3, 4)
@@ -263,7 +263,7 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
     while axis < 3 and wp.max(is_open) > 0:
         low = wp.vec3i(0, 0, 0)
         high = wp.vec3i(0, 0, 0)
-        # components without roots first: they cost little, and opposite signs settle all
+        # components without roots first: they cost little, and opposite signs decide the query
         step = int(0)
         while step < 2 * corners:
             if wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
@@ -302,43 +302,46 @@ for _limbs in BITS:
 
     @wp.func
     def _decide(kind: int, polygon: wp.array[_Integer], timed: bool, digits: int) -> wp.float64:
-        """As :func:`first_contact_exactly`; taking an array of a known type keeps it from being copied at each call."""
+        """Returns :func:`first_contact_exactly`; an array of a known type is not copied at each call."""
         return first_contact_exactly(kind, polygon, timed, digits)
 
 
 @functools.cache
-def decide_in(limbs):
-    """The device function that decides queries in integers of so many limbs a coordinate, a key of BITS."""
+def decide_in(limbs: int) -> wp.Function:
+    """Returns a device function that decides queries in integers of ``limbs`` limbs per coordinate, a key of BITS."""
     number = integer(limbs)
     most = BITS[limbs]
 
     @wp.func
     def decide(
         kind: int,
+        # points at the start
         a0: wp.vec3d,
         b0: wp.vec3d,
         c0: wp.vec3d,
         d0: wp.vec3d,
+        # points at the end
         a1: wp.vec3d,
         b1: wp.vec3d,
         c1: wp.vec3d,
         d1: wp.vec3d,
+        # time of impact
         timed: bool,
         digits: int,
     ) -> wp.float64:
-        """First contact of a query, as :func:`first_contact_exactly` has it, or TOO_WIDE.
+        """Returns :func:`first_contact_exactly` of a query, or TOO_WIDE.
 
         Args:
             kind: VERTEX_FACE or EDGE_EDGE.
-            a0: The four points in order, at the start.
-            b0: Second point.
-            c0: Third point.
-            d0: Fourth point.
-            a1: The same points at the end.
-            b1: Second point.
-            c1: Third point.
-            d1: Fourth point.
-            timed: Whether the time is asked for.
+            a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
+            b0: Second point at the start.
+            c0: Third point at the start.
+            d0: Fourth point at the start.
+            a1: First point at the end.
+            b1: Second point at the end.
+            c1: Third point at the end.
+            d1: Fourth point at the end.
+            timed: Whether the time matters, see :func:`first_contact_exactly`.
             digits: Binary digits of the time, at most 38.
         """
         exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)

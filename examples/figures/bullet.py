@@ -1,28 +1,32 @@
 """Draws the example Cloth Bullet without the collision stage and with it, at the same times.
 
-    python examples/draw_bullet.py bullet.png
+    python examples/figures/bullet.py bullet.png
 
 Needs matplotlib (``pip install matplotlib``).
 """
 
 import argparse
+import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import newton.viewer
 import numpy as np
-from example_cloth_bullet import Example
 from matplotlib.colors import to_rgb
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+sys.path.append(str(Path(__file__).parents[1]))  # for the example
+from example_cloth_bullet import Example
 
 FRAMES = (0, 1, 2, 6)
 _SHEET, _PATCH = to_rgb("#9db8d9"), to_rgb("#e07a2f")
 _LIFT = 0.012
-"""How far the patch is drawn above where it is [m]: whole triangles are sorted by depth, and it lies on others."""
+"""Distance by which the patch is drawn above its position [m], because whole triangles are sorted by depth."""
 _LIGHT = np.array([0.3, -0.5, 0.81])
 
 
 def positions(ccd):
-    """The example that was run and its positions at the frames, shape [len(FRAMES), particles, 3]."""
+    """Returns the example after a run, and its positions at the frames, shape [len(FRAMES), particles, 3]."""
     args = Example.create_parser().parse_args(["--viewer", "null", "--speed", "30", "--ccd" if ccd else "--no-ccd"])
     example = Example(newton.viewer.ViewerNull(), args)
     taken = []
@@ -43,7 +47,7 @@ def draw(axes, example, x):
     shade = 0.35 + 0.65 * np.abs(normals @ _LIGHT)
     colors = np.repeat([_SHEET, _PATCH], [example.sheet_triangles, len(triangles) - example.sheet_triangles], axis=0)
     colors = np.minimum(shade[:, None] * colors, 1.0)
-    # one collection, so that what is behind is drawn first
+    # one collection, which sorts all triangles by depth
     axes.add_collection3d(Poly3DCollection(corners, facecolors=colors, edgecolors=colors, linewidths=0.3))
     axes.set(xlim=(-0.5, 0.5), ylim=(-0.5, 0.5), zlim=(-0.5, 0.5))
     axes.set_box_aspect((1, 1, 1), zoom=1.2)
@@ -52,9 +56,9 @@ def draw(axes, example, x):
 
 
 def main():
-    """Draws what the command line asks for."""
+    """Reads the command line, and draws the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("picture", help="File to write, .png or another format that matplotlib knows.")
+    parser.add_argument("picture", help="File to write, .png or another format of matplotlib.")
     picture = parser.parse_args().picture
     figure = plt.figure(figsize=(10.0, 5.0), dpi=110)
     for row, ccd in enumerate((False, True)):

@@ -1,9 +1,9 @@
-"""Records the scenes of the paper as USD: what is in assets/, or of any size.
+"""Records the scenes of the paper as USD, as in assets/ or of any size.
 
-    python examples/record_scenes.py                              # all, as in assets/, into this folder
-    python examples/record_scenes.py twisting --triangles 50000   # one of them, with so many triangles
+    python examples/paper/record_scenes.py                              # all, as in assets/, into this folder
+    python examples/paper/record_scenes.py twisting --triangles 50000   # one of them, larger
 
-What comes before the most interesting moments is simulated, but not recorded.
+The beginning of each scene is simulated, but not recorded.
 """
 
 import argparse
@@ -16,12 +16,12 @@ import warp as wp
 
 
 class Recording(NamedTuple):
-    """Which part of a scene is recorded.
+    """The part of a scene that is recorded.
 
     Attributes:
-        first: Number of the first frame.
-        count: How many there are.
-        every: How many frames are between one and the next.
+        first: Number of the first recorded frame.
+        count: Number of recorded frames.
+        every: Distance from one recorded frame to the next.
     """
 
     first: int
@@ -42,12 +42,12 @@ def record(name, folder, triangles):
     """Simulates a scene and writes the recorded part to a USD file named after it.
 
     Args:
-        name: Of the scene.
-        folder: Where to write.
-        triangles: About how many, or None for the scene's default.
+        name: Name of the scene.
+        folder: Folder to write to.
+        triangles: Approximate number of triangles, or None for the scene's default.
 
     Returns:
-        The example, as it was at the end, and the file.
+        The example after its last frame, and the file.
     """
     example_class = importlib.import_module(f"example_{name}").Example
     options = ["--viewer", "usd"] if triangles is None else ["--viewer", "usd", "--triangles", str(triangles)]
@@ -68,7 +68,7 @@ def record(name, folder, triangles):
 
 
 def shorten(stage):
-    """Leaves out the normals and what is not shown, most of the file, and lets the time begin at the first sample."""
+    """Removes normals and invisible prims, most of the file, and lets the time begin at the first sample."""
     layer = stage.GetRootLayer()
     for name in ("particles", "joints", "com", "inertia_boxes"):
         stage.RemovePrim(f"/root/model/{name}")
@@ -81,7 +81,7 @@ def shorten(stage):
 
 
 def main():
-    """Records what the command line names."""
+    """Records the scenes that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="which scenes (default: all)")
     parser.add_argument("--triangles", type=int, help="about how many (default: that of each scene)")

@@ -1,24 +1,28 @@
-"""Draws what the example Diffsim Throw learns with the collision stage and without it.
+"""Draws the throws that the example Diffsim Throw finds with the collision stage and without it.
 
-    python examples/draw_throw.py throw.png
+    python examples/figures/throw.py throw.png
 
 Needs matplotlib (``pip install matplotlib``).
 """
 
 import argparse
+import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import newton.viewer
 import numpy as np
-from example_diffsim_throw import MARK, STARTS, Example
 from rich.progress import track
+
+sys.path.append(str(Path(__file__).parents[1]))  # for the example
+from example_diffsim_throw import MARK, STARTS, Example
 
 _ITERATIONS = 60
 _COLORS = "#2f6fb3", "#e07a2f", "#3a9a5b"
 
 
 def learn(ccd):
-    """The example after all iterations, and the paths of the first."""
+    """Returns the example after all iterations, and the paths of the first one."""
     args = Example.create_parser().parse_args(["--viewer", "null", "--ccd" if ccd else "--no-ccd"])
     example = Example(newton.viewer.ViewerNull(), args)
     for iteration in track(range(_ITERATIONS), "with the stage" if ccd else "without"):
@@ -45,9 +49,9 @@ def draw_paths(axes, example, first):
 
 
 def main():
-    """Draws what the command line asks for."""
+    """Reads the command line, and draws the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("picture", help="File to write, .png or another format that matplotlib knows.")
+    parser.add_argument("picture", help="File to write, .png or another format of matplotlib.")
     picture = parser.parse_args().picture
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.7), dpi=110, width_ratios=(3.7, 1.9, 2.9))
     for column, ccd in enumerate((False, True)):

@@ -1,9 +1,9 @@
-"""Draws how the time of a detection grows with the number of triangles, one line a device.
+"""Draws how the time of a detection grows with the number of triangles, one line per device.
 
     warp-bsc bench detector crash:5000 crash:10000 crash:20000 crash:40000 --json > cpu.json
-    python examples/draw_growth.py cpu.json growth.png
+    python examples/figures/growth.py cpu.json growth.png
 
-Several files of times, of one device each, make one picture. Of a GPU it shows the times of the CUDA graph.
+Several files of times, each of one device, make one picture. For a GPU it shows the times of the CUDA graph.
 Needs matplotlib (``pip install matplotlib``).
 """
 
@@ -17,23 +17,23 @@ from matplotlib.ticker import NullLocator
 
 _COLORS = ["#1f77b4", "#76b900", "#d62728", "#9467bd"]
 _FITTED = 10.0
-"""Times are fitted over meshes of at least the largest number of triangles by this: small ones do not fill a GPU."""
+"""The fit leaves out meshes this many times smaller than the largest, because small meshes do not fill a GPU."""
 
 
 class Growth:
     """Times of detections on one device.
 
     Attributes:
-        device: What it is called.
+        device: Name of the device.
         triangles: Sizes of the meshes, ascending, shape [n].
-        milliseconds: Time of a detection with each [ms], shape [n].
-        fitted: Which of them the fit is over, bool, shape [n].
-        exponent: The power of the number of triangles that times grow with, by least squares of the logarithms.
-        fit: Times by that power where it is fitted [ms].
+        milliseconds: Time of a detection with each mesh [ms], shape [n].
+        fitted: Which meshes the fit includes, bool, shape [n].
+        exponent: Power of the number of triangles that times grow with, by least squares of the logarithms.
+        fit: Times of the fit for the meshes that it includes [ms].
     """
 
     def __init__(self, benchmark):
-        """Reads what ``warp-bsc bench detector --json`` printed."""
+        """Reads the output of ``warp-bsc bench detector --json``."""
         cpu = benchmark["device"] == "cpu"
         threads = benchmark["threads"]
         self.device = f"CPU, {threads} core{'s' if threads > 1 else ''}" if cpu else benchmark["device_name"]
@@ -50,7 +50,7 @@ class Growth:
 
 
 def describe(benchmarks):
-    """What the meshes of some benchmarks have in common."""
+    """Returns a title with the scene and the ranges of candidates and hits per triangle."""
     scenes = [scene for benchmark in benchmarks for scene in benchmark["scenes"]]
     parts = []
     for name, digits in (("candidates", 0), ("hits", 2)):
@@ -60,10 +60,10 @@ def describe(benchmarks):
 
 
 def draw(benchmarks, path):
-    """Writes the picture of some benchmarks to a file.
+    """Writes the picture of benchmarks to a file.
 
     Returns:
-        The :class:`Growth` of each.
+        The :class:`Growth` of each benchmark.
     """
     growths = [Growth(benchmark) for benchmark in benchmarks]
     figure, axes = plt.subplots(figsize=(8.0, 4.8), layout="constrained")
