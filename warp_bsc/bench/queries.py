@@ -48,7 +48,7 @@ SEED = 0
 
 _MOST_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
-_MISSES = dict(zip(KINDS, (1.32, 2.33), strict=True))
+_MISSES: dict[str, float] = dict(zip(KINDS, (1.32, 2.33), strict=True))
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
 culls."""
 
