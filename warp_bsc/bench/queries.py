@@ -31,7 +31,7 @@ __all__ = [
     "generate_touching_queries",
 ]
 
-KINDS = ("vertex-face", "edge-edge")
+KINDS: tuple[str, ...] = ("vertex-face", "edge-edge")
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """The modes that are measured, with the bytes of a query and its answer.
@@ -48,7 +48,7 @@ SEED = 0
 
 _MOST_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
-_MISSES = dict(zip(KINDS, (1.32, 2.33), strict=True))
+_MISSES: dict[str, float] = dict(zip(KINDS, (1.32, 2.33), strict=True))
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
 culls."""
 
