@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM
 from pxr import Sdf, Usd, UsdGeom, UsdUtils
-from stages import FALLING, FLOOR, add_floor, add_mesh, falling, moved, new_stage, save
+from stages import FALLING, FLOOR, add_falling, add_floor, add_mesh, falling, moved, new_stage, save
 
 from warp_bsc import _atomic_file
 from warp_bsc._atomic_file import OutputFile
@@ -115,7 +115,7 @@ def test_overlay_names_prims_in_the_same_order_every_time(tmp_path):
     add_floor(stage)
     names = [f"Falling{number}" for number in range(8)]
     for name in names:
-        add_mesh(stage, f"/World/{name}", falling())
+        add_falling(stage, f"/World/{name}")
     replay(stage)
     lines = (tmp_path / "overlay.usda").read_text().splitlines()
     assert [line.split('"')[1] for line in lines if 'over "Falling' in line] == names
