@@ -1,6 +1,7 @@
 """Settings of the test run: one device for all tests, what tests need, quiet Warp, repeatable hypothesis."""
 
 import os
+import signal
 
 import hypothesis
 import pytest
@@ -22,7 +23,10 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Sets what must be set before any kernel is loaded or array made."""
+    """Sets what must be set before any kernel is loaded or array made, and signals as a terminal has them."""
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
+            signal.signal(number, handler)
     if config.getoption("--guard-memory"):
         guard_memory()
     if config.getoption("--warp-debug"):

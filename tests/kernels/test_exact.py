@@ -186,6 +186,20 @@ def stages_kernel(limbs):
     """A kernel that computes what the exact stage does, step by step."""
     one, two, four, eight = (integer(limbs * times) for times in (1, 2, 4, 8))
 
+    # As the exact stage does, functions take the polygon as an array: Warp keeps one instance of a generic function for
+    # arrays in memory and those of a kernel, whichever came first.
+    @wp.func
+    def coordinate_of(polygon: wp.array[one], corner: int, end: int, axis: int):
+        return coordinate(polygon, corner, end, axis)
+
+    @wp.func
+    def volume_of(polygon: wp.array[one], last: int):
+        return volume(polygon, last)
+
+    @wp.func
+    def cross_component_of(polygon: wp.array[one], first: int, second: int, axis: int):
+        return cross_component(polygon, first, second, axis)
+
     @wp.kernel(enable_backward=False, module="unique")
     def compute(
         kind: int,
@@ -212,14 +226,14 @@ def stages_kernel(limbs):
         make_polygon(kind == 1, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
         for corner in range(4):
             for axis in range(3):
-                corners[i, 6 * corner + axis] = coordinate(polygon, corner, 0, axis)
-                corners[i, 6 * corner + 3 + axis] = coordinate(polygon, corner, 1, axis)
-        v0, v1, v2, v3 = volume(polygon, 2 + kind)
+                corners[i, 6 * corner + axis] = coordinate_of(polygon, corner, 0, axis)
+                corners[i, 6 * corner + 3 + axis] = coordinate_of(polygon, corner, 1, axis)
+        v0, v1, v2, v3 = volume_of(polygon, 2 + kind)
         v[i, 0] = v0
         v[i, 1] = v1
         v[i, 2] = v2
         v[i, 3] = v3
-        q0, q1, q2 = cross_component(polygon, 0, 1, i % 3)
+        q0, q1, q2 = cross_component_of(polygon, 0, 1, i % 3)
         c[i, 0] = q0
         c[i, 1] = q1
         c[i, 2] = q2

@@ -61,7 +61,7 @@ def test_times_of_impact_in_a_user_kernel_have_gradients(device):
     np.testing.assert_allclose(p.grad.numpy()[0].sum(axis=0), 0.0, atol=1e-6)
 
 
-@wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True})
+@wp.kernel(enable_backward=False, module="unique", module_options={"fast_math": True, "mode": "release"})
 def ask_fast(p: wp.array2d[wp.vec3], status: wp.array[int]):
     i = wp.tid()
     status[i] = ccd_vertex_face(p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7])
