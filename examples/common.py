@@ -3,7 +3,6 @@
 import argparse
 
 import newton.examples
-import warp as wp
 from newton.viewer import ViewerNull, ViewerViser
 from rich.console import Console
 from rich.progress import track
@@ -36,8 +35,6 @@ class ExampleBase:
         self.sim_dt = self.frame_dt / self.sim_substeps
         self.sim_time = 0.0
         self.frame = 0
-        self.graph = None
-        self.repeated_steps = 0
 
     def start(self, model, solver, camera, clocks=()):
         """Puts the collision stage behind a solver, unless ``--no-ccd`` is given, and shows the model.
@@ -46,14 +43,13 @@ class ExampleBase:
             model: The model.
             solver: The inner solver, which needs no contacts.
             camera: Position [m], pitch and yaw [degrees].
-            clocks: Arrays on the device, besides the states, that a step advances.
+            clocks: Arrays on the device, besides the states, that a step reads and advances.
         """
         self.model = model
         self.solver = bsc.SolverCCD(solver) if self.ccd else solver
         self.state_0, self.state_1 = model.state(), model.state()
         self.control = model.control()
-        self.clocks = clocks
-        self.saved_state, self.saved_clocks = model.state(), [wp.clone(clock) for clock in clocks]
+        self.run_frame = bsc.CapturedSteps(self.simulate, self.solver, [self.state_0, *clocks])
         self.viewer.set_model(model)
         position, pitch, yaw = camera
         self.viewer.set_camera(pos=position, pitch=pitch, yaw=yaw)
@@ -67,46 +63,10 @@ class ExampleBase:
             self.state_0, self.state_1 = self.state_1, self.state_0
 
     def step(self):
-        """Simulates a frame, on a GPU from a CUDA graph.
-
-        In a graph the buffers of the stage cannot grow. A frame for which they are too small is simulated again
-        without the graph, which enlarges them, and captured anew.
-        """
-        if not self.launch_graph():
-            self.simulate()
-            self.capture()
+        """Simulates a frame, on a GPU from a CUDA graph."""
+        self.run_frame()
         self.frame += 1
         self.sim_time += self.frame_dt
-
-    def capture(self):
-        """Captures a frame on a GPU."""
-        self.graph = None
-        if self.model.device.is_cuda:
-            with wp.ScopedCapture() as capture:
-                self.simulate()
-            self.graph = capture.graph
-
-    def launch_graph(self):
-        """Simulates a frame from the graph; returns whether there is a graph and it certified all steps."""
-        if self.graph is None:
-            return False
-        self.saved_state.assign(self.state_0)
-        for saved, clock in zip(self.saved_clocks, self.clocks, strict=True):
-            wp.copy(saved, clock)
-        uncertified = self.count_uncertified()
-        wp.capture_launch(self.graph)
-        uncertified = self.count_uncertified() - uncertified
-        if uncertified == 0:
-            return True
-        self.state_0.assign(self.saved_state)
-        for saved, clock in zip(self.saved_clocks, self.clocks, strict=True):
-            wp.copy(clock, saved)
-        self.repeated_steps += uncertified
-        return False
-
-    def count_uncertified(self):
-        """Returns the number of steps that were not certified, repeated ones included."""
-        return self.solver.report.uncertified_steps if self.ccd else 0
 
     def render(self):
         """Shows the frame."""
@@ -122,7 +82,7 @@ class ExampleBase:
     def test_final(self):
         """Checks that the stage certified all steps and left no intersections."""
         if self.ccd:
-            uncertified = self.count_uncertified() - self.repeated_steps
+            uncertified = self.solver.report.uncertified_steps
             assert uncertified == 0, f"{uncertified} steps are not certified"
             intersections = self.solver.report.intersections
             assert len(intersections) == 0, f"{len(intersections)} edges cross faces in the last step"
@@ -130,7 +90,7 @@ class ExampleBase:
     def print_report(self):
         """Prints what the stage did."""
         if self.ccd:
-            repeated = f"; {self.repeated_steps} of these in frames simulated again" if self.repeated_steps else ""
+            repeated = f"; frames simulated again: {self.run_frame.retaken}" if self.run_frame.retaken else ""
             print(f"{self.solver.report}{repeated}")
 
     @classmethod

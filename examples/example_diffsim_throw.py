@@ -107,8 +107,8 @@ class Example:
 
         self.viewer.set_model(model)
         self.viewer.set_camera(pos=wp.vec3(-0.3, -3.2, 0.5), pitch=-5.0, yaw=90.0)
-        self.graph = None
-        self.repeated_steps = 0
+        self.tape = None
+        self.run_iteration = bsc.CapturedSteps(self.differentiate, self.solver)
 
     def add_cloth(self, builder, cells, cell, center, axis, angle, **fixed):
         """Adds a square of cloth with ``cells`` cells of width ``cell`` [m] along each side, turned about an axis."""
@@ -147,40 +147,16 @@ class Example:
 
     def differentiate(self):
         """Simulates the throws, and computes the gradient of the loss."""
+        if self.tape is not None:
+            self.tape.zero()  # of the last iteration; or NaN, of a graph whose buffers were too small
         self.tape = wp.Tape()
         with self.tape:
             self.simulate()
         self.tape.backward(self.loss)
 
-    def capture(self):
-        """Captures simulation and gradient in a CUDA graph, on a GPU."""
-        self.graph = None
-        if self.model.device.is_cuda:
-            with wp.ScopedCapture() as capture:
-                self.differentiate()
-            self.graph = capture.graph
-
-    def launch_graph(self):
-        """Computes the gradient from the graph; returns whether there is a graph and its buffers were large enough."""
-        if self.graph is None:
-            return False
-        missing = self.count_missing()
-        wp.capture_launch(self.graph)
-        missing = self.count_missing() - missing
-        self.repeated_steps += missing
-        return missing == 0
-
-    def count_missing(self):
-        """Returns the number of steps that the stage has not certified, or not recorded for the gradient."""
-        return self.solver.report.uncertified_steps + self.solver.report.lost_gradients if self.ccd else 0
-
     def step(self):
-        """Improves the throws by the gradient, computed without the graph if its buffers are too small."""
-        if not self.launch_graph():
-            if self.graph:
-                self.tape.zero()
-            self.differentiate()
-            self.capture()
+        """Improves the throws by the gradient, computed on a GPU from a CUDA graph."""
+        self.run_iteration()
         self.loss_history.append(self.losses.numpy().copy())
         distance = np.linalg.norm(self.centres.numpy() - np.array(MARK), axis=1)
         nearer = distance < self.distance
@@ -189,7 +165,6 @@ class Example:
         self.path[:, nearer] = self.centre_paths()[:, nearer]
         self.optimizer.lr = FIRST_RATE * RATE_DECAY**self.iteration
         self.optimizer.step([self.throws.grad])
-        self.tape.zero()
         self.iteration += 1
 
     def centre_paths(self):
@@ -211,7 +186,8 @@ class Example:
         """Checks that all throws land within two centimetres of the mark; without the stage, that none has changed."""
         if self.ccd:
             assert self.distance.max() < 0.02, self.distance
-            assert self.count_missing() == self.repeated_steps, self.solver.report
+            report = self.solver.report
+            assert report.uncertified_steps + report.lost_gradients == 0, report
         else:
             assert np.abs(self.throws.numpy() - STARTS).max() < 1e-3, self.throws
             assert self.distance.min() > 1.0, self.distance

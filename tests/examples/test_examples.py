@@ -230,23 +230,42 @@ def test_scene_has_to_become_what_it_is_called(name):
         run(path_of(name), 1, "--triangles", "2000").test_final()
 
 
-def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch):
-    expected, example = (run(path_of("dancer"), 2, "--triangles", "1000") for _ in range(2))
-    counts = iter([0, 3, 3])  # not certified: before, after, at the end
+def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch, capsys):
+    expected, example = (run(path_of("dancer"), frames, "--triangles", "1000") for frames in (3, 2))
 
     def spoil(graph):
-        example.state_0.particle_q.zero_()
+        totals = example.solver.report._totals
+        for array in (totals.steps, totals.uncertified_steps, totals.undetected_steps):
+            array.fill_(9)
+        example.state_0.assign(example.model.state())
         example.solver.time.zero_()
 
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    monkeypatch.setattr(example, "count_uncertified", lambda: next(counts))
-    example.graph = "a graph"
-    expected.step()
+    example.run_frame._graph = "a graph"
     example.step()
     assert (expected.positions() == example.positions()).all()
-    assert example.repeated_steps == 3
+    assert (example.solver.time.numpy() == expected.solver.time.numpy()).all()
+    assert str(example.solver.report) == str(expected.solver.report)
+    example.print_report()
+    assert "0 not certified; frames simulated again: 1\n" in capsys.readouterr().out
     with pytest.raises(AssertionError, match="hem"):  # only
         example.test_final()
+
+
+def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypatch):
+    expected, example = (run(THROW, frames) for frames in (3, 2))
+
+    def spoil(graph):
+        example.solver.report._totals.lost_gradients.fill_(1)
+        for array in (example.throws, example.states[0].particle_q, example.states[9].particle_qd):
+            array.grad.fill_(wp.nan)
+
+    monkeypatch.setattr(wp, "capture_launch", spoil)
+    example.run_iteration._graph = "a graph"
+    example.step()
+    assert example.run_iteration.retaken == 1
+    assert example.solver.report.lost_gradients == 0
+    np.testing.assert_allclose(example.throws.numpy(), expected.throws.numpy(), rtol=1e-4)
 
 
 @pytest.mark.slow
