@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
@@ -23,6 +24,20 @@ class _KernelsFinder:
 
 if not (Path(__file__).parent / "kernels").is_dir():
     sys.meta_path.insert(0, _KernelsFinder)  # before those of another checkout that may be installed
+
+if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
+    from . import checker
+    from .detection.collisions import CapturedCollisions, Collisions, DetectionStats
+    from .detection.detector import CollisionDetector
+    from .detection.differentiable import CollisionArrays
+    from .detection.mesh import CollisionMesh
+    from .detection.query import QueryResult, query_edge_edge, query_vertex_face
+    from .detection.query_points import query_points
+    from .replay.intervals import replay
+    from .response.captured_steps import CapturedSteps
+    from .response.report import SolverReport
+    from .response.solver_ccd import SolverCCD
+    from .usd.scene import Scene
 
 _MODULES = {
     "CapturedCollisions": "detection.collisions",

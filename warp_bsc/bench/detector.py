@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.collisions import CapturedCollisions, Collisions, DetectionStats, StageCounts
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
@@ -107,6 +107,7 @@ def benchmark_detector(
     collisions = detector.detect(x0, x1)
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None
 
+    assert isinstance(collisions, Collisions)  # nothing is captured here
     stats = collisions.stats
     detect, read, stages = [], [], []
     for _ in range(repeat):
@@ -115,6 +116,7 @@ def benchmark_detector(
         collisions = detector.detect(x0, x1)
         wp.synchronize_device(device)
         detect.append(1e3 * (time.perf_counter() - start))
+        assert isinstance(collisions, Collisions)
         stats = collisions.stats  # reads everything else with it
         read.append(1e3 * (time.perf_counter() - start))
         stages.append(stats.milliseconds)
@@ -140,7 +142,7 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
         captured = detector.detect(x0, x1)
-    assert capture.graph
+    assert capture.graph and isinstance(captured, CapturedCollisions)
     milliseconds = replay_graph(capture.graph, device, replays=_GRAPH_REPLAYS)
     found = captured.read().stats
     if (found.vertex_face, found.edge_edge) != (stats.vertex_face, stats.edge_edge):

@@ -62,6 +62,6 @@ def loading_kernels(device: wp.Device) -> Iterator[None]:
 
 def load_detector(method: str, dtype: npt.DTypeLike, device: wp.Device) -> None:
     """Loads the detector's kernels for one type of position; compiles them if need be."""
-    triangles = CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+    triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)
     CollisionDetector(triangles, method=method).detect(points, points)

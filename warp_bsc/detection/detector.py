@@ -101,7 +101,8 @@ class CollisionDetector:
         arrays = None
         if x0.requires_grad or x1.requires_grad:
             arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *contacts)
-        return Collisions(self.method != "float", (), arrays, self.method, counts, *contacts, timer)
+        vertex_face, edge_edge = contacts
+        return Collisions(self.method != "float", (), arrays, self.method, counts, vertex_face, edge_edge, timer)
 
     def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
@@ -139,7 +140,9 @@ class CollisionDetector:
         replayed: list[Collisions] = []
 
         def detect() -> None:
-            replayed[:] = [self.detect(x0, x1)]
+            collisions = self.detect(x0, x1)
+            assert isinstance(collisions, Collisions)  # a replay is not captured
+            replayed[:] = [collisions]
 
         def read() -> Collisions:
             if not replayed:
@@ -164,11 +167,12 @@ class CollisionDetector:
             overflows = tuple(pipeline.overflows(counts))
             left_to_host = counts.vertex_face.too_wide_8 + counts.edge_edge.too_wide_8
             certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            contacts = [
+            vertex_face, edge_edge = (
                 narrow_phase.ordered_contacts(min(kind_counts.collisions, len(narrow_phase.contacts.pairs)))
                 for narrow_phase, kind_counts in self._narrow_phases(counts)
-            ]
-            return Collisions(certified, overflows, arrays, self.method, counts, *contacts, StageTimer(None))
+            )
+            timer = StageTimer(None)
+            return Collisions(certified, overflows, arrays, self.method, counts, vertex_face, edge_edge, timer)
 
         arrays = None
         if x0.requires_grad or x1.requires_grad:

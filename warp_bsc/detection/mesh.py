@@ -85,9 +85,9 @@ class CollisionMesh:
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
         self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
         self.device_owned = wp.array(owned, dtype=int, device=self.device)
-        self.world = None if world is None else self._checked_world(world)
-        self.device_face_world = None
+        self.world = self.device_face_world = None
         if world is not None:
+            self.world = self._checked_world(world)
             self.device_face_world = wp.array(self.world[self.faces[:, 0]], dtype=int, device=self.device)
 
     def device_elements(self, kind: PairKind) -> wp.array:

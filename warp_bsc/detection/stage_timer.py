@@ -34,7 +34,7 @@ class StageTimer:
         milliseconds: dict[str, float] = {}
         start = self._start
         for name, end in self._ends:
-            passed = wp.get_event_elapsed_time(start, end) if self._device.is_cuda else 1000.0 * (end - start)
+            passed = wp.get_event_elapsed_time(start, end) if isinstance(end, wp.Event) else 1000.0 * (end - start)
             milliseconds[name] = milliseconds.get(name, 0.0) + passed
             start = end
         return milliseconds
@@ -43,6 +43,7 @@ class StageTimer:
         return self._device is None or self._device.is_capturing
 
     def _now(self) -> Any:  # wp.Event, or seconds
+        assert self._device is not None  # else it is idle
         if not self._device.is_cuda:
             return time.perf_counter()
         event = wp.Event(self._device, enable_timing=True)

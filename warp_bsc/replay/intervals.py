@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..detection.collisions import DetectionStats
+from ..detection.collisions import Collisions, DetectionStats
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..usd.scene import Scene
@@ -131,6 +131,7 @@ def replay(
             mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
             detector = CollisionDetector(mesh, method=method)
         collisions = detector.detect(interval.x0, interval.x1)
+        assert isinstance(collisions, Collisions)  # nothing is captured here
         contacts = find_contacts(interval, detector.mesh, collisions, scene.selection)
         validation = None
         if validate_most != 0:

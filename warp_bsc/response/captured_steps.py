@@ -1,6 +1,7 @@
 """Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import newton
 import warp as wp
@@ -48,7 +49,9 @@ class CapturedSteps:
         self._state = list(state)
         if self._report is not None:
             self._state.append(self._report._totals_values)
-        self._saved = [wp.clone(x) if isinstance(x, wp.array) else solver.model.state() for x in self._state]
+        self._saved: list[Any] = [  # each of the type of its state
+            wp.clone(x) if isinstance(x, wp.array) else solver.model.state() for x in self._state
+        ]
         self._graph = None
         self.retaken = 0
 
@@ -83,4 +86,5 @@ class CapturedSteps:
 
     def _count_lost(self):
         """Returns the steps so far for which the buffers of a graph may have been too small."""
+        assert self._report is not None
         return self._report.undetected_steps + self._report.lost_gradients

@@ -1,6 +1,6 @@
 """The collision mesh of a Newton model: cloth, the surfaces of soft bodies, and rigid shapes cut into triangles."""
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,10 @@ _BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": Fals
 """Options of a ``newton.Mesh`` whose triangles alone are used."""
 
 
-class ShapeVertices(NamedTuple):
+_Array = TypeVar("_Array", np.ndarray, wp.array)
+
+
+class ShapeVertices(NamedTuple, Generic[_Array]):
     """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
 
     Attributes:
@@ -26,12 +29,12 @@ class ShapeVertices(NamedTuple):
         shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
     """
 
-    position: np.ndarray | wp.array
-    body: np.ndarray | wp.array
-    shape: np.ndarray | wp.array
+    position: _Array
+    body: _Array
+    shape: _Array
 
 
-class Planes(NamedTuple):
+class Planes(NamedTuple, Generic[_Array]):
     """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
 
     Attributes:
@@ -42,11 +45,11 @@ class Planes(NamedTuple):
         world: World of the plane, -1 for all worlds, int32, shape [n].
     """
 
-    point: np.ndarray | wp.array
-    normal: np.ndarray | wp.array
-    body: np.ndarray | wp.array
-    shape: np.ndarray | wp.array
-    world: np.ndarray | wp.array
+    point: _Array
+    normal: _Array
+    body: _Array
+    shape: _Array
+    world: _Array
 
 
 class ModelMesh(CollisionMesh):
@@ -80,17 +83,17 @@ class ModelMesh(CollisionMesh):
             NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
                 cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
         """
-        particle_world = model.particle_world.numpy()
+        particle_world = _finalized(model.particle_world).numpy()
         if model.world_count == 1:
             particle_world = np.zeros_like(particle_world)
         elif (particle_world < 0).any():
             raise NotImplementedError(
                 f"particle {np.argmax(particle_world < 0)} is in all of {model.world_count} worlds; add it to one world"
             )
-        shape_body, shape_world = model.shape_body.numpy(), model.shape_world.numpy()
-        shape_type, shape_scale = model.shape_type.numpy(), model.shape_scale.numpy()
-        transform = model.shape_transform.numpy().astype(np.float64)
-        collides = (model.shape_flags.numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
+        shape_body, shape_world = _finalized(model.shape_body).numpy(), _finalized(model.shape_world).numpy()
+        shape_type, shape_scale = _finalized(model.shape_type).numpy(), _finalized(model.shape_scale).numpy()
+        transform = _finalized(model.shape_transform).numpy().astype(np.float64)
+        collides = (_finalized(model.shape_flags).numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
         infinite = (shape_type == GeoType.PLANE) & (shape_scale[:, :2] <= 0.0).any(axis=1)
 
         tessellations = {}
@@ -129,7 +132,7 @@ class ModelMesh(CollisionMesh):
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
 
-    def _on_device(self, values):
+    def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
         return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
 
@@ -199,6 +202,12 @@ def _write_inverse_masses(
     if particle_flags[particle] & ParticleFlags.ACTIVE:
         inverse_mass = particle_inv_mass[particle]
     inverse_masses[particle] = inverse_mass
+
+
+def _finalized(array: wp.array | None) -> wp.array:
+    """Returns an array that a model has once it is finalized."""
+    assert array is not None
+    return array
 
 
 def _soft_faces(model):

@@ -5,6 +5,7 @@ import warp as wp
 
 from ..detection.intersections import find_intersections
 from .buffers import FROZEN, TRUNCATED
+from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .response import Response
 from .step_record import name_elements
@@ -83,9 +84,10 @@ class SolverReport:
         access, in exact arithmetic.
         """
         mesh = self._response.detector.mesh
+        assert isinstance(mesh, ModelMesh)
         particles = mesh.model.particle_count
         pairs = find_intersections(mesh, self._motion.vertices.x0)
-        of_particles = [(elements < particles).any(axis=1) for elements in (mesh.edges, mesh.faces)]
+        of_particles = [elements.min(axis=1) < particles for elements in (mesh.edges, mesh.faces)]
         return pairs[of_particles[0][pairs[:, 0]] | of_particles[1][pairs[:, 1]]]
 
     @property
@@ -93,6 +95,7 @@ class SolverReport:
         """Time of the last step that was not captured, without the inner solver [ms]; None if there was none."""
         if self._start is None:
             return None
+        assert self._end is not None
         if isinstance(self._start, wp.Event):
             return wp.get_event_elapsed_time(self._start, self._end)
         return 1e3 * (self._end - self._start)

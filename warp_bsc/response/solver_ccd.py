@@ -165,7 +165,8 @@ class SolverCCD(SolverBase):
 
     def _median_edge(self):
         """Returns the median edge length of cloth and soft bodies at rest [m]; 1 if they have no edges."""
-        rest = self.model.particle_q.numpy() if self.model.particle_count else np.zeros((0, 3))
+        particle_q = self.model.particle_q
+        rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
         edges = self.mesh.edges[self.mesh.edges[:, 1] < self.model.particle_count]
         lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
         return float(np.median(lengths)) if lengths.any() else 1.0
