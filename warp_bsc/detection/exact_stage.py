@@ -1,9 +1,10 @@
 """The exact stage: wide integers decide, on the device, the contacts that floating point cannot.
 
 Contacts that the stage before has enqueued are decided in integers of one limb a coordinate, see
-:mod:`warp_bsc.kernels.exact.decision`. Those whose exponents are too far apart for that go to the next queue, for two
-limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are too wide
-for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays small.
+:mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
+for two limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are
+too wide for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays
+small.
 """
 
 import functools
