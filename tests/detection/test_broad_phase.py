@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import warp_bsc as bsc
-from warp_bsc.detection.broad_phase_bvh import BroadPhaseBvh
+from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.settings import Count
 
@@ -58,7 +58,7 @@ def all_pairs(mesh, x0, x1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @given(
     faces=st.integers(1, 90),
@@ -85,7 +85,7 @@ def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat,
     assert find_pairs(broad_phase, mesh, x0, x1) == all_pairs(mesh, x0, x1)
 
 
-@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 def test_trees_of_several_levels(broad_phase):
     """A strip long enough for four levels of packets, whose pairs are known by counting."""
     n = 6000

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import warp as wp
 
-from .broad_phase_bvh import BroadPhaseBvh
+from .broad_phase_hierarchy import BroadPhaseHierarchy
 from .broad_phase_simd import BroadPhaseSimd
 from .mesh import CollisionMesh
 
@@ -78,11 +78,14 @@ class BroadPhase(Protocol):
         ...
 
 
-def make_broad_phase(mesh: CollisionMesh, count: wp.array) -> BroadPhase:
+def make_broad_phase(mesh: CollisionMesh, count: wp.array, *, capacity: int | None = None) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
 
     Args:
         mesh: The mesh.
         count: Number of pairs of faces found, zero before each run, array of one int64.
+        capacity: Capacity for pairs of faces at first, of a broad phase with a queue for them; None for the default.
     """
-    return (BroadPhaseSimd if mesh.device.is_cpu else BroadPhaseBvh)(mesh, count)
+    if mesh.device.is_cpu:
+        return BroadPhaseSimd(mesh, count)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity)
