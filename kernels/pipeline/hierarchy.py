@@ -155,9 +155,7 @@ def same_world(level: HierarchyLevel, i: int, other_level: HierarchyLevel, j: in
     """Returns whether two nodes may have faces in one world."""
     if not level.first_world:
         return True
-    return (
-        level.first_world[i] <= other_level.last_world[j] and other_level.first_world[j] <= level.last_world[i]
-    )
+    return level.first_world[i] <= other_level.last_world[j] and other_level.first_world[j] <= level.last_world[i]
 
 
 @wp.func

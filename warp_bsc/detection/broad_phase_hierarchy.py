@@ -372,7 +372,9 @@ def _pair_elements(
 
 
 @wp.func
-def _pair_edges_with_face(mesh: FaceHierarchy, face: int, other: int, counts: wp.array[wp.int64], pairs: wp.array[wp.vec2i]):
+def _pair_edges_with_face(
+    mesh: FaceHierarchy, face: int, other: int, counts: wp.array[wp.int64], pairs: wp.array[wp.vec2i]
+):
     """Enqueues the edges that a face owns with another face."""
     owned = mesh.owned[face]
     sides = wp.where(owned >> 3 == 0, 0, 3)
@@ -558,9 +560,7 @@ class BroadPhaseHierarchy:
         """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""
         threads = self._clusters * self._warps_of_cluster * WIDTH
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
-        wp.launch(
-            kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False
-        )
+        wp.launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
     def _pair_faces(self, x0, x1, changed=None):
         """Enqueues the pairs of faces whose swept boxes overlap, each once."""
@@ -572,6 +572,4 @@ class BroadPhaseHierarchy:
     def _launch_over_pairs(self, kernel, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
         blocks = most_blocks(self._device, 256)
-        wp.launch(
-            kernel, self.capacity, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False
-        )
+        wp.launch(kernel, self.capacity, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)

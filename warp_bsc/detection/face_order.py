@@ -71,7 +71,7 @@ def _visit(
 
 @wp.func
 def _split_at(begin: int, end: int):
-    """Returns where to split a part of more than a cluster: near the middle, between groups or else between clusters."""
+    """Returns where to split a part near the middle: between groups or else between clusters."""
     middle = (begin + end) / 2
     quarter = (end - begin) / 4
     split = (middle + _GROUP / 2) / _GROUP * _GROUP

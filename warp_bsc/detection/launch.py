@@ -14,11 +14,6 @@ __all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "most_blocks", 
 
 _THREADS = os.cpu_count() or 1
 
-_THREADS_OF_MULTIPROCESSOR = 2048
-"""Threads that a multiprocessor of a GPU holds at most."""
-_BLOCKS_OF_MULTIPROCESSOR = 32
-"""Blocks that it holds at most."""
-
 _threads = contextvars.ContextVar("threads", default=_THREADS)
 
 
@@ -50,17 +45,23 @@ def _may_share(kernel: wp.Kernel) -> bool:
     return mode == "release" and level != 0
 
 
-def most_blocks(device: wp.Device, block_dim: int) -> int:
-    """Returns how many blocks a launch over a queue needs, so that a capacity costs no more than what is filled.
+def most_blocks(device: wp.Device, block_dim: int, threads: int = 1024) -> int:
+    """Returns the most blocks of a launch over a queue, so that a capacity costs next to nothing beside what is filled.
 
-    These fill a GPU. Their threads go on to further entries, in a loop around Warp's kernel.
+    Their threads go on to further entries, in Warp's loop around a kernel.
+
+    Args:
+        device: The device.
+        block_dim: Threads of a block.
+        threads: Threads of a multiprocessor; twice as many as it holds balance the work, more cost time if the queue
+            is empty.
 
     Returns:
         The number of blocks; 0, without a limit, for the CPU and where Warp is configured to make no such loops.
     """
     if device.is_cpu or not getattr(wp.config, "default_grid_stride", True):
         return 0
-    return device.sm_count * max(1, min(_BLOCKS_OF_MULTIPROCESSOR, _THREADS_OF_MULTIPROCESSOR // block_dim))
+    return device.sm_count * max(1, threads // block_dim)
 
 
 def launch_over(
