@@ -16,6 +16,9 @@ GROUP = CLUSTER * CLUSTER
 _CLUSTER = wp.constant(CLUSTER)
 _GROUP = wp.constant(GROUP)
 
+_LARGE = wp.constant(4096)
+"""Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
+
 _LEAST_OWN_CLUSTER = 8
 """Connected components of fewer faces share clusters, so that at most three of four places are empty."""
 
@@ -35,7 +38,7 @@ def _visit(
     queue: wp.array[int],
     distance: wp.array[int],
 ):
-    """Writes the faces of a part to a queue, breadth first from a seed, and their distances; returns the last.
+    """Writes the faces of a part to a queue, breadth first from a seed, and their distances.
 
     The part is ``order[begin:end]``. Faces that the seed does not reach follow, in pieces, as if they were next to the
     last.
@@ -66,7 +69,6 @@ def _visit(
                         distance[other] = steps
                         queue[filled] = other
                         filled += 1
-    return queue[end - 1]
 
 
 @wp.func
@@ -145,7 +147,15 @@ def _coordinate(axis: int, face: int, distances: wp.array2d[int]):
         return v
     if axis == 2:
         return u + v
-    return u - v
+    if axis == 3:
+        return u - v
+    if axis == 4:
+        return 2 * u + v
+    if axis == 5:
+        return 2 * u - v
+    if axis == 6:
+        return u + 2 * v
+    return u - 2 * v
 
 
 @wp.func
@@ -155,21 +165,25 @@ def _sort(
     axis: int,
     order: wp.array[int],
     distances: wp.array2d[int],
-    # out
+    # scratch
+    keys: wp.array[int],
     buckets: wp.array[int],
+    # out
     sorted_faces: wp.array[int],
 ):
     """Sorts the faces of a part along an axis, by counting."""
     lowest = _coordinate(axis, order[begin], distances)
     highest = lowest
     for i in range(begin, end):
-        coordinate = _coordinate(axis, order[i], distances)
-        lowest = wp.min(lowest, coordinate)
-        highest = wp.max(highest, coordinate)
+        key = _coordinate(axis, order[i], distances)
+        lowest = wp.min(lowest, key)
+        highest = wp.max(highest, key)
+        keys[i] = key
         buckets[i] = 0
     width = (highest - lowest) / (end - begin) + 1
     for i in range(begin, end):
-        bucket = begin + (_coordinate(axis, order[i], distances) - lowest) / width
+        bucket = begin + (keys[i] - lowest) / width
+        keys[i] = bucket
         buckets[bucket] = buckets[bucket] + 1
     place = int(begin)
     for i in range(begin, end):
@@ -177,7 +191,7 @@ def _sort(
         buckets[i] = place
         place += size
     for i in range(begin, end):
-        bucket = begin + (_coordinate(axis, order[i], distances) - lowest) / width
+        bucket = keys[i]
         sorted_faces[buckets[bucket]] = order[i]
         buckets[bucket] = buckets[bucket] + 1
 
@@ -219,6 +233,7 @@ def _order_components(
     # scratch
     stack: wp.array2d[int],
     queue: wp.array[int],
+    keys: wp.array[int],
     buckets: wp.array[int],
     distances: wp.array2d[int],
 ):
@@ -233,12 +248,11 @@ def _order_components(
             begin = stack[depth, 0]
             end = stack[depth, 1]
             if end - begin > _CLUSTER:
-                pole = _visit(links, begin, end, order[begin], stamp + 1, order, place_of, visited, queue, distances[0])
+                stamp += 1
+                _visit(links, begin, end, order[begin], stamp, order, place_of, visited, queue, distances[0])
+                pole = queue[end - 1]
                 for i in range(4):
-                    stamp += 1
-                    if i == 1:
-                        pole = queue[end - 1]
-                    if i > 1:
+                    if i > 0:
                         pole = _farthest(begin, end, order, distances, i)
                     stamp += 1
                     _visit(links, begin, end, pole, stamp, order, place_of, visited, queue, distances[i])
@@ -247,14 +261,14 @@ def _order_components(
                 split = _split_at(begin, end)
                 best = int(0)
                 least = int(2147483647)
-                for axis in range(4):
-                    _sort(begin, end, axis, order, distances, buckets, queue)
+                for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
+                    _sort(begin, end, axis, order, distances, keys, buckets, queue)
                     stamp += 1
                     cut = _count_cut(links, begin, split, end, stamp, queue, place_of, visited)
                     if cut < least:
                         least = cut
                         best = axis
-                _sort(begin, end, best, order, distances, buckets, queue)
+                _sort(begin, end, best, order, distances, keys, buckets, queue)
                 for i in range(begin, end):
                     order[i] = queue[i]
                     place_of[queue[i]] = i
@@ -305,8 +319,9 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     """Returns the faces in an order in which each cluster of places is a compact patch of one connected component.
 
     Connectivity alone decides, so that the order stays good however the mesh moves. Each component is bisected until
-    its parts fit in clusters: a breadth-first search from a face at its rim visits the faces, and the first half of
-    these is one part. Time and memory grow with ``n log n``.
+    its parts fit in clusters. Breadth-first searches from four faces at its rim, far from one another, give each face
+    coordinates, the differences of its distances from two opposite ones. Of several directions in these coordinates
+    the one is halved whose halves share the fewest edges. Time grows with ``n log n``.
 
     Args:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].
@@ -322,23 +337,30 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     def on_host(values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device="cpu")
 
-    links = on_host(_links(faces))
-    order = np.arange(n) if world is None else np.argsort(world, kind="stable")
-    starts, count, queue = on_host(np.zeros(n)), on_host([0]), on_host(order)
-    inputs = [links, on_host(order), on_host(np.zeros(n)), starts, count, queue]
+    links = _links(faces)
+    order = on_host(np.arange(n) if world is None else np.argsort(world, kind="stable"))
+    starts, count, queue = on_host(np.zeros(n)), on_host(np.zeros(1)), wp.empty_like(order)
+    inputs = [on_host(links), order, on_host(np.zeros(n)), starts, count, queue]
     wp.launch(_find_components, 1, inputs=inputs, device="cpu", record_tape=False)
-    order = queue.numpy()
+
+    # neighbours get numbers close to one another, which processor caches reward
+    face_of = queue.numpy()
+    number_of = np.empty(n + 1, dtype=np.int32)
+    number_of[face_of] = np.arange(n)
+    number_of[-1] = -1
+    links = number_of[links[face_of]]
     starts = starts.numpy()[: count.numpy()[0]]
     sizes = np.diff(starts, append=n)
     places = _component_places(sizes)
-    place_of = np.empty(n, dtype=np.int32)
-    place_of[order] = np.arange(n) + np.repeat(places[:-1] - starts, sizes)
-    ordered = np.full(places[-1], -1, dtype=np.int32)
-    ordered[place_of] = np.arange(n)
+    place_of = np.arange(n) + np.repeat(places[:-1] - starts, sizes)
+    numbers = np.full(places[-1], -1, dtype=np.int32)
+    numbers[place_of] = np.arange(n)
+
     large = sizes > CLUSTER
-    result = on_host(ordered)
-    inputs = [links, on_host(places[:-1][large]), on_host(sizes[large]), result, on_host(place_of)]
-    inputs += [on_host(np.zeros(n)), wp.empty((64, 2), dtype=int, device="cpu")]
-    inputs += [wp.empty_like(result), wp.empty_like(result), wp.empty((4, n), dtype=int, device="cpu")]
+    result = on_host(numbers)
+    scratch = [wp.empty((64, 2), dtype=int, device="cpu"), *(wp.empty_like(result) for _ in range(3))]
+    scratch.append(wp.empty((4, n), dtype=int, device="cpu"))
+    inputs = [on_host(links), on_host(places[:-1][large]), on_host(sizes[large])]
+    inputs += [result, on_host(place_of), on_host(np.zeros(n)), *scratch]
     wp.launch(_order_components, 1, inputs=inputs, device="cpu", record_tape=False)
-    return result.numpy().copy()
+    return np.where(result.numpy() < 0, -1, face_of[result.numpy()])
