@@ -58,6 +58,27 @@ def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
     ...
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here, whose result nothing waits for
+    const unsigned mask = __activemask();
+    int total = 0;
+    for (int bit = 0; bit < 6; ++bit)
+        total += __popc(__ballot_sync(mask, (amount >> bit) & 1)) << bit;
+    if ((threadIdx.x & 31) == __ffs(mask) - 1 && total > 0)
+        atomicAdd((unsigned long long*)&counts.data[queue], (unsigned long long)total);
+#else
+    if (amount != 0)
+        __atomic_fetch_add(&counts.data[queue], (wp::int64)amount, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def raise_count(counts: wp.array[wp.int64], queue: int, amount: int):
+    """Raises the count of a queue by an amount below 64."""
+    ...
+
+
 @wp.func
 def write(pair: wp.vec2i, queue: wp.array[wp.vec2i], slot: wp.int64):
     """Writes a pair to a slot of a queue, if its capacity allows."""

@@ -195,3 +195,19 @@ def test_a_traversal_with_another_visit():
     assert counted[mesh.face_order < 0].sum() == 0
     # each quad has one pair within, and four with each of its 8 neighbours
     assert counted.sum() == 400 + 4 * (2 * 20 * 19 + 2 * 19 * 19)
+
+
+@pytest.mark.parametrize("dtype", [wp.vec3, wp.vec3d])
+def test_positions_that_are_not_finite_are_counted(dtype):
+    x0, _, faces = crumpled(0, 8)
+    mesh = bsc.CollisionMesh(faces, len(x0) + 2)
+    device = mesh.device
+    x0 = np.concatenate([x0, [[np.nan] * 3, [np.inf] * 3]])
+    x1 = x0.copy()
+    x0[3, 1], x1[3, 0], x1[50, 2] = np.nan, np.inf, -np.inf
+    used = wp.array(np.isin(np.arange(mesh.vertex_count), mesh.vertices), dtype=int, device=device)
+    for checked, expected in ((None, 4), (used, 2)):
+        counts = [wp.zeros(1, dtype=wp.int64, device=device) for _ in range(2)]
+        finder = BroadPhaseHierarchy(mesh, counts[0], not_finite=counts[1], checked=checked)
+        finder.fit(*(wp.array(x, dtype=dtype, device=device) for x in (x0, x1)))
+        assert counts[1].numpy()[0] == expected

@@ -25,7 +25,7 @@ from ..kernels.pipeline.hierarchy import (
     overlapping_faces,
 )
 from ..kernels.pipeline.pairs import owns_edge, owns_vertex
-from ..kernels.pipeline.queues import append, is_filled, take_slots, write
+from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slots, write
 from .launch import most_blocks
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, Count, capacity_for
@@ -37,7 +37,10 @@ _QUEUED = wp.constant(int(Count.QUEUED))
 
 _WIDTH = wp.constant(WIDTH)
 
-_WARPS_OF_MULTIPROCESSOR = 32
+_UNGROUPED = 8
+"""Number of groups up to which their boxes are not worth a launch, and all of them are traversed."""
+
+_WARPS_OF_MULTIPROCESSOR = 64
 """Warps that a multiprocessor of a GPU should have at least in a traversal."""
 _MOST_WARPS_OF_CLUSTER = 8
 _TRAVERSAL_BLOCK = 64
@@ -60,7 +63,7 @@ class FaceHierarchy:
         face_boxes: Box of the face at each place.
         places: Level of the faces.
         clusters: Level above.
-        groups: Highest level.
+        groups: Highest level; without arrays in a small mesh, where all groups are traversed.
     """
 
     order: wp.array[int]
@@ -100,7 +103,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     if checked:
                         found = checked[i]
                     if found != 0:
-                        take_slots(not_finite, 0, 1)
+                        raise_count(not_finite, 0, 1)
             start = rounded(x0[i])
             end = rounded(x1[i])
             mesh.vertex_boxes[i, 0] = start
@@ -181,8 +184,13 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
         high = mesh.clusters.uppers[cluster]
         own_group = cluster / _WIDTH
         turn = int(0)
-        for first_group in range(own_group, mesh.groups.lowers.shape[0], _WIDTH):
-            groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
+        count = (mesh.clusters.lowers.shape[0] - 1) / _WIDTH + 1
+        for first_group in range(own_group, count, _WIDTH):
+            groups = wp.uint32(0)
+            if mesh.groups.lowers:
+                groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
+            else:
+                groups = ~from_place(count - first_group)
             while groups != wp.uint32(0):
                 group = first_group + lowest_place(groups)
                 groups = groups & (groups - wp.uint32(1))
@@ -347,8 +355,8 @@ def _pair_elements(
     vertices = _overlapping_vertices(mesh, face, other, keep_separated)
     vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_separated) << 6)
     edges = _overlapping_edges(mesh, face, other, keep_separated)
-    take_slots(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
-    take_slots(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
+    raise_count(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
+    raise_count(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
     # of the rest only what no axis separates
     vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
     edges = edges >> 9
@@ -429,6 +437,12 @@ def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
     return np.stack([first.min(axis=1), last.max(axis=1)])
 
 
+def _group_count(places: int) -> int:
+    """Returns the number of groups that have boxes."""
+    groups = -(-places // (WIDTH * WIDTH))
+    return groups if groups > _UNGROUPED else 0
+
+
 def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
     """Allocates the hierarchy of a mesh on its device."""
     device, order = mesh.device, mesh.face_order
@@ -451,11 +465,12 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
         # empty places have the worlds of the faces before, which keeps those of nodes
         filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
         worlds = np.stack([world[filled], world[filled]])
-    clusters = len(order) // WIDTH
+    clusters, groups = len(order) // WIDTH, _group_count(len(order))
     hierarchy.places = _level(len(order), worlds, device)
     worlds = _parents(worlds)
     hierarchy.clusters = _level(clusters, worlds, device)
-    hierarchy.groups = _level(-(-clusters // WIDTH), _parents(worlds), device)
+    if groups:
+        hierarchy.groups = _level(groups, _parents(worlds), device)
     return hierarchy
 
 
@@ -492,6 +507,7 @@ class BroadPhaseHierarchy:
         places = len(mesh.face_order)
         self._elements = max(mesh.vertex_count, len(mesh.edges), places)
         self._clusters = places // WIDTH
+        self._groups = _group_count(places)
         self._warps_of_cluster = 1
         if device.is_cuda and self._clusters:
             wanted = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
@@ -552,9 +568,9 @@ class BroadPhaseHierarchy:
         inputs, outputs = [x0, x1, changed, self._checked, self.hierarchy], [self._not_finite]
         kernel = _box_elements(x0.dtype)
         wp.launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
-        nodes = self.hierarchy.groups.lowers.shape[0] * WIDTH
-        inputs = [self.hierarchy.clusters, self.hierarchy.groups]
-        wp.launch(_box_groups, nodes, inputs=inputs, device=self._device, record_tape=False)
+        if self._groups:
+            inputs = [self.hierarchy.clusters, self.hierarchy.groups]
+            wp.launch(_box_groups, WIDTH * self._groups, inputs=inputs, device=self._device, record_tape=False)
 
     def traverse(self, kernel: wp.Kernel, arguments: Any) -> None:
         """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""
