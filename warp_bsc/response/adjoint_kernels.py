@@ -24,6 +24,7 @@ from .constraints import (
     contact_weights,
     feasible,
     feasible_in_contact,
+    is_excluded,
     longest_path,
     to_double,
     to_single,
@@ -370,7 +371,7 @@ def count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, record
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
     corners = contact_vertices(contacts, i)
-    if wp.min(corners) >= motion.movable:
+    if is_excluded(motion, contacts, i, corners):
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]

@@ -3,6 +3,7 @@
 import warp as wp
 
 __all__ = [
+    "DIVIDED",
     "FROZEN",
     "NEVER",
     "PROJECTED",
@@ -17,8 +18,9 @@ __all__ = [
     "allocate_vertices",
 ]
 
-PROJECTED, TRUNCATED, FROZEN = (wp.constant(bit) for bit in (1, 2, 4))
-"""Bits of the outcome of a vertex: constraints moved it, its path was cut, it was left where it was."""
+PROJECTED, DIVIDED, TRUNCATED, FROZEN = (wp.constant(bit) for bit in (1, 2, 4, 8))
+"""Bits of the outcome of a vertex: constraints moved it, a dividing plane did, its path was cut, it was left where it
+was."""
 
 NEVER = wp.constant(wp.int64(2**62))
 """The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
@@ -34,7 +36,6 @@ class Motion:
     inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved
     friction: wp.array[float]  # coefficient
     world: wp.array[int]
-    movable: int  # vertices from here on belong to shapes: contacts of only these do not count
 
 
 @wp.struct
@@ -48,7 +49,7 @@ class Vertices:
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
     first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
-    outcome: wp.array[int]  # bits of PROJECTED, TRUNCATED, FROZEN
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
 
 
 @wp.struct
@@ -85,8 +86,10 @@ class SolveStatus:
     iteration: wp.array[int]  # iterations of detect and project so far
     certified: wp.array[int]  # 1 if the last detection was complete and found no contact
     hits: wp.array[int]  # contacts found so far by the detection in progress
+    crossed_hits: wp.array[int]  # of elements that crossed at the start, found so far by the detection in progress
     first_hits: wp.array[int]  # contacts of the wanted motion
     remaining: wp.array[int]  # contacts that the last detection found
+    excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
 
@@ -105,7 +108,8 @@ class Progress:
 
     status: SolveStatus
     sweep: SweepStatus
-    max_iterations: int  # of detect and project; after them paths are truncated
+    max_iterations: int  # of detect and project; after them vertices are divided, or their paths truncated
+    max_truncations: int  # iterations of that; after them vertices are frozen
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
 
 

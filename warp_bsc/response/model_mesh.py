@@ -8,7 +8,7 @@ from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["ModelMesh", "Planes", "ShapeVertices"]
+__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices"]
 
 _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
@@ -52,6 +52,14 @@ class Planes(NamedTuple, Generic[_Array]):
     world: _Array
 
 
+@wp.struct
+class Incidence:
+    """The elements that each element belongs to: those of element ``i`` are ``items[first[i]:first[i + 1]]``."""
+
+    first: wp.array[int]
+    items: wp.array[int]
+
+
 class ModelMesh(CollisionMesh):
     """The triangles of a Newton model that particles can collide with, as one mesh.
 
@@ -71,6 +79,8 @@ class ModelMesh(CollisionMesh):
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
+        device_vertex_edges: The edges of each vertex, :class:`Incidence`.
+        device_edge_faces: The faces of each edge, :class:`Incidence`.
     """
 
     def __init__(self, model: Model):
@@ -129,6 +139,9 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
+        self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
+        face_edges = self.device_face_edges.numpy()
+        self.device_edge_faces = _incidence(face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
 
@@ -208,6 +221,18 @@ def _finalized(array: wp.array | None) -> wp.array:
     """Returns an array that a model has once it is finalized."""
     assert array is not None
     return array
+
+
+def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
+    """Returns the rows of ``elements`` that each of ``count`` numbers is in; negative numbers are left out."""
+    numbers = elements.ravel()
+    rows = np.repeat(np.arange(len(elements)), elements.shape[1])
+    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+    incidence = Incidence()
+    first = np.concatenate([[0], np.cumsum(np.bincount(numbers[order], minlength=count))])
+    incidence.first = wp.array(first, dtype=int, device=device)
+    incidence.items = wp.array(rows[order], dtype=int, device=device)
+    return incidence
 
 
 def _soft_faces(model):

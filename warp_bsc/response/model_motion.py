@@ -48,7 +48,6 @@ class ModelMotion:
         for name in ("x0", "x1", "velocity"):
             setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
         vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
-        vertices.movable = mesh.model.particle_count
         self.planes = planes = MovingPlanes()
         planes.friction, planes.world = plane_friction, mesh.device_planes.world
         for name in ("start", "end"):

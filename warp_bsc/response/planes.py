@@ -4,11 +4,14 @@ import warp as wp
 
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import PLANE_CONTACT, add_constraint, count_contact, to_double, update_first_contact, widened
+from .dividing_planes import DividingPlanes, add_plane
 
 __all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transform_planes"]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
+_MARGIN = wp.constant(wp.float64(0.1))
+"""Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
 _ZERO = wp.constant(wp.float64(0.0))
 
 _KERNEL = {"enable_backward": False}
@@ -76,6 +79,7 @@ def collect_penetrations(
     vertices: Vertices,
     planes: MovingPlanes,
     constraints: Constraints,
+    dividing: DividingPlanes,
     progress: Progress,
     separation: wp.float64,
     ahead: bool,
@@ -118,4 +122,9 @@ def collect_penetrations(
                 _ZERO,
             )
         else:
+            if dividing.first:
+                plane = planes.end[i]
+                normal = wp.vec3d(plane[0], plane[1], plane[2])
+                margin = _MARGIN * separation
+                add_plane(dividing, vertex, normal, plane[3] + wp.min(wp.float64(2.0) * error_after, margin), margin)
             update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)

@@ -19,6 +19,7 @@ from .constraints import (
     relative,
     to_double,
 )
+from .exclusion import Connectivity, crossed_at_start, is_movable
 
 __all__ = ["Proximities", "closest_vector", "collect_proximities", "drop_proximities"]
 
@@ -35,6 +36,7 @@ _KERNEL = {"enable_backward": False}
 class Proximities:
     """The candidate pairs of one kind, among which proximities are looked for."""
 
+    mesh: Connectivity
     edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
@@ -94,7 +96,7 @@ def collect_proximities(
     if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
-    if wp.min(corners) >= motion.movable or not is_projecting(progress, motion.world[corners[0]]):
+    if not is_movable(motion, corners) or not is_projecting(progress, motion.world[corners[0]]):
         return
     if is_slow(motion, corners, near.edges) == 0:
         return
@@ -104,6 +106,8 @@ def collect_proximities(
     distance = wp.length(between)
     path = longest_path(motion, corners)
     if distance == _ZERO or distance > wp.max(path, _REACH * separation):
+        return
+    if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
         return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = feasible(separation, distance, separation, path)

@@ -20,8 +20,10 @@ from .buffers import (
     allocate_constraints,
     allocate_vertices,
 )
-from .constraints import MAX_ITERATIONS, Contacts, collect_contacts
-from .kernels import decide, drop_if_full, freeze_undetected, record_offsets, truncate_vertices
+from .constraints import MAX_DIVISIONS, MAX_ITERATIONS, MAX_TRUNCATIONS, Contacts
+from .dividing_planes import DividingPlanes, allocate_dividing_planes
+from .exclusion import Connectivity
+from .kernels import collect_contacts, decide, drop_if_full, freeze_undetected, record_offsets, truncate_vertices
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .planes import collect_penetrations
@@ -46,6 +48,8 @@ MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
 
 _MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
+_DIVIDING_PLANES = 16
+"""Capacity for dividing planes, for each particle."""
 _ITERATIONS_RESERVED = 2
 """Iterations for whose contacts constraints are reserved."""
 
@@ -103,6 +107,9 @@ class Response:
         self.worlds = max(1, mesh.model.world_count)
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
+        self._connectivity = connectivity = Connectivity()
+        connectivity.faces, connectivity.edges = mesh.device_faces, mesh.device_edges
+        connectivity.vertex_edges, connectivity.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
         self._status_values = wp.zeros(len(SolveStatus.vars), dtype=int, device=device)
         self.status = name_elements(SolveStatus, self._status_values)
         self._sweep_values = wp.zeros(len(SweepStatus.vars), dtype=int, device=device)
@@ -118,6 +125,8 @@ class Response:
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self._most_penetrations = self._movable * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
+        self._dividing_planes = allocate_dividing_planes(self._movable, _DIVIDING_PLANES * self._movable + 1024, device)
+        self._dividing: DividingPlanes  # none in a step that is recorded, as the adjoint has no such planes
         self.constraints = allocate_constraints(0, device)
         self._retired = []
 
@@ -150,6 +159,10 @@ class Response:
         self._motion, self._recorder = motion, record
         wanted, vertices = motion.vertices, self.vertices
         self._record = StepRecord()  # which records nothing
+        self._dividing = self._dividing_planes if record is None else DividingPlanes()
+        self._progress.max_truncations = MAX_DIVISIONS if record is None else int(MAX_TRUNCATIONS)
+        self._dividing_planes.count.zero_()
+        self._dividing_planes.first.fill_(-1)
         if record is not None:
             if not self.device.is_capturing:
                 record.reserve_entries(_MIN_ENTRIES)
@@ -181,7 +194,7 @@ class Response:
 
     def _collect_penetrations(self, ahead):
         motion = self._motion
-        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._progress]
+        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._dividing, self._progress]
         self._launch_over_particles(collect_penetrations, [*inputs, self.separation, ahead])
 
     def _collect_near_pairs(self):
@@ -193,6 +206,7 @@ class Response:
         def collect() -> None:
             for narrow_phase, elements in self._with_elements():
                 near = Proximities()
+                near.mesh = self._connectivity
                 near.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
                 near.elements, near.pairs, near.counts = elements, narrow_phase.queue, narrow_phase.counts
                 inputs = [motion, vertices, near, self.constraints, self._progress, self.separation]
@@ -269,7 +283,8 @@ class Response:
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
             self._record = self._recorder.reserve_truncations(self._movable)
-        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, *self._contacts(), dt]
+        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, self._dividing]
+        inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._detect(refit=True)
 
@@ -288,7 +303,7 @@ class Response:
         inputs = [self.constraints, self._record, self._most_contacts]
         wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
         for contacts in self._contacts():
-            inputs = [motion, vertices, contacts, self.constraints, progress, self.separation]
+            inputs = [motion, vertices, contacts, self.constraints, self._dividing, progress, self.separation]
             self._launch_over(collect_contacts, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
             if self._recorder is not None:
                 inputs = [motion, vertices, contacts, self._record]
@@ -302,6 +317,7 @@ class Response:
         for narrow_phase, elements in self._with_elements():
             found = narrow_phase.contacts
             contacts = Contacts()
+            contacts.mesh = self._connectivity
             contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
             contacts.elements, contacts.counts = elements, narrow_phase.counts
             contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.within_tolerance
