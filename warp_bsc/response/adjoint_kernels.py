@@ -364,10 +364,8 @@ def truncate_paths(
     velocity[entry] = to_single(path / dt)
 
 
-@wp.kernel(enable_backward=False)
-def count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, record: StepRecord):
-    """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
-    i = wp.tid()
+@wp.func
+def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: int, record: StepRecord):
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
     corners = contact_vertices(contacts, i)
@@ -377,3 +375,11 @@ def count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, record
     at = contacts.coordinates[i]
     impact = _impact(motion, vertices, corners, kind, contacts.localized[i], contacts.toi[i], at, contacts.normal[i])
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)
+
+
+@wp.kernel(enable_backward=False)
+def count_grazing(motion: Motion, vertices: Vertices, vertex_face: Contacts, edge_edge: Contacts, record: StepRecord):
+    """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
+    i = wp.tid()
+    _count_grazing(motion, vertices, vertex_face, i, record)
+    _count_grazing(motion, vertices, edge_edge, i, record)

@@ -5,7 +5,7 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
-from .buffers import DIVIDED, FROZEN, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
+from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
     PLANE_CONTACT,
@@ -28,7 +28,15 @@ from .dividing_planes import DividingPlanes, add_dividing_planes, position_on_si
 from .exclusion import crossed_at_start, is_movable
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
-__all__ = ["collect_contacts", "decide", "drop_if_full", "freeze_undetected", "record_offsets", "truncate_vertices"]
+__all__ = [
+    "begin_step",
+    "collect_contacts",
+    "decide",
+    "drop_if_full",
+    "freeze_undetected",
+    "record_offsets",
+    "truncate_vertices",
+]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 
@@ -36,20 +44,63 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.kernel(**_KERNEL)
-def collect_contacts(
+def begin_step(
+    # in
+    motion: Motion,
+    worlds: int,
+    # out
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+):
+    """Initializes the vertices by what is wanted of them, and clears everything else."""
+    i = wp.tid()
+    if i == 0:
+        status = progress.status
+        status.active[0] = 0
+        status.unfinished[0] = 0
+        status.iteration[0] = 0
+        status.certified[0] = 0
+        status.hits[0] = 0
+        status.crossed_hits[0] = 0
+        status.first_hits[0] = 0
+        status.remaining[0] = 0
+        status.excluded[0] = 0
+        status.newly_frozen[0] = 0
+        status.undetected[0] = 0
+        status.truncated[0] = 0
+        status.frozen[0] = 0
+        status.lost[0] = 0
+        constraints.count[0] = 0
+        dividing.count[0] = 0
+    if i < worlds:
+        progress.contact_iteration[i] = -1
+    if i >= vertices.x1.shape[0]:
+        return
+    vertices.x1[i] = motion.x1[i]
+    vertices.velocity[i] = motion.velocity[i]
+    for axis in range(3):
+        vertices.particle_delta_x[i, axis] = wp.int64(0)
+        vertices.particle_delta_v[i, axis] = wp.int64(0)
+    vertices.first_contact[i] = NEVER
+    vertices.changed[i] = 0
+    vertices.outcome[i] = wp.where(motion.is_lost[i] != 0, LOST, 0)
+    dividing.first[i] = -1
+
+
+@wp.func
+def _collect_contact(
     motion: Motion,
     vertices: Vertices,
     contacts: Contacts,
+    i: int,
     constraints: Constraints,
     dividing: DividingPlanes,
     progress: Progress,
     separation: wp.float64,
 ):
-    """Counts the contacts, and adds constraints for them; after the last projection, dividing planes.
-
-    Then it finds the first contact of each vertex as well.
-    """
-    i = wp.tid()
+    """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
     corners = contact_vertices(contacts, i)
@@ -92,6 +143,26 @@ def collect_contacts(
 
 
 @wp.kernel(**_KERNEL)
+def collect_contacts(
+    motion: Motion,
+    vertices: Vertices,
+    vertex_face: Contacts,
+    edge_edge: Contacts,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Counts the contacts of both kinds, and adds constraints for them; after the last projection, dividing planes.
+
+    Then it finds the first contact of each vertex as well.
+    """
+    i = wp.tid()
+    _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, progress, separation)
+    _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, progress, separation)
+
+
+@wp.kernel(**_KERNEL)
 def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
     if constraints.count[0] > constraints.vertices.shape[0] - needed:
@@ -110,7 +181,7 @@ def record_offsets(constraints: Constraints, progress: Progress, record: StepRec
 
 
 @wp.kernel(**_KERNEL)
-def decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
+def decide(constraints: Constraints, progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed."""
     overflowed = bool(False)
     for i in range(counts.shape[0]):
@@ -129,6 +200,7 @@ def decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[
     status.undetected[0] = wp.where(overflowed, 1, 0)
     status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
+    status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
 
 
 @wp.func

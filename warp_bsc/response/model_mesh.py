@@ -8,7 +8,7 @@ from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices"]
+__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "vertex_position"]
 
 _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
@@ -167,6 +167,14 @@ class ModelMesh(CollisionMesh):
         Raises:
             ValueError: If an array has another length.
         """
+        self.check_lengths(particle_q, body_q, out)
+        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
+
+    def check_lengths(
+        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
+    ) -> None:
+        """Raises ValueError if an array as of :meth:`positions` has another length."""
         for name, array, count in (
             ("particle_q", particle_q, self.model.particle_count),
             ("body_q", body_q, self.model.body_count),
@@ -175,8 +183,6 @@ class ModelMesh(CollisionMesh):
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
-        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
-        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
 
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
@@ -188,22 +194,35 @@ class ModelMesh(CollisionMesh):
         wp.launch(_write_inverse_masses, model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def _write_positions(
+@wp.func
+def vertex_position(
+    vertex: int,
     particle_q: wp.array[wp.vec3],
     body_q: wp.array[wp.transform],
     shape_vertex_position: wp.array[wp.vec3],
     shape_vertex_body: wp.array[int],
+) -> wp.vec3:
+    """Returns the position of a vertex of a :class:`ModelMesh` [m], see :meth:`ModelMesh.positions`."""
+    i = vertex - particle_q.shape[0]
+    if i < 0:
+        return particle_q[vertex]
+    if shape_vertex_body[i] < 0:
+        return shape_vertex_position[i]
+    return wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_positions(
+    # in
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    shape_vertex_position: wp.array[wp.vec3],
+    shape_vertex_body: wp.array[int],
+    # out
     positions: wp.array[wp.vec3],
 ):
     vertex = wp.tid()
-    i = vertex - particle_q.shape[0]
-    if i < 0:
-        positions[vertex] = particle_q[vertex]
-    elif shape_vertex_body[i] < 0:
-        positions[vertex] = shape_vertex_position[i]
-    else:
-        positions[vertex] = wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+    positions[vertex] = vertex_position(vertex, particle_q, body_q, shape_vertex_position, shape_vertex_body)
 
 
 @wp.kernel(enable_backward=False, module="unique")

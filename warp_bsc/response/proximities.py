@@ -77,22 +77,16 @@ def closest_vector(motion: Motion, corners: wp.vec4i, edges: int):
     return weights, relative(weights, corners, motion.x0)
 
 
-@wp.kernel(**_KERNEL)
-def collect_proximities(
+@wp.func
+def _collect_proximity(
     motion: Motion,
     vertices: Vertices,
     near: Proximities,
+    i: int,
     constraints: Constraints,
     progress: Progress,
     separation: wp.float64,
 ):
-    """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
-
-    In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
-    the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs
-    whose closest points are within both elements are used, because others soon are those of other elements.
-    """
-    i = wp.tid()
     if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
@@ -114,6 +108,27 @@ def collect_proximities(
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     normal = between / distance
     add_constraint(motion, vertices, constraints, corners, weights, normal, target, friction, 1, kind, True, _ZERO)
+
+
+@wp.kernel(**_KERNEL)
+def collect_proximities(
+    motion: Motion,
+    vertices: Vertices,
+    vertex_face: Proximities,
+    edge_edge: Proximities,
+    constraints: Constraints,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
+
+    In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
+    the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs
+    whose closest points are within both elements are used, because others soon are those of other elements.
+    """
+    i = wp.tid()
+    _collect_proximity(motion, vertices, vertex_face, i, constraints, progress, separation)
+    _collect_proximity(motion, vertices, edge_edge, i, constraints, progress, separation)
 
 
 @wp.kernel(**_KERNEL)
