@@ -37,7 +37,7 @@ def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
     const unsigned lower = (1u << lane) - 1u;
     int before = 0;
     int total = 0;
-    for (int bit = 0; bit < 5; ++bit) {
+    for (int bit = 0; bit < 6; ++bit) {
         const unsigned with_bit = __ballot_sync(mask, (amount >> bit) & 1);
         before += __popc(with_bit & lower) << bit;
         total += __popc(with_bit) << bit;
@@ -54,7 +54,7 @@ def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
 """
 )
 def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
-    """Raises the count of a queue by an amount below 32, and returns what it was: the first of the slots taken."""
+    """Raises the count of a queue by an amount below 64, and returns what it was: the first of the slots taken."""
     ...
 
 

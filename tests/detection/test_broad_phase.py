@@ -5,11 +5,13 @@ import pytest
 import warp as wp
 from hypothesis import example, given
 from hypothesis import strategies as st
+from sheets import crumpled, grid
 
 import warp_bsc as bsc
-from warp_bsc.detection.broad_phase_bvh import BroadPhaseBvh
+from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy, traversal_kernel
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.settings import Count
+from warp_bsc.kernels.pipeline.hierarchy import count_places
 
 
 def find_pairs(broad_phase, mesh, x0, x1):
@@ -58,7 +60,7 @@ def all_pairs(mesh, x0, x1):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @given(
     faces=st.integers(1, 90),
@@ -85,7 +87,7 @@ def test_all_pairs_are_found_once(broad_phase, dtype, faces, size, worlds, flat,
     assert find_pairs(broad_phase, mesh, x0, x1) == all_pairs(mesh, x0, x1)
 
 
-@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseBvh])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 def test_trees_of_several_levels(broad_phase):
     """A strip long enough for four levels of packets, whose pairs are known by counting."""
     n = 6000
@@ -103,3 +105,93 @@ def test_trees_of_several_levels(broad_phase):
     for found, short, long in zip([vertex_face, edge_edge, edge_face], expected, longer, strict=True):
         assert len(found) == len(set(found))
         assert len(found) == len(long) + (n - 60) * (len(long) - len(short)) // 10
+
+
+@pytest.mark.parametrize("faces", [[], [[0, 1, 2]], [[0, 1, 1]], [[0, 1, 2]] * 70, [[0, 1, 2], [3, 4, 5]] * 20])
+def test_few_faces_and_many_alike(faces):
+    x0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 3)).astype(np.float32)
+    mesh = bsc.CollisionMesh(np.array(faces, dtype=np.int32), len(x0))
+    x1 = x0[::-1].copy()
+    assert find_pairs(BroadPhaseHierarchy, mesh, x0, x1) == all_pairs(mesh, x0, x1)
+
+
+def face_pairs(mesh, x0, x1, changed=None):
+    """Pairs of faces that a hierarchy enqueues, sorted within and among each other."""
+    device = mesh.device
+    count = wp.zeros(1, dtype=wp.int64, device=device)
+    finder = BroadPhaseHierarchy(mesh, count, capacity=4_000_000)
+    positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
+    finder._pair_faces(*positions, None if changed is None else wp.array(changed, dtype=int, device=device))
+    pairs = mesh.face_order[finder._face_pairs.numpy()[: count.numpy()[0]]]
+    return sorted(map(tuple, np.sort(pairs, axis=1).tolist()))
+
+
+def overlapping_faces(mesh, x0, x1):
+    """The same from boxes sorted along an axis."""
+    points = np.concatenate([x0[mesh.faces], x1[mesh.faces]], axis=1)
+    low, high = points.min(axis=1), points.max(axis=1)
+    order = np.argsort(low[:, 0], kind="stable")
+    found = []
+    for i, face in enumerate(order):
+        others = order[i + 1 : np.searchsorted(low[order, 0], high[face, 0], side="right")]
+        others = others[((low[face] <= high[others]) & (low[others] <= high[face])).all(axis=1)]
+        if mesh.world is not None:
+            others = others[mesh.world[mesh.faces[others, 0]] == mesh.world[mesh.faces[face, 0]]]
+        found += [(min(face, other), max(face, other)) for other in others.tolist()]
+    return sorted((int(a), int(b)) for a, b in found)
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_many_groups(worlds):
+    """More groups of clusters than a warp tests at once, of one sheet that moves through itself."""
+    n = 132 if worlds == 1 else 76
+    x0, x1, faces = crumpled(0, n)
+    world = None
+    if worlds > 1:
+        world = np.repeat(np.arange(worlds)[::-1], len(x0))
+        faces = np.concatenate([faces + len(x0) * i for i in range(worlds)])
+        x0, x1 = (np.tile(x, (worlds, 1)) for x in (x0, x1))
+    mesh = bsc.CollisionMesh(faces, len(x0), world=world)
+    assert len(mesh.face_order) > 33 * 1024 or worlds > 1
+    found = face_pairs(mesh, x0, x1)
+    assert len(found) > 10 * len(faces)
+    assert found == overlapping_faces(mesh, x0, x1)
+
+
+def test_pairs_of_faces_of_which_one_has_changed():
+    x0, x1, faces = crumpled(0)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    everything = overlapping_faces(mesh, x0, x1)
+    random = np.random.default_rng(0)
+    for share in (0.0, 0.001, 0.1, 1.0):
+        changed = (random.random(len(x0)) < share).astype(np.int32) * random.integers(1, 3, len(x0)).astype(np.int32)
+        changes = (changed[mesh.faces] != 0).any(axis=1)
+        expected = [(a, b) for a, b in everything if changes[a] or changes[b]]
+        assert face_pairs(mesh, x0, x1, changed) == expected
+
+
+@wp.struct
+class _Visits:
+    faces: wp.array[int]
+
+
+@wp.func
+def _count_visit(place: int, first: int, found: wp.uint32, visits: _Visits):
+    wp.atomic_add(visits.faces, place, count_places(found))
+
+
+def test_a_traversal_with_another_visit():
+    """A kernel that counts, for each face, the pairs that it is visited for."""
+    x, faces = grid(20)
+    mesh = bsc.CollisionMesh(faces, len(x))
+    device = mesh.device
+    finder = BroadPhaseHierarchy(mesh, wp.zeros(1, dtype=wp.int64, device=device))
+    x = wp.array(x, dtype=wp.vec3, device=device)
+    finder.fit(x, x)
+    visits = _Visits()
+    visits.faces = wp.zeros(len(mesh.face_order), dtype=int, device=device)
+    finder.traverse(traversal_kernel(_count_visit, _Visits), visits)
+    counted = visits.faces.numpy()
+    assert counted[mesh.face_order < 0].sum() == 0
+    # each quad has one pair within, and four with each of its 8 neighbours
+    assert counted.sum() == 400 + 4 * (2 * 20 * 19 + 2 * 19 * 19)

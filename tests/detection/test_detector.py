@@ -11,7 +11,7 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.broad_phase_bvh import BroadPhaseBvh
+from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.intersections import find_intersections
 from warp_bsc.detection.launch import retry_until_fits
@@ -22,12 +22,12 @@ from warp_bsc.kernels.signs import FREE
 METHODS = ("float", "conservative", "exact")
 
 
-@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseBvh], ids=["simd", "bvh"])
+@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseHierarchy], ids=["simd", "bvh"])
 def broad_phase(request, monkeypatch, device):
     """Both broad phases where both run, whatever the detector would choose."""
     if device.is_cuda and request.param is BroadPhaseSimd:
         pytest.skip("SIMD packets are for the CPU")
-    chosen = "BroadPhaseSimd" if device.is_cpu else "BroadPhaseBvh"
+    chosen = "BroadPhaseSimd" if device.is_cpu else "BroadPhaseHierarchy"
     monkeypatch.setattr(f"warp_bsc.detection.broad_phase.{chosen}", request.param)
     return request.param
 
@@ -283,8 +283,8 @@ def test_queues_with_room_for_one_entry_grow(broad_phase):
     assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
     detector = bsc.CollisionDetector(mesh)
     pipeline = detector._pipeline
-    assert bool(pipeline._broad_phase.buffers) == (broad_phase is BroadPhaseBvh)
-    if broad_phase is BroadPhaseBvh:
+    assert bool(pipeline._broad_phase.buffers) == (broad_phase is BroadPhaseHierarchy)
+    if broad_phase is BroadPhaseHierarchy:
         pipeline._broad_phase._face_pairs = wp.empty(1, dtype=wp.vec2i)
     for narrow_phase in pipeline.narrow_phases:
         narrow_phase.queue = wp.empty(1, dtype=wp.vec2i)

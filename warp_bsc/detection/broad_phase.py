@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
 import warp as wp
 
-from .broad_phase_bvh import BroadPhaseBvh
+from .broad_phase_hierarchy import BroadPhaseHierarchy
 from .broad_phase_simd import BroadPhaseSimd
 from .mesh import CollisionMesh
 
@@ -78,11 +79,27 @@ class BroadPhase(Protocol):
         ...
 
 
-def make_broad_phase(mesh: CollisionMesh, count: wp.array) -> BroadPhase:
+def make_broad_phase(
+    mesh: CollisionMesh,
+    count: wp.array,
+    *,
+    capacity: int | None = None,
+    not_finite: wp.array | None = None,
+    checked_vertices: np.ndarray | None = None,
+) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
 
     Args:
         mesh: The mesh.
         count: Number of pairs of faces found, zero before each run, array of one int64.
+        capacity: Capacity for pairs of faces at first, on a GPU; None for the default.
+        not_finite: Number of vertices with a position that is not finite, array of one int64, which a run on a GPU adds
+            to; None to count none.
+        checked_vertices: Indices of the vertices that are counted; None for all.
     """
-    return (BroadPhaseSimd if mesh.device.is_cpu else BroadPhaseBvh)(mesh, count)
+    if mesh.device.is_cpu:
+        return BroadPhaseSimd(mesh, count)
+    checked = None
+    if checked_vertices is not None and len(checked_vertices) < mesh.vertex_count:
+        checked = wp.array(np.isin(np.arange(mesh.vertex_count), checked_vertices), dtype=int, device=mesh.device)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked)

@@ -7,22 +7,26 @@ import warp as wp
 
 from ..kernels.classification import classify
 from ..kernels.closest import contact_at
-from ..kernels.culling import (
-    centroid_direction,
-    direction_separates,
-    edge_edge_boxes_apart,
-    vertex_face_boxes_apart,
-)
+from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
-from ..kernels.polynomials import coplanarity
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
-from ..kernels.time_of_impact import impact
+from ..kernels.time_of_impact import Impact, impact
 from .contact_buffer import ContactBuffer
 from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, PairKind
 
-__all__ = ["PairKernels", "gather_contacts", "pair_kernels"]
+__all__ = [
+    "PairKernels",
+    "PairStages",
+    "batch_culling_kernel",
+    "culling_kernel",
+    "gather_contacts",
+    "pad_keys",
+    "pair_kernels",
+]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -33,37 +37,216 @@ _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _REFUTED = wp.constant(int(Count.REFUTED))
 
 
-class PairKernels(NamedTuple):
-    """The kernels for one kind of pair and one type of position, in the order in which they run."""
+@wp.struct
+class PairStages:
+    """The pairs of one kind in all stages of the narrow phase; without arrays there are none.
 
-    cull: wp.Kernel
-    cull_batches: wp.Kernel
+    Attributes:
+        elements: Vertex indices of the faces or edges.
+        counts: Counts by :class:`Count`.
+        queue: The pairs to decide.
+        survivors: Pairs that no cull decides.
+        contacts: Survivors that classification does not certify free.
+        keys: Sorting keys of the contacts.
+        order: Indices of the contacts, to be sorted by their keys.
+        for_exact: Indices of contacts for the exact stage.
+        second_bits: Bits of the second element in a key.
+        last_key: Key of what is no contact, greater than those of contacts.
+    """
+
+    elements: wp.array2d[int]
+    counts: wp.array[wp.int64]
+    queue: wp.array[wp.vec2i]
+    survivors: wp.array[wp.vec2i]
+    contacts: ContactBuffer
+    keys: wp.array[wp.int64]
+    order: wp.array[int]
+    for_exact: wp.array[int]
+    second_bits: int
+    last_key: wp.int64
+
+
+class PairKernels(NamedTuple):
+    """The kernels after the culls for one type of position, in the order in which they run.
+
+    One launch covers both kinds of pair, because a launch costs time even if its queue is empty: first the capacity of
+    the vertex-face pairs, then that of the edge-edge pairs.
+    """
+
     classify_survivors: wp.Kernel
     find_impacts: wp.Kernel
     find_contact_points: wp.Kernel
 
 
+@wp.func
+def _kind_at(i: int, capacity: int):
+    """Returns the kind of pair of a thread, and the place in the queue of that kind, whose first has a capacity."""
+    if i < capacity:
+        return VERTEX_FACE, i
+    return EDGE_EDGE, i - capacity
+
+
+@wp.func
+def _pair_at(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int):
+    """Returns entry i of a queue, (-1, -1) if it has not been written."""
+    if is_filled(i, queue, counts, count):
+        return queue[i]
+    return wp.vec2i(-1, -1)
+
+
+@wp.func
+def _enqueue_contact(pair: wp.vec2i, status: int, stages: PairStages):
+    slot = take_slot(stages.counts, _CONTACTS)
+    if slot < wp.int64(stages.contacts.pairs.shape[0]):
+        stages.contacts.pairs[wp.int32(slot)] = pair
+        stages.contacts.status[wp.int32(slot)] = wp.int8(status)
+
+
+@wp.func
+def _write_impact(i: int, result: Impact, stages: PairStages):
+    contacts = stages.contacts
+    contacts.status[i] = wp.int8(result.status)
+    contacts.within_tolerance[i] = result.localized == 1
+    contacts.toi[i] = result.toi
+    contacts.coordinates[i] = result.coordinates
+    contacts.normal[i] = result.normal
+
+
+@wp.func
+def _decide(i: int, pair: wp.vec2i, status: int, timed: bool, stages: PairStages):
+    """Counts a contact by its status, makes its sorting key, and enqueues it for the exact stage if that is needed."""
+    contacts = stages.contacts
+    contacts.decided[i] = wp.int8(status)
+    stages.order[i] = i
+    if status == FREE:
+        stages.keys[i] = stages.last_key
+        return
+    stages.keys[i] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+    take_slot(stages.counts, _FOUND)
+    if status == UNSURE:
+        take_slot(stages.counts, _UNSURE)
+    if status == UNSURE or (timed and not contacts.within_tolerance[i]):
+        stages.for_exact[wp.int32(take_slot(stages.counts, _FOR_EXACT))] = i
+
+
 @functools.cache
-def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
-    """Returns the kernels for one kind of pair and one type of position, each in a module of its own."""
-    kind_number = int(kind)
+def pair_kernels(dtype: type) -> PairKernels:
+    """Returns the kernels for one type of position, each in a module of its own."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def classify_survivors(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        # in and out
+        vertex_face: PairStages,
+        edge_edge: PairStages,
+    ):
+        kind, i = _kind_at(first + wp.tid(), vertex_face.survivors.shape[0])
+        pair = wp.vec2i()
+        if kind == VERTEX_FACE:
+            pair = _pair_at(i, vertex_face.survivors, vertex_face.counts, _SURVIVORS)
+        else:
+            pair = _pair_at(i, edge_edge.survivors, edge_edge.counts, _SURVIVORS)
+        if pair[0] < 0:
+            return
+        v = wp.vec4i()
+        if kind == VERTEX_FACE:
+            v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
+        else:
+            v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+        status = classify(motion, coplanarity(motion))
+        if status != FREE:
+            if kind == VERTEX_FACE:
+                _enqueue_contact(pair, status, vertex_face)
+            else:
+                _enqueue_contact(pair, status, edge_edge)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_impacts(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        # in and out
+        vertex_face: PairStages,
+        edge_edge: PairStages,
+    ):
+        kind, i = _kind_at(first + wp.tid(), vertex_face.contacts.pairs.shape[0])
+        pair = wp.vec2i()
+        if kind == VERTEX_FACE:
+            pair = _pair_at(i, vertex_face.contacts.pairs, vertex_face.counts, _CONTACTS)
+        else:
+            pair = _pair_at(i, edge_edge.contacts.pairs, edge_edge.counts, _CONTACTS)
+        if pair[0] < 0:
+            return
+        v = wp.vec4i()
+        status = int(0)
+        if kind == VERTEX_FACE:
+            v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
+            status = int(vertex_face.contacts.status[i])
+        else:
+            v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
+            status = int(edge_edge.contacts.status[i])
+        if timed or status != HIT:
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            result = impact(motion, coplanarity(motion), status, tolerance)
+            status = result.status
+            if kind == VERTEX_FACE:
+                _write_impact(i, result, vertex_face)
+            else:
+                _write_impact(i, result, edge_edge)
+        if kind == VERTEX_FACE:
+            _decide(i, pair, status, timed, vertex_face)
+        else:
+            _decide(i, pair, status, timed, edge_edge)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_contact_points(
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        kind: int,
+        # in
+        pairs: wp.array[wp.vec2i],
+        toi: wp.array[wp.float64],
+        # out
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+    ):
+        i = wp.tid()
+        v = vertices_of_pair(kind, elements, pairs[i])
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+        at, direction = contact_at(motion, toi[i])
+        coordinates[i] = at
+        normal[i] = direction
+
+    return PairKernels(classify_survivors, find_impacts, find_contact_points)
+
+
+@functools.cache
+def culling_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that culls on a GPU, for one kind of pair and one type of position.
+
+    Each kind has its own, because one for both takes an eighth more registers, which costs more than a launch.
+    """
     vertex_face = kind == PairKind.VERTEX_FACE
+    kind_number = int(kind)
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
-
-    if vertex_face:
-
-        @wp.func
-        def four_points(x: wp.array[dtype], elements: wp.array2d[int], pair: wp.vec2i):
-            face = pair[1]
-            return x[pair[0]], x[elements[face, 0]], x[elements[face, 1]], x[elements[face, 2]]
-    else:
-
-        @wp.func
-        def four_points(x: wp.array[dtype], elements: wp.array2d[int], pair: wp.vec2i):
-            first = pair[0]
-            second = pair[1]
-            return x[elements[first, 0]], x[elements[first, 1]], x[elements[second, 0]], x[elements[second, 1]]
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull(
@@ -71,21 +254,16 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        elements: wp.array2d[int],
         roundoff: wp.float64,
-        # in
-        queue: wp.array[wp.vec2i],
         # in and out
-        counts: wp.array[wp.int64],
-        # out
-        survivors: wp.array[wp.vec2i],
+        stages: PairStages,
     ):
-        i = first + wp.tid()
-        if not is_filled(i, queue, counts, _QUEUED):
+        pair = _pair_at(first + wp.tid(), stages.queue, stages.counts, _QUEUED)
+        if pair[0] < 0:
             return
-        pair = queue[i]
-        a0, b0, c0, d0 = four_points(x0, elements, pair)
-        a1, b1, c1, d1 = four_points(x1, elements, pair)
+        v = vertices_of_pair(kind_number, stages.elements, pair)
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
@@ -95,9 +273,15 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         # last, because in single precision queued pairs always pass; but exact at any scale
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
-        append(pair, survivors, counts, _SURVIVORS)
+        append(pair, stages.survivors, stages.counts, _SURVIVORS)
 
-    cull_batch = cull_batch_of(dtype, vertex_face)
+    return cull
+
+
+@functools.cache
+def batch_culling_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position."""
+    cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_batches(
@@ -105,124 +289,34 @@ def pair_kernels(kind: PairKind, dtype: type) -> PairKernels:
         # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        elements: wp.array2d[int],
         roundoff: wp.float64,
-        # in
-        queue: wp.array[wp.vec2i],
         # in and out
-        counts: wp.array[wp.int64],
-        # out
-        survivors: wp.array[wp.vec2i],
+        stages: PairStages,
     ):
         i = BATCH * (first + wp.tid())
-        filled = wp.int32(wp.min(counts[_QUEUED], wp.int64(queue.shape[0])))
-        left = cull_batch(x0, x1, elements, queue, i, wp.min(BATCH, filled - i), roundoff)
+        filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
+        left = cull_batch(x0, x1, stages.elements, stages.queue, i, wp.min(BATCH, filled - i), roundoff)
         while left != wp.uint64(0):
             lane = lowest_bit(left)
-            append(queue[i + lane], survivors, counts, _SURVIVORS)
+            append(stages.queue[i + lane], stages.survivors, stages.counts, _SURVIVORS)
             left = left & (left - wp.uint64(1))
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def classify_survivors(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        roundoff: wp.float64,
-        # in
-        survivors: wp.array[wp.vec2i],
-        # in and out
-        counts: wp.array[wp.int64],
-        # out
-        contacts: ContactBuffer,
-    ):
-        i = first + wp.tid()
-        if not is_filled(i, survivors, counts, _SURVIVORS):
-            return
-        pair = survivors[i]
-        a0, b0, c0, d0 = four_points(x0, elements, pair)
-        a1, b1, c1, d1 = four_points(x1, elements, pair)
-        motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        status = classify(motion, coplanarity(motion))
-        if status != FREE:
-            slot = take_slot(counts, _CONTACTS)
-            if slot < wp.int64(contacts.pairs.shape[0]):
-                contacts.pairs[wp.int32(slot)] = pair
-                contacts.status[wp.int32(slot)] = wp.int8(status)
+    return cull_batches
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def find_impacts(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        roundoff: wp.float64,
-        timed: bool,
-        tolerance: wp.float64,
-        first_bits: int,
-        second_bits: int,
-        # in and out
-        counts: wp.array[wp.int64],
-        contacts: ContactBuffer,
-        # out
-        keys: wp.array[wp.int64],
-        order: wp.array[int],
-        for_exact: wp.array[int],
-    ):
-        i = first + wp.tid()
-        if i >= contacts.pairs.shape[0]:
-            return
-        order[i] = i
-        # stays where there is no contact, which sorts it behind the others
-        keys[i] = wp.int64(1) << wp.int64(first_bits + second_bits)
-        if not is_filled(i, contacts.pairs, counts, _CONTACTS):
-            return
-        pair = contacts.pairs[i]
-        status = int(contacts.status[i])
-        if timed or status != HIT:
-            a0, b0, c0, d0 = four_points(x0, elements, pair)
-            a1, b1, c1, d1 = four_points(x1, elements, pair)
-            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-            result = impact(motion, coplanarity(motion), status, tolerance)
-            status = result.status
-            contacts.status[i] = wp.int8(status)
-            contacts.within_tolerance[i] = result.localized == 1
-            contacts.toi[i] = result.toi
-            contacts.coordinates[i] = result.coordinates
-            contacts.normal[i] = result.normal
-        contacts.decided[i] = wp.int8(status)
-        if status != FREE:
-            keys[i] = (wp.int64(pair[0]) << wp.int64(second_bits)) | wp.int64(pair[1])
-            take_slot(counts, _FOUND)
-            if status == UNSURE:
-                take_slot(counts, _UNSURE)
-            if status == UNSURE or (timed and not contacts.within_tolerance[i]):
-                for_exact[wp.int32(take_slot(counts, _FOR_EXACT))] = i
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def find_contact_points(
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        # in
-        pairs: wp.array[wp.vec2i],
-        toi: wp.array[wp.float64],
-        # out
-        coordinates: wp.array[wp.vec3d],
-        normal: wp.array[wp.vec3d],
-    ):
-        i = wp.tid()
-        a0, b0, c0, d0 = four_points(x0, elements, pairs[i])
-        a1, b1, c1, d1 = four_points(x1, elements, pairs[i])
-        motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
-        at, direction = contact_at(motion, toi[i])
-        coordinates[i] = at
-        normal[i] = direction
-
-    return PairKernels(cull, cull_batches, classify_survivors, find_impacts, find_contact_points)
+@wp.kernel(**NO_GRADIENTS)
+def pad_keys(
+    first: int,
+    # in
+    counts: wp.array[wp.int64],
+    last_key: wp.int64,
+    # out
+    keys: wp.array[wp.int64],
+):
+    """Writes the last key behind the contacts."""
+    i = first + wp.tid()
+    if wp.int64(i) >= counts[_CONTACTS]:
+        keys[i] = last_key
 
 
 @wp.kernel(**NO_GRADIENTS)

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 import warp as wp
 
-__all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "one_core", "retry_until_fits"]
+__all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "most_blocks", "one_core", "retry_until_fits"]
 
 _THREADS = os.cpu_count() or 1
 
@@ -45,6 +45,25 @@ def _may_share(kernel: wp.Kernel) -> bool:
     return mode == "release" and level != 0
 
 
+def most_blocks(device: wp.Device, block_dim: int, threads: int = 1024) -> int:
+    """Returns the most blocks of a launch over a queue, so that a capacity costs next to nothing beside what is filled.
+
+    Their threads go on to further entries, in Warp's loop around a kernel.
+
+    Args:
+        device: The device.
+        block_dim: Threads of a block.
+        threads: Threads of a multiprocessor; twice as many as it holds balance the work, more cost time if the queue
+            is empty.
+
+    Returns:
+        The number of blocks; 0, without a limit, for the CPU and where Warp is configured to make no such loops.
+    """
+    if device.is_cpu or not getattr(wp.config, "default_grid_stride", True):
+        return 0
+    return device.sm_count * max(1, threads // block_dim)
+
+
 def launch_over(
     kernel: wp.Kernel,
     count: int,
@@ -54,18 +73,28 @@ def launch_over(
     device: wp.Device,
     block_dim: int = 256,
     chunk: int = 1024,
+    max_blocks: int = 0,
 ) -> None:
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
     The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
-    suit kernels in which few threads work long. A core takes at least ``chunk`` entries at a time.
+    suit kernels in which few threads work long. A core takes at least ``chunk`` entries at a time. At most
+    ``max_blocks`` blocks run on a GPU, 0 for any number.
 
     Raises:
         RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
     """
     if device.is_cuda:
-        inputs = [0, *inputs]
-        wp.launch(kernel, count, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim, record_tape=False)
+        wp.launch(
+            kernel,
+            count,
+            inputs=[0, *inputs],
+            outputs=outputs,
+            device=device,
+            max_blocks=max_blocks,
+            block_dim=block_dim,
+            record_tape=False,
+        )
         return
     if device.is_capturing:
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
@@ -93,6 +122,8 @@ def launch_over_queue(
 ) -> None:
     """Launches a kernel over a queue: its filled entries on the CPU; all on a GPU, without synchronizing.
 
+    On a GPU a large capacity costs next to nothing, see :func:`most_blocks`.
+
     Args:
         kernel: The kernel, with a first argument as for :func:`launch_over`.
         queue: The queue.
@@ -106,7 +137,15 @@ def launch_over_queue(
     entries = len(queue)
     if device.is_cpu:
         entries = min(entries, int(counts.numpy()[count]))
-    launch_over(kernel, entries, inputs=inputs, outputs=outputs, device=device, block_dim=block_dim)
+    launch_over(
+        kernel,
+        entries,
+        inputs=inputs,
+        outputs=outputs,
+        device=device,
+        block_dim=block_dim,
+        max_blocks=most_blocks(device, block_dim),
+    )
 
 
 class GrowingBuffers(Protocol):

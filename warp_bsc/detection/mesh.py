@@ -1,11 +1,13 @@
 """The collision mesh: the part of a triangle mesh that takes part in collision detection."""
 
+import functools
 from numbers import Integral
 
 import numpy as np
 import warp as wp
 
 from .._arrays import checked_shape
+from .face_order import order_faces
 from .settings import PairKind
 
 __all__ = ["CollisionMesh"]
@@ -20,6 +22,10 @@ class CollisionMesh:
     Attributes:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].
         edges: Vertex indices of the edges, smaller first, sorted, int32, shape [edge_count, 2].
+        face_edges: Edges of the faces, edge i from corner i to the next, -1 where both are one vertex, int32, shape
+            [face_count, 3].
+        owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pipeline.pairs`, int32, shape
+            [face_count].
         vertices: Indices of the vertices that faces use, sorted, int32, shape [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
@@ -78,17 +84,20 @@ class CollisionMesh:
         np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
         first_sides = first_sides[proper]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
+        self.face_edges, self.owned = face_edges.astype(np.int32), owned
         self.vertex_count = int(vertex_count)
         self.device = wp.get_device(device)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.device_face_edges = wp.array(face_edges, dtype=int, device=self.device)
-        self.device_owned = wp.array(owned, dtype=int, device=self.device)
-        self.world = self.device_face_world = None
+        self.world = None
         if world is not None:
             self.world = self._checked_world(world)
-            self.device_face_world = wp.array(self.world[self.faces[:, 0]], dtype=int, device=self.device)
+
+    @functools.cached_property
+    def face_order(self) -> np.ndarray:
+        """Face at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
+        return order_faces(self.faces, None if self.world is None else self.world[self.faces[:, 0]])
 
     def device_elements(self, kind: PairKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int."""

@@ -5,6 +5,7 @@ the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -14,12 +15,12 @@ from ..kernels.pipeline.batch_culling import BATCH
 from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
-from .kernels import gather_contacts, pair_kernels
-from .launch import launch_over, launch_over_queue
+from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
+from .launch import launch_over, launch_over_queue, most_blocks
 from .settings import TOLERANCE, UNLIMITED, Count, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
-__all__ = ["NarrowPhase", "decide_on_host"]
+__all__ = ["NarrowPhase", "decide_on_host", "run_narrow_phases"]
 
 
 class NarrowPhase:
@@ -117,66 +118,50 @@ class NarrowPhase:
             tolerance: Of the times of impact, as a share of the step.
             timer: Measures the stages.
         """
-        kernels = pair_kernels(self.kind, x0.dtype)
-        roundoff = 0.0 if method == "float" else ROUNDOFF
-        motion = [x0, x1, elements, roundoff]
-        counts, contacts = self.counts, self.contacts
+        run_narrow_phases([(self, elements)], x0, x1, method=method, timed=timed, tolerance=tolerance, timer=timer)
 
-        with timer.stage("cull"):
-            inputs, outputs = [*motion, self.queue], [counts, self._survivors]
-            if counts.device.is_cpu:
-                batches = -(-min(len(self.queue), int(counts.numpy()[Count.QUEUED])) // BATCH)
-                launch_over(
-                    kernels.cull_batches, batches, inputs=inputs, outputs=outputs, device=counts.device, chunk=16
-                )
-            else:
-                launch_over_queue(kernels.cull, self.queue, counts, Count.QUEUED, inputs=inputs, outputs=outputs)
+    def stages(self, elements: wp.array) -> PairStages:
+        """Returns the buffers as kernels take them, with the vertex indices of the faces or edges."""
+        stages = PairStages()
+        stages.elements, stages.counts = elements, self.counts
+        stages.queue, stages.survivors, stages.contacts = self.queue, self._survivors, self.contacts
+        stages.keys, stages.order, stages.for_exact = self._keys, self._order, self._for_exact[0]
+        stages.second_bits, stages.last_key = self._bits[1], self._last_key
+        return stages
 
-        with timer.stage("classify"):
-            launch_over_queue(
-                kernels.classify_survivors,
-                self._survivors,
-                counts,
-                Count.SURVIVORS,
-                inputs=[*motion, self._survivors],
-                outputs=[counts, contacts],
-            )
+    @property
+    def _last_key(self) -> int:
+        """Sorting key of what is no contact, which sorts it behind the others."""
+        return 1 << sum(self._bits)
 
-        with timer.stage("time of impact"):
-            launch_over_queue(
-                kernels.find_impacts,
-                contacts.pairs,
-                counts,
-                Count.CONTACTS,
-                inputs=[*motion, timed, tolerance, *self._bits],
-                outputs=[counts, contacts, self._keys, self._order, self._for_exact[0]],
-                block_dim=32,
-            )
-
-        if method == "exact":
-            with timer.stage("exact"):
-                launch_exact_stage(
-                    self.kind,
-                    x0,
-                    x1,
-                    elements,
-                    timed=timed,
-                    tolerance=tolerance,
-                    queues=self._for_exact,
-                    counts=counts,
-                    filled=Count.FOR_EXACT,
-                    too_wide=[Count.TOO_WIDE_1, Count.TOO_WIDE_2, Count.TOO_WIDE_8],
-                    refuted=Count.REFUTED,
-                    contacts=contacts,
-                    keys=self._keys,
-                    last_key=1 << sum(self._bits),
-                )
+    def decide_exactly(self, x0: wp.array, x1: wp.array, elements: wp.array, *, timed: bool, tolerance: float) -> None:
+        """Launches the exact stage over the contacts that the last run has left to it; arguments as of :meth:`run`."""
+        launch_exact_stage(
+            self.kind,
+            x0,
+            x1,
+            elements,
+            timed=timed,
+            tolerance=tolerance,
+            queues=self._for_exact,
+            counts=self.counts,
+            filled=Count.FOR_EXACT,
+            too_wide=[Count.TOO_WIDE_1, Count.TOO_WIDE_2, Count.TOO_WIDE_8],
+            refuted=Count.REFUTED,
+            contacts=self.contacts,
+            keys=self._keys,
+            last_key=self._last_key,
+        )
 
     def sort(self) -> None:
         """Launches the sorting of the contacts by their pairs, without synchronizing with a GPU."""
         entries = len(self.contacts.pairs)
-        if self.counts.device.is_cpu:
+        device = self.counts.device
+        if device.is_cpu:
             entries = min(entries, int(self.counts.numpy()[Count.CONTACTS]))
+        else:
+            inputs, outputs = [self.counts, self._last_key], [self._keys]
+            launch_over(pad_keys, entries, inputs=inputs, outputs=outputs, device=device)
         wp.utils.radix_sort_pairs(self._keys, self._order, entries, end_bit=sum(self._bits) + 1)
 
     def ordered_contacts(self, rows: int) -> ContactBuffer:
@@ -189,6 +174,68 @@ class NarrowPhase:
         inputs = [self.counts, self._order, self.contacts]
         launch_over(gather_contacts, rows, inputs=inputs, outputs=[ordered], device=self.counts.device)
         return ordered
+
+
+def run_narrow_phases(
+    narrow_phases: Sequence[tuple[NarrowPhase, wp.array]],
+    x0: wp.array,
+    x1: wp.array,
+    *,
+    method: str,
+    timed: bool = True,
+    tolerance: float = TOLERANCE,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages but the sorting over the queued pairs of both kinds, or of one.
+
+    A GPU decides both kinds in the same launches, without synchronizing.
+
+    Args:
+        narrow_phases: Narrow phases of different kinds, each with the vertex indices of its elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        method: As of :meth:`NarrowPhase.run`.
+        timed: As of :meth:`NarrowPhase.run`.
+        tolerance: As of :meth:`NarrowPhase.run`.
+        timer: Measures the stages.
+    """
+    device = x0.device
+    motion = [x0, x1, 0.0 if method == "float" else ROUNDOFF]
+    kernels = pair_kernels(x0.dtype)
+    stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
+
+    def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int, threads: int) -> None:
+        """Launches a kernel over a buffer of both kinds, of one after the other on the CPU and if they are too long."""
+        entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
+        together = [list(stages)]
+        if device.is_cpu or sum(entries.values()) >= 2**31:
+            together = [[kind] for kind in stages]
+        for kinds in together:
+            both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
+            dim = sum(entries[kind] for kind in kinds)
+            if device.is_cpu:
+                dim = min(dim, int(stages[kinds[0]].counts.numpy()[count]))
+            blocks = most_blocks(device, block_dim, threads)
+            inputs = [*motion, *arguments]
+            launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
+
+    with timer.stage("cull"):
+        for kind, s in stages.items():
+            if device.is_cpu:
+                batches = -(-min(len(s.queue), int(s.counts.numpy()[Count.QUEUED])) // BATCH)
+                kernel = batch_culling_kernel(kind, x0.dtype)
+                launch_over(kernel, batches, inputs=motion, outputs=[s], device=device, chunk=16)
+            else:
+                kernel = culling_kernel(kind, x0.dtype)
+                launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=motion, outputs=[s])
+    with timer.stage("classify"):
+        launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64, 512)
+    with timer.stage("time of impact"):
+        launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32, 512)
+    if method == "exact":
+        with timer.stage("exact"):
+            for narrow_phase, elements in narrow_phases:
+                narrow_phase.decide_exactly(x0, x1, elements, timed=timed, tolerance=tolerance)
 
 
 def decide_on_host(
@@ -233,9 +280,9 @@ def decide_on_host(
     times = wp.array(toi[again], dtype=wp.float64, device=x0.device)
     timed_pairs = wp.array(pairs[again], dtype=wp.vec2i, device=x0.device)
     wp.launch(
-        pair_kernels(kind, x0.dtype).find_contact_points,
+        pair_kernels(x0.dtype).find_contact_points,
         len(again),
-        inputs=[x0, x1, elements, timed_pairs, times],
+        inputs=[x0, x1, elements, int(kind), timed_pairs, times],
         outputs=[coordinates, normal],
         device=x0.device,
         record_tape=False,

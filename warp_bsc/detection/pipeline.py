@@ -6,11 +6,14 @@ import warp as wp
 
 from .broad_phase import make_broad_phase
 from .mesh import CollisionMesh
-from .narrow_phase import NarrowPhase
+from .narrow_phase import NarrowPhase, run_narrow_phases
 from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, PairKind, check_method, check_tolerance
 from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
+
+LEAST_CAPACITY = 4096
+"""Least capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
 
 _UNTIMED = StageTimer(None)
 
@@ -68,6 +71,7 @@ class DetectionPipeline:
         method: str = "conservative",
         tolerance: float = TOLERANCE,
         only_used_vertices: bool = False,
+        pairs_per_face: int | None = None,
     ):
         """Allocates the buffers on the mesh's device.
 
@@ -77,6 +81,9 @@ class DetectionPipeline:
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
+            pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together; a
+                half of it for survivors, an eighth for contacts. A large capacity costs memory, but no time. Default:
+                eight pairs of faces, one vertex-face and two edge-edge pairs.
 
         Raises:
             ValueError: If there is no such method, or the tolerance is out of range.
@@ -92,12 +99,21 @@ class DetectionPipeline:
         self._retired: list = []  # buffers that a CUDA graph may still write to
         self.counters = Counters(mesh.device)
         self.counts = self.counters.read()
-        self._broad_phase = make_broad_phase(mesh, self.counters.face_pairs)
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
-        self.vertex_face = NarrowPhase(
-            PairKind.VERTEX_FACE, self.counters.vertex_face, faces, elements=(vertices, faces)
+        face_pairs, vertex_face, edge_edge = 8 * faces, faces, 2 * faces
+        if pairs_per_face is not None:
+            face_pairs = vertex_face = edge_edge = min(max(pairs_per_face * faces, LEAST_CAPACITY), 2**31 - 1)
+        self._broad_phase = make_broad_phase(
+            mesh,
+            self.counters.face_pairs,
+            capacity=face_pairs,
+            not_finite=self.counters.not_finite,
+            checked_vertices=mesh.vertices if only_used_vertices else None,
         )
-        self.edge_edge = NarrowPhase(PairKind.EDGE_EDGE, self.counters.edge_edge, 2 * faces, elements=(edges, edges))
+        self.vertex_face = NarrowPhase(
+            PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
+        )
+        self.edge_edge = NarrowPhase(PairKind.EDGE_EDGE, self.counters.edge_edge, edge_edge, elements=(edges, edges))
         self.capacities = self._device_capacities()
 
     @property
@@ -121,28 +137,28 @@ class DetectionPipeline:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            refit: Whether to keep the tree of the run before, which is fast if little has moved since. Only then the
-                run can be captured in the body of a conditional node.
+            refit: Whether to keep the tree of the run before, which is fast if little has moved since. A GPU's never
+                changes.
             changed: Nonzero for each vertex whose motion has changed since the run before, or that was in a contact
                 then. Pairs without such a vertex have no contact again, and are excluded. Warp array of int; None for
                 all.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
             timer: Measures the stages.
-            side_stream: Stream for the vertex-face pairs; None to find one kind of pair after the other.
+            side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
         """
         self._captured |= bool(self.mesh.device.is_capturing)
         self.counters.array.zero_()
         with timer.stage("broad phase"):
             self._broad_phase.pair_elements(x0, x1, *self._queues(), refit=refit, changed=changed)
-            with wp.ScopedStream(side_stream):
+            if self.mesh.device.is_cpu:
                 self._launch_count_not_finite(x0, x1)
+        narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
+        run_narrow_phases(narrow_phases, x0, x1, method=self.method, tolerance=self.tolerance, timer=timer)
+        if not sort:
+            return
         for narrow_phase, stream in ((self.vertex_face, side_stream), (self.edge_edge, None)):
-            with wp.ScopedStream(stream):
-                elements = self.mesh.device_elements(narrow_phase.kind)
-                narrow_phase.run(x0, x1, elements, method=self.method, tolerance=self.tolerance, timer=timer)
-                if sort:
-                    with timer.stage("sort"):
-                        narrow_phase.sort()
+            with wp.ScopedStream(stream), timer.stage("sort"):
+                narrow_phase.sort()
         if side_stream is not None:
             wp.wait_stream(side_stream)
 
@@ -190,6 +206,7 @@ class DetectionPipeline:
         return wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)
 
     def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
+        """Launches the count on the CPU; the broad phase of a GPU counts while it boxes the elements."""
         vertices, device = self._checked_vertices, self.mesh.device
         dim = self.mesh.vertex_count if vertices is None else len(vertices)
         inputs, outputs = [x0, x1, vertices], [self.counters.not_finite]

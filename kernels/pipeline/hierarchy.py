@@ -1,0 +1,225 @@
+"""A hierarchy of boxes over faces in a fixed order: faces, clusters of 32 places, and groups of 32 clusters.
+
+On a GPU the threads of a warp work on a cluster together: each has one of its faces, and tests one child of a node. All
+threads of a warp must therefore call the functions below together. On the CPU, threads run one after the other, in
+order, and each tests all children.
+"""
+
+import warp as wp
+
+from .boxes import boxes_overlap
+
+WIDTH = 32
+"""Children of a node, and threads of a warp."""
+
+_WIDTH = wp.constant(WIDTH)
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x & 31;
+#else
+    return 0;
+#endif
+"""
+)
+def first_child() -> int:
+    """Returns the first child that a thread tests: the CPU's tests all, a GPU's only its own."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+"""
+)
+def child_step() -> int:
+    """Returns the step to the next child that a thread tests."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, found != 0);
+#else
+    return found;
+#endif
+"""
+)
+def union_of_warp(found: wp.uint32) -> wp.uint32:
+    """Returns the children that the threads of a warp have found, as bits, from those that each has tested."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2)
+        for (int axis = 0; axis < 3; ++axis)
+            x[axis] = fminf(x[axis], __shfl_xor_sync(0xffffffffu, x[axis], step));
+#endif
+    return x;
+"""
+)
+def _least_of_warp(x: wp.vec3) -> wp.vec3:
+    """Returns the least coordinates of the threads of a warp; those of the thread on the CPU."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(0xffffffffu, flag != 0) != 0;
+#else
+    return flag != 0;
+#endif
+"""
+)
+def _any_of_warp(flag: int) -> int:
+    """Returns whether any thread of a warp has a flag, as 0 or 1; on the CPU whether the thread has."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+"""
+)
+def lowest_place(bits: wp.uint32) -> int:
+    """Returns the place of the lowest bit that is set; there must be one."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+"""
+)
+def count_places(bits: wp.uint32) -> int:
+    """Returns the number of bits that are set."""
+    ...
+
+
+@wp.struct
+class HierarchyLevel:
+    """The nodes of one level: faces by place, clusters or groups.
+
+    Attributes:
+        lowers: Lowest coordinates over the time of the motion; higher than ``uppers`` where there is no face.
+        uppers: Highest coordinates over the time of the motion.
+        changed: Nonzero where pairs are wanted.
+        first_world: Least world of the faces below; no array if all faces are in one world.
+        last_world: Greatest world of the faces below.
+    """
+
+    lowers: wp.array[wp.vec3]
+    uppers: wp.array[wp.vec3]
+    changed: wp.array[int]
+    first_world: wp.array[int]
+    last_world: wp.array[int]
+
+
+@wp.func
+def fit_parent(child: int, low: wp.vec3, high: wp.vec3, changed: int, parents: HierarchyLevel):
+    """Writes the box of the parent of a child, from the boxes of all 32 children, one a thread."""
+    least = _least_of_warp(low)
+    greatest = -_least_of_warp(-high)
+    any_changed = _any_of_warp(changed)
+    parent = child / _WIDTH
+    if child % _WIDTH == 0:
+        parents.lowers[parent] = least
+        parents.uppers[parent] = greatest
+        parents.changed[parent] = any_changed
+    elif child_step() == 1:
+        parents.lowers[parent] = wp.min(parents.lowers[parent], least)
+        parents.uppers[parent] = wp.max(parents.uppers[parent], greatest)
+        parents.changed[parent] = parents.changed[parent] | any_changed
+
+
+@wp.func
+def same_world(level: HierarchyLevel, i: int, other_level: HierarchyLevel, j: int):
+    """Returns whether two nodes may have faces in one world."""
+    if not level.first_world:
+        return True
+    return level.first_world[i] <= other_level.last_world[j] and other_level.first_world[j] <= level.last_world[i]
+
+
+@wp.func
+def overlapping_children(
+    clusters: HierarchyLevel, cluster: int, low: wp.vec3, high: wp.vec3, level: HierarchyLevel, first: int
+):
+    """Returns which of 32 nodes of a level, from the first on, overlap a cluster with a box, as bits.
+
+    Nodes in other worlds, and nodes without a change if the cluster has none, do not overlap.
+    """
+    found = wp.uint32(0)
+    changed = clusters.changed[cluster]
+    count = wp.min(_WIDTH, level.lowers.shape[0] - first)
+    for child in range(first_child(), count, child_step()):
+        node = first + child
+        if boxes_overlap(low, high, level.lowers[node], level.uppers[node]):
+            if (changed | level.changed[node]) != 0 and same_world(clusters, cluster, level, node):
+                found = found | (wp.uint32(1) << wp.uint32(child))
+    return union_of_warp(found)
+
+
+@wp.func
+def changed_children(level: HierarchyLevel, first: int):
+    """Returns which of 32 nodes of a level, from the first on, have changed, as bits."""
+    found = wp.uint32(0)
+    count = wp.min(_WIDTH, level.lowers.shape[0] - first)
+    for child in range(first_child(), count, child_step()):
+        if level.changed[first + child] != 0:
+            found = found | (wp.uint32(1) << wp.uint32(child))
+    return union_of_warp(found)
+
+
+@wp.func
+def from_place(place: int):
+    """Returns the bits from a place on, in [0, 31]."""
+    return ~((wp.uint32(1) << wp.uint32(place)) - wp.uint32(1))
+
+
+@wp.func
+def overlapping_faces(faces: HierarchyLevel, place: int, first: int, candidates: wp.uint32, changed: wp.uint32):
+    """Returns which faces of a cluster overlap a face at a place, as bits, each pair of faces once.
+
+    Args:
+        faces: The level of faces.
+        place: Place of the face.
+        first: First place of the cluster, which is that of the face or a later one.
+        candidates: Places of the cluster to test, the same for all threads of a warp.
+        changed: Places of the cluster whose faces have changed.
+    """
+    low = faces.lowers[place]
+    high = faces.uppers[place]
+    wanted = candidates
+    if faces.changed[place] == 0:
+        wanted = wanted & changed
+    if first <= place:
+        own = wp.uint32(1) << wp.uint32(place - first)
+        wanted = wanted & ~(own | (own - wp.uint32(1)))
+    found = wp.uint32(0)
+    left = candidates
+    while left != wp.uint32(0):
+        bit = left & (~left + wp.uint32(1))
+        left = left ^ bit
+        other = first + lowest_place(bit)
+        if boxes_overlap(low, high, faces.lowers[other], faces.uppers[other]):
+            if (wanted & bit) != wp.uint32(0) and same_world(faces, place, faces, other):
+                found = found | bit
+    return found

@@ -1,0 +1,575 @@
+"""The broad phase of a GPU: one traversal of a hierarchy of boxes over the faces finds all pairs of elements.
+
+The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
+compact however a mesh moves. A run only fits its boxes. Faces without neighbours have no such order, and are compared
+by brute force in the worst case, 1,024 pairs of faces at a time.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.pipeline.boxes import boxes_apart, boxes_overlap, rounded
+from ..kernels.pipeline.hierarchy import (
+    WIDTH,
+    HierarchyLevel,
+    changed_children,
+    count_places,
+    fit_parent,
+    from_place,
+    lowest_place,
+    overlapping_children,
+    overlapping_faces,
+)
+from ..kernels.pipeline.pairs import owns_edge, owns_vertex
+from ..kernels.pipeline.queues import append, is_filled, take_slots, write
+from .launch import most_blocks
+from .mesh import CollisionMesh
+from .settings import NO_GRADIENTS, Count, capacity_for
+
+__all__ = ["BroadPhaseHierarchy", "FaceHierarchy", "traversal_kernel"]
+
+_CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_QUEUED = wp.constant(int(Count.QUEUED))
+
+_WIDTH = wp.constant(WIDTH)
+
+_WARPS_OF_MULTIPROCESSOR = 32
+"""Warps that a multiprocessor of a GPU should have at least in a traversal."""
+_MOST_WARPS_OF_CLUSTER = 8
+_TRAVERSAL_BLOCK = 64
+
+
+@wp.struct
+class FaceHierarchy:
+    """The faces in the order of their places, the boxes of elements, and the nodes above the faces.
+
+    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end.
+
+    Attributes:
+        order: Face at each place, -1 for none.
+        faces: Vertices of the face at each place.
+        face_edges: Edges of the face at each place.
+        owned: What the face at each place is the representative of.
+        edges: Vertices of each edge.
+        vertex_boxes: Box of each vertex.
+        edge_boxes: Box of each edge.
+        face_boxes: Box of the face at each place.
+        places: Level of the faces.
+        clusters: Level above.
+        groups: Highest level.
+    """
+
+    order: wp.array[int]
+    faces: wp.array2d[int]
+    face_edges: wp.array2d[int]
+    owned: wp.array[int]
+    edges: wp.array2d[int]
+    vertex_boxes: wp.array2d[wp.vec3]
+    edge_boxes: wp.array2d[wp.vec3]
+    face_boxes: wp.array2d[wp.vec3]
+    places: HierarchyLevel
+    clusters: HierarchyLevel
+    groups: HierarchyLevel
+
+
+@functools.cache
+def _box_elements(dtype: type) -> wp.Kernel:
+    """The kernel that boxes moving elements and clusters, for one type of position."""
+
+    @wp.kernel(**NO_GRADIENTS)
+    def box_elements(
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        changed: wp.array[int],
+        checked: wp.array[int],
+        # in and out
+        mesh: FaceHierarchy,
+        # out
+        not_finite: wp.array[wp.int64],
+    ):
+        i = wp.tid()
+        if i < mesh.vertex_boxes.shape[0]:
+            if not_finite:
+                if not (wp.isfinite(x0[i]) and wp.isfinite(x1[i])):
+                    found = int(1)
+                    if checked:
+                        found = checked[i]
+                    if found != 0:
+                        take_slots(not_finite, 0, 1)
+            start = rounded(x0[i])
+            end = rounded(x1[i])
+            mesh.vertex_boxes[i, 0] = start
+            mesh.vertex_boxes[i, 1] = start
+            mesh.vertex_boxes[i, 2] = end
+            mesh.vertex_boxes[i, 3] = end
+        if i < mesh.edges.shape[0]:
+            a = mesh.edges[i, 0]
+            b = mesh.edges[i, 1]
+            mesh.edge_boxes[i, 0] = rounded(wp.min(x0[a], x0[b]))
+            mesh.edge_boxes[i, 1] = rounded(wp.max(x0[a], x0[b]))
+            mesh.edge_boxes[i, 2] = rounded(wp.min(x1[a], x1[b]))
+            mesh.edge_boxes[i, 3] = rounded(wp.max(x1[a], x1[b]))
+        if i < mesh.order.shape[0]:  # the same for all threads of a warp
+            low = wp.vec3(wp.inf, wp.inf, wp.inf)
+            high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            has_changed = int(0)
+            if mesh.order[i] >= 0:
+                a = mesh.faces[i, 0]
+                b = mesh.faces[i, 1]
+                c = mesh.faces[i, 2]
+                low0 = rounded(wp.min(wp.min(x0[a], x0[b]), x0[c]))
+                high0 = rounded(wp.max(wp.max(x0[a], x0[b]), x0[c]))
+                low1 = rounded(wp.min(wp.min(x1[a], x1[b]), x1[c]))
+                high1 = rounded(wp.max(wp.max(x1[a], x1[b]), x1[c]))
+                mesh.face_boxes[i, 0] = low0
+                mesh.face_boxes[i, 1] = high0
+                mesh.face_boxes[i, 2] = low1
+                mesh.face_boxes[i, 3] = high1
+                low = wp.min(low0, low1)
+                high = wp.max(high0, high1)
+                has_changed = 1
+                if changed:
+                    has_changed = changed[a] | changed[b] | changed[c]
+            mesh.places.lowers[i] = low
+            mesh.places.uppers[i] = high
+            mesh.places.changed[i] = has_changed
+            fit_parent(i, low, high, has_changed, mesh.clusters)
+
+    return box_elements
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _box_groups(clusters: HierarchyLevel, groups: HierarchyLevel):
+    i = wp.tid()
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    has_changed = int(0)
+    if i < clusters.lowers.shape[0]:
+        low = clusters.lowers[i]
+        high = clusters.uppers[i]
+        has_changed = clusters.changed[i]
+    fit_parent(i, low, high, has_changed, groups)
+
+
+@functools.cache
+def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
+    """Returns a kernel that visits the pairs of faces whose swept boxes overlap, each pair once.
+
+    Its parameters are a :class:`FaceHierarchy`, the warps of a cluster and the arguments; launch it with
+    :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
+
+    Args:
+        visit: Function of Warp, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
+            overlaps the face at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
+            together, each for its own face of one cluster, some of them with no bits. A thread may be called for many
+            ``first``, or for none.
+        arguments_type: Type of the last argument, a struct of Warp.
+    """
+
+    @wp.kernel(**NO_GRADIENTS)
+    def traverse(mesh: FaceHierarchy, warps_of_cluster: int, arguments: arguments_type):
+        i = wp.tid()
+        cluster = i / (_WIDTH * warps_of_cluster)
+        part = (i / _WIDTH) % warps_of_cluster
+        place = cluster * _WIDTH + i % _WIDTH
+        low = mesh.clusters.lowers[cluster]
+        high = mesh.clusters.uppers[cluster]
+        own_group = cluster / _WIDTH
+        turn = int(0)
+        for first_group in range(own_group, mesh.groups.lowers.shape[0], _WIDTH):
+            groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
+            while groups != wp.uint32(0):
+                group = first_group + lowest_place(groups)
+                groups = groups & (groups - wp.uint32(1))
+                clusters = overlapping_children(mesh.clusters, cluster, low, high, mesh.clusters, group * _WIDTH)
+                if group == own_group:
+                    clusters = clusters & from_place(cluster % _WIDTH)
+                while clusters != wp.uint32(0):
+                    first = (group * _WIDTH + lowest_place(clusters)) * _WIDTH
+                    clusters = clusters & (clusters - wp.uint32(1))
+                    if turn % warps_of_cluster == part:
+                        faces = overlapping_children(mesh.clusters, cluster, low, high, mesh.places, first)
+                        if faces != wp.uint32(0):
+                            changed = changed_children(mesh.places, first)
+                            found = overlapping_faces(mesh.places, place, first, faces, changed)
+                            visit(place, first, found, arguments)
+                    turn += 1
+
+    return traverse
+
+
+@wp.struct
+class _FacePairs:
+    """The queue of pairs of faces, by place, and its count."""
+
+    pairs: wp.array[wp.vec2i]
+    count: wp.array[wp.int64]
+
+
+@wp.func
+def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
+    slot = take_slots(queue.count, 0, count_places(found))
+    while found != wp.uint32(0):
+        write(wp.vec2i(place, first + lowest_place(found)), queue.pairs, slot)
+        found = found & (found - wp.uint32(1))
+        slot += wp.int64(1)
+
+
+@wp.func
+def _low(boxes: wp.array2d[wp.vec3], i: int):
+    """The lowest coordinates over the time of the motion."""
+    return wp.min(boxes[i, 0], boxes[i, 2])
+
+
+@wp.func
+def _high(boxes: wp.array2d[wp.vec3], i: int):
+    """The highest coordinates over the time of the motion."""
+    return wp.max(boxes[i, 1], boxes[i, 3])
+
+
+@wp.func
+def _apart(boxes: wp.array2d[wp.vec3], i: int, other_boxes: wp.array2d[wp.vec3], j: int):
+    return boxes_apart(
+        boxes[i, 0],
+        boxes[i, 1],
+        boxes[i, 2],
+        boxes[i, 3],
+        other_boxes[j, 0],
+        other_boxes[j, 1],
+        other_boxes[j, 2],
+        other_boxes[j, 3],
+    )
+
+
+@wp.func
+def _next(corner: int):
+    return wp.where(corner == 2, 0, corner + 1)
+
+
+@wp.func
+def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
+    return faces[face, 0] == vertex or faces[face, 1] == vertex or faces[face, 2] == vertex
+
+
+@wp.func
+def _overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+    """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
+
+    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
+    """
+    owned = mesh.owned[face]
+    low = mesh.places.lowers[other]
+    high = mesh.places.uppers[other]
+    found = int(0)
+    corners = wp.where(owned & 7 == 0, 0, 3)
+    for corner in range(corners):
+        if owns_vertex(owned, corner):
+            vertex = mesh.faces[face, corner]
+            if boxes_overlap(_low(mesh.vertex_boxes, vertex), _high(mesh.vertex_boxes, vertex), low, high):
+                if not _has_vertex(mesh.faces, other, vertex):
+                    found = found | (1 << corner)
+                    if keep_separated or not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
+                        found = found | (8 << corner)
+    return found
+
+
+@wp.func
+def _overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+    """Which edges of a face and of another, each of its own, have overlapping boxes: bit 3 i + j for sides i and j.
+
+    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well.
+    """
+    owned = mesh.owned[face]
+    other_owned = mesh.owned[other]
+    found = int(0)
+    sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
+    for side in range(sides):
+        if owns_edge(owned, side):
+            edge = mesh.face_edges[face, side]
+            low = _low(mesh.edge_boxes, edge)
+            high = _high(mesh.edge_boxes, edge)
+            if boxes_overlap(low, high, mesh.places.lowers[other], mesh.places.uppers[other]):
+                a = mesh.faces[face, side]
+                b = mesh.faces[face, _next(side)]
+                for other_side in range(sides):
+                    if owns_edge(other_owned, other_side):
+                        other_edge = mesh.face_edges[other, other_side]
+                        if boxes_overlap(
+                            low, high, _low(mesh.edge_boxes, other_edge), _high(mesh.edge_boxes, other_edge)
+                        ):
+                            c = mesh.faces[other, other_side]
+                            d = mesh.faces[other, _next(other_side)]
+                            if a != c and a != d and b != c and b != d:
+                                bit = 3 * side + other_side
+                                found = found | (1 << bit)
+                                if keep_separated or not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
+                                    found = found | (512 << bit)
+    return found
+
+
+@wp.func
+def _bit_count(bits: int):
+    count = int(0)
+    while bits != 0:
+        bits = bits & (bits - 1)
+        count += 1
+    return count
+
+
+@wp.func
+def _lowest_bit(bits: int):
+    """The place of the lowest bit that is set."""
+    return _bit_count((bits & -bits) - 1)
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _pair_elements(
+    mesh: FaceHierarchy,
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    keep_separated: bool,
+    vertex_face_counts: wp.array[wp.int64],
+    vertex_face: wp.array[wp.vec2i],
+    edge_edge_counts: wp.array[wp.int64],
+    edge_edge: wp.array[wp.vec2i],
+):
+    """First finds all pairs, then takes slots for them, so that the threads of a warp can do so together."""
+    i = wp.tid()
+    if not is_filled(i, face_pairs, face_pair_count, 0):
+        return
+    face = face_pairs[i][0]
+    other = face_pairs[i][1]
+    vertices = _overlapping_vertices(mesh, face, other, keep_separated)
+    vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_separated) << 6)
+    edges = _overlapping_edges(mesh, face, other, keep_separated)
+    take_slots(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
+    take_slots(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
+    # of the rest only what no axis separates
+    vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
+    edges = edges >> 9
+    slot = take_slots(vertex_face_counts, _QUEUED, _bit_count(vertices))
+    while vertices != 0:
+        corner = _lowest_bit(vertices)
+        vertices = vertices & (vertices - 1)
+        if corner < 3:
+            write(wp.vec2i(mesh.faces[face, corner], mesh.order[other]), vertex_face, slot)
+        else:
+            write(wp.vec2i(mesh.faces[other, corner - 3], mesh.order[face]), vertex_face, slot)
+        slot += wp.int64(1)
+    slot = take_slots(edge_edge_counts, _QUEUED, _bit_count(edges))
+    while edges != 0:
+        bit = _lowest_bit(edges)
+        edges = edges & (edges - 1)
+        edge = mesh.face_edges[face, bit / 3]
+        other_edge = mesh.face_edges[other, bit % 3]
+        write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, slot)
+        slot += wp.int64(1)
+
+
+@wp.func
+def _pair_edges_with_face(
+    mesh: FaceHierarchy, face: int, other: int, counts: wp.array[wp.int64], pairs: wp.array[wp.vec2i]
+):
+    """Enqueues the edges that a face owns with another face."""
+    owned = mesh.owned[face]
+    sides = wp.where(owned >> 3 == 0, 0, 3)
+    for side in range(sides):
+        if owns_edge(owned, side):
+            edge = mesh.face_edges[face, side]
+            a = mesh.faces[face, side]
+            b = mesh.faces[face, _next(side)]
+            if boxes_overlap(
+                _low(mesh.edge_boxes, edge),
+                _high(mesh.edge_boxes, edge),
+                mesh.places.lowers[other],
+                mesh.places.uppers[other],
+            ):
+                if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
+                    append(wp.vec2i(edge, mesh.order[other]), pairs, counts, _QUEUED)
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _pair_edges_with_faces(
+    mesh: FaceHierarchy,
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    counts: wp.array[wp.int64],
+    pairs: wp.array[wp.vec2i],
+):
+    i = wp.tid()
+    if not is_filled(i, face_pairs, face_pair_count, 0):
+        return
+    face = face_pairs[i][0]
+    other = face_pairs[i][1]
+    _pair_edges_with_face(mesh, face, other, counts, pairs)
+    _pair_edges_with_face(mesh, other, face, counts, pairs)
+
+
+def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
+    """Allocates a level of nodes; worlds: the least and the greatest of each, int, shape [2, count], or None."""
+    level = HierarchyLevel()
+    level.lowers = wp.empty(count, dtype=wp.vec3, device=device)
+    level.uppers = wp.empty(count, dtype=wp.vec3, device=device)
+    level.changed = wp.zeros(count, dtype=int, device=device)
+    if worlds is not None:
+        level.first_world, level.last_world = (wp.array(w.astype(np.int32), dtype=int, device=device) for w in worlds)
+    return level
+
+
+def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
+    """Returns the least and the greatest world of each parent, from those of the children, shape [2, n]."""
+    if worlds is None:
+        return None
+    first, last = (np.pad(w, (0, -len(w) % WIDTH), mode="edge").reshape(-1, WIDTH) for w in worlds)
+    return np.stack([first.min(axis=1), last.max(axis=1)])
+
+
+def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
+    """Allocates the hierarchy of a mesh on its device."""
+    device, order = mesh.device, mesh.face_order
+    hierarchy = FaceHierarchy()
+
+    def by_place(values: np.ndarray) -> wp.array:
+        return wp.array(values[order] if len(order) else values, dtype=int, device=device)
+
+    hierarchy.order = wp.array(order, dtype=int, device=device)
+    hierarchy.faces = by_place(mesh.faces)
+    hierarchy.face_edges = by_place(mesh.face_edges)
+    hierarchy.owned = by_place(mesh.owned)
+    hierarchy.edges = mesh.device_edges
+    hierarchy.vertex_boxes = wp.empty((mesh.vertex_count, 4), dtype=wp.vec3, device=device)
+    hierarchy.edge_boxes = wp.empty((len(mesh.edges), 4), dtype=wp.vec3, device=device)
+    hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)
+    worlds = None
+    if mesh.world is not None and len(order):
+        world = mesh.world[mesh.faces[:, 0]][order]
+        # empty places have the worlds of the faces before, which keeps those of nodes
+        filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
+        worlds = np.stack([world[filled], world[filled]])
+    clusters = len(order) // WIDTH
+    hierarchy.places = _level(len(order), worlds, device)
+    worlds = _parents(worlds)
+    hierarchy.clusters = _level(clusters, worlds, device)
+    hierarchy.groups = _level(-(-clusters // WIDTH), _parents(worlds), device)
+    return hierarchy
+
+
+class BroadPhaseHierarchy:
+    """The broad phase by a hierarchy over the faces, see :class:`warp_bsc.detection.broad_phase.BroadPhase`.
+
+    Attributes:
+        hierarchy: The hierarchy on the device; a run fits its boxes.
+    """
+
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        count: wp.array,
+        *,
+        capacity: int | None = None,
+        not_finite: wp.array | None = None,
+        checked: wp.array | None = None,
+    ):
+        """Allocates the hierarchy and the queue for pairs of faces.
+
+        Args:
+            mesh: The mesh.
+            count: Number of pairs of faces found, zero before each run, array of one int64.
+            capacity: Capacity of the queue at first; default: eight pairs a face.
+            not_finite: Number of vertices with a position that is not finite, which a run adds to, array of one int64;
+                None to count none.
+            checked: Nonzero for each vertex that is counted, array of int; None for all.
+        """
+        self._device = device = mesh.device
+        self._count = count
+        self._not_finite, self._checked = not_finite, checked
+        self.hierarchy = _make_hierarchy(mesh)
+        places = len(mesh.face_order)
+        self._elements = max(mesh.vertex_count, len(mesh.edges), places)
+        self._clusters = places // WIDTH
+        self._warps_of_cluster = 1
+        if device.is_cuda and self._clusters:
+            wanted = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
+            self._warps_of_cluster = max(1, min(_MOST_WARPS_OF_CLUSTER, wanted))
+        capacity = 8 * len(mesh.faces) if capacity is None else capacity
+        self._face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
+
+    @property
+    def buffers(self) -> list[wp.array]:
+        """The queue for pairs of faces."""
+        return [self._face_pairs]
+
+    @property
+    def capacity(self) -> int:
+        """Capacity for pairs of faces."""
+        return len(self._face_pairs)
+
+    def grow(self, count: int) -> None:
+        """Enlarges the queue if it is too small for the count."""
+        if count > self.capacity:
+            self._face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
+
+    def pair_elements(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_face_counts: wp.array,
+        vertex_face: wp.array,
+        edge_edge_counts: wp.array,
+        edge_edge: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+    ) -> None:
+        """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
+        self._pair_faces(x0, x1, changed)
+        self._launch_over_pairs(_pair_elements, False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+
+    def pair_overlapping_elements(
+        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
+    ) -> None:
+        """Enqueues all candidates of the last run."""
+        self._launch_over_pairs(_pair_elements, True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
+        self._pair_faces(x, x)
+        self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
+
+    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
+        """Boxes all elements of a motion, and all nodes.
+
+        Args:
+            x0: Positions at the start, array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all.
+        """
+        inputs, outputs = [x0, x1, changed, self._checked, self.hierarchy], [self._not_finite]
+        kernel = _box_elements(x0.dtype)
+        wp.launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
+        nodes = self.hierarchy.groups.lowers.shape[0] * WIDTH
+        inputs = [self.hierarchy.clusters, self.hierarchy.groups]
+        wp.launch(_box_groups, nodes, inputs=inputs, device=self._device, record_tape=False)
+
+    def traverse(self, kernel: wp.Kernel, arguments: Any) -> None:
+        """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""
+        threads = self._clusters * self._warps_of_cluster * WIDTH
+        inputs = [self.hierarchy, self._warps_of_cluster, arguments]
+        wp.launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
+
+    def _pair_faces(self, x0, x1, changed=None):
+        """Enqueues the pairs of faces whose swept boxes overlap, each once."""
+        self.fit(x0, x1, changed)
+        queue = _FacePairs()
+        queue.pairs, queue.count = self._face_pairs, self._count
+        self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
+
+    def _launch_over_pairs(self, kernel, *arguments):
+        inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
+        blocks = most_blocks(self._device, 256)
+        wp.launch(kernel, self.capacity, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)
