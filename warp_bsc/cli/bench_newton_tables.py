@@ -45,28 +45,31 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     _add_text_column(table, "Mode", no_wrap=True)
     for header in ("Median\n[ms]", "95%\n[ms]", "Worst\n[ms]", "Cross-\nings", "Most"):
         table.add_column(header, justify="right", no_wrap=True)
-    _add_text_column(table, "Its own test")
+    _add_text_column(table, "Its tests", no_wrap=True)
+    notes = []
     for run in runs:
         took = run.measured
         if took is None:
-            table.add_row(*map(Text, (run.example, run.mode, "", "", "", "", "", run.problem or "")))
-            continue
-        times = (f"{milliseconds:,.1f}" for milliseconds in (took.median, took.percentile_95, took.worst))
-        counts = (f"{number:,}" for number in (took.crossings_at_start, took.most_crossings))
-        table.add_row(*map(Text, (run.example, run.mode, *times, *counts, _describe_tests(took))))
+            cells, result, remarks = [""] * 5, "not run", [run.problem or ""]
+        else:
+            cells = [f"{milliseconds:,.1f}" for milliseconds in (took.median, took.percentile_95, took.worst)]
+            cells += [f"{number:,}" for number in (took.crossings_at_start, took.most_crossings)]
+            remarks = _find_failures(took)
+            result = "fail" if remarks else took.test_final or "none"
+        table.add_row(*map(Text, (run.example, run.mode, *cells, result)))
+        notes += [f"{run.example}, {run.mode}: {remark}" for remark in remarks]
     console.print(table)
+    for note in notes:
+        say(console, note)
 
-    measured = [(run, run.measured) for run in runs if run.measured]
-    if measured:
+    sizes = {run.example: run.measured for run in runs if run.measured}
+    sizes |= {run.example: run.measured for run in runs if run.measured and run.measured.stage}
+    if sizes:
         console.print()
         headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "Uncer-\ntified", "Trun-\ncated", "Stand-\ning")
         caption = "Steps of the stage: all, not certified, with paths truncated, with vertices left standing."
         table = make_table("Example", *headers, caption=caption)
-        shown = {}
-        for run, took in measured:  # sizes do not depend on the mode; the stage's row has more to show
-            if run.example not in shown or took.stage:
-                shown[run.example] = took
-        for name, took in shown.items():
+        for name, took in sizes.items():
             counts = [took.particles, took.triangles, took.frames, *(asdict(took.stage).values() if took.stage else ())]
             table.add_row(Text(name), *(f"{number:,}" for number in counts))
         console.print(table)
@@ -105,11 +108,13 @@ def _measurement_to_dict(took: ExampleMeasurement) -> dict[str, Any]:
     return values | {"milliseconds": milliseconds}
 
 
-def _describe_tests(took: ExampleMeasurement) -> str:
-    """What the tests of an example found, in words; "ok" if all passed."""
-    failed = [] if took.first_frame_not_finite is None else [f"not finite at frame {took.first_frame_not_finite}"]
-    failed += [result for result in (took.test_post_step, took.test_final) if result not in (None, "ok")]
-    return "; ".join(failed) or took.test_final or "none"
+def _find_failures(took: ExampleMeasurement) -> list[str]:
+    """The messages of an example's tests that failed, and the frame at which positions were not finite."""
+    failures = [f"test_post_step: {took.test_post_step}"] if took.test_post_step not in (None, "ok") else []
+    failures += [f"test_final: {took.test_final}"] if took.test_final not in (None, "ok") else []
+    if took.first_frame_not_finite is not None:
+        failures.append(f"positions are not finite at the end of frame {took.first_frame_not_finite}")
+    return failures
 
 
 def _add_text_column(table: Table, header: str, *, no_wrap: bool = False) -> None:
