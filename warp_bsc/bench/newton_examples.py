@@ -11,7 +11,6 @@ import difflib
 import importlib
 import importlib.util
 import json
-import math
 import os
 import runpy
 import shlex
@@ -76,6 +75,7 @@ class NewtonExample:
         name: Its name, as ``python -m newton.examples`` takes it.
         module: The module, which runs the example if it is the main one.
         options: Options of the example itself.
+        deformable: Whether its source adds cloth or soft bodies to a model.
         downloads: Names of the assets that it downloads, "" for one that the source does not name.
         missing: Packages that it imports and that are not installed.
     """
@@ -83,6 +83,7 @@ class NewtonExample:
     name: str
     module: str
     options: tuple[str, ...] = ()
+    deformable: bool = True
     downloads: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
 
@@ -208,7 +209,7 @@ def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
     modules = get_examples()
     if not requests:
         found = [_read_example(name, module) for name, module in modules.items() if module.split(".")[2] in FOLDERS]
-        return [example for example in found if example is not None]
+        return [example for example in found if example.deformable]
     examples = []
     for request in requests:
         try:
@@ -219,18 +220,17 @@ def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
             close = difflib.get_close_matches(name, modules, n=3)
             hint = f"; did you mean {' or '.join(close)}?" if close else ""
             raise ValueError(f"{name!r}: Newton has no example of this name{hint}")
-        examples.append(_read_example(name, modules[name], tuple(options), deformable_only=False))
-    return [example for example in examples if example is not None]
+        examples.append(_read_example(name, modules[name], tuple(options)))
+    return examples
 
 
-def _read_example(name, module, options=(), *, deformable_only=True) -> NewtonExample | None:
-    """Reads in an example's source what it needs; None for one without cloth and soft bodies, unless all are wanted."""
+def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> NewtonExample:
+    """Reads an example's source for what it needs."""
     specification = importlib.util.find_spec(module)
     assert specification is not None and specification.origin is not None
     tree = ast.parse(Path(specification.origin).read_text(encoding="utf-8"))
     calls = [(_called_name(node), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    if deformable_only and not any(called.startswith(_BUILDERS) for called, _ in calls):
-        return None
+    deformable = any(called.startswith(_BUILDERS) for called, _ in calls)
     downloads = dict.fromkeys(_first_string(node) for called, node in calls if called in _DOWNLOADS)
     imported = []
     for node in tree.body:  # an import within a function or a "try" may have a substitute
@@ -240,7 +240,7 @@ def _read_example(name, module, options=(), *, deformable_only=True) -> NewtonEx
             imported.append(node.module)
     packages = dict.fromkeys(name.split(".")[0] for name in imported)
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
-    return NewtonExample(name, module, tuple(options), tuple(downloads), tuple(missing))
+    return NewtonExample(name, module, options, deformable, tuple(downloads), tuple(missing))
 
 
 def _called_name(call: ast.Call) -> str:
@@ -598,9 +598,9 @@ class _Crossings:
         return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())
 
     def are_finite(self) -> bool:
-        """Whether all positions are finite."""
+        """Whether the positions of all vertices of faces are finite."""
         self._read_positions()
-        return math.isfinite(np.abs(self._x.numpy()).sum(dtype=np.float64))
+        return bool(np.isfinite(self._x.numpy()[self._mesh.vertices]).all())
 
     def _read_positions(self) -> None:
         """Reads the positions of the state, which the example may have replaced by another."""

@@ -26,7 +26,8 @@ in exact arithmetic; what the stage could not certify; and whether the example's
 own tests pass. Default: the examples of newton.examples.cloth, softbody and
 multiphysics that have cloth or soft bodies. Any other example of Newton can be
 named. Options of the example itself follow its name, in quotes. A run that
-fails is a row that says why."""
+fails is a row, and a line below the table says why. Tests that expect a state
+at rest fail in short runs, in both modes."""
 
 _EPILOG = f"""\
 examples:
