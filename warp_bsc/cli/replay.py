@@ -264,7 +264,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
                     say(console, f"Wrote {output.file.path}.")
     if interrupt:
         raise interrupt
-    if summary.validation and summary.validation["disagreements"]:
+    if summary.validation and summary.validation.disagreements:
         return _DISAGREES
     if arguments.fail_on_collision and summary.hits:
         return _COLLIDES
