@@ -10,7 +10,7 @@ same question: do the two features meet? They differ as follows:
   them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
   favors ``cubic``.
 - ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
-  so it knows a time as well; that time is not written.
+  so it finds a time as well; that time is not written.
 - ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5,
   :mod:`warp_bsc.bench.baselines.reduced_inside_test`. The culls are those of the narrow phase, in the same order. The
   paper does not subdivide, so a query that classification leaves open is a collision at once, as the paper's weak
