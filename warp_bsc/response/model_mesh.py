@@ -140,8 +140,7 @@ class ModelMesh(CollisionMesh):
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
         self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
-        face_edges = self.device_face_edges.numpy()
-        self.device_edge_faces = _incidence(face_edges, len(self.edges), self.device)
+        self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
 

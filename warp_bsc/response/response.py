@@ -55,6 +55,8 @@ MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
 
 _MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
+_PAIRS_PER_FACE = 32
+"""Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow."""
 _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
 _DIVIDING_PLANES = 16
@@ -110,7 +112,7 @@ class Response:
             tolerance: Tolerance of constraints, as a share of the separation.
         """
         self.device = device = mesh.device
-        self.detector = DetectionPipeline(mesh)
+        self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
         self.separation, self.restitution = separation, restitution
         self._tolerance = tolerance * separation
         self.worlds = max(1, mesh.model.world_count)
@@ -315,9 +317,9 @@ class Response:
             detector,
             self.device,
         )
-        vertices.changed.zero_()
         self._reserve(self._most_contacts)
-        if refit:  # before, there is always enough
+        if refit:  # before, nothing has changed, and there is always enough
+            vertices.changed.zero_()
             inputs = [self.constraints, self._record, self._most_contacts]
             wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
         contacts = list(self._contacts())
