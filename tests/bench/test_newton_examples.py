@@ -158,6 +158,7 @@ def test_an_example_that_fails_is_a_row(write_example, device, source, problem):
     assert fail(write_example(source), device=device) == problem
 
 
+@pytest.mark.slow
 def test_a_part_of_a_coupled_solver_is_not_applicable(device):
     (example,) = find_examples(["xpbd_vbd_coupled_solver"])
     problem = fail(example, "stage", device=device)
