@@ -16,7 +16,7 @@ from .roots import largest
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 
 MAX_VISITS = wp.constant(256)
-"""Number of intervals after which the search stops, undecided."""
+"""Number of intervals after which the search stops, unsure."""
 
 LEAST_DIGITS = 10
 """Fewest binary digits of a time of impact, however large the tolerance."""
@@ -184,15 +184,15 @@ def power_of_two(x: wp.float64) -> wp.float64:
 def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64):
     """Returns a time before which there is certainly no contact, from one interval after the other, in order of time.
 
-    After an interval that is certainly free comes the other half, or one twice as long. An undecided interval becomes
+    After an interval that is certainly free comes the other half, or one twice as long. An unsure interval becomes
     shorter: it ends half the tolerance before a root of Y, so that it is usually free and the next one, as long as the
     tolerance, certainly contains contact; or before Y turns back from zero; or it is halved.
 
     The search ends at the first interval that certainly contains contact and is short enough: its start is the time of
-    impact to within the tolerance. Or it ends at an interval that stays undecided, with an unknown status from there
-    on. That interval has the shortest length; or the length of the tolerance, with an undecided shortest interval
+    impact to within the tolerance. Or it ends at an interval that stays unsure, with an unknown status from there
+    on. That interval has the shortest length; or the length of the tolerance, with an unsure shortest interval
     around the root; or it is the whole step, if the features may touch at the start and the shortest interval there is
-    undecided; or Y is zero in it to within its bound, so that no part of it certainly contains contact, and it is short
+    unsure; or Y is zero in it to within its bound, so that no part of it certainly contains contact, and it is short
     enough for a lower bound of the time.
 
     All times are multiples of the shortest length, a power of two, and hence exact.
@@ -213,7 +213,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
     root = _ZERO
     ahead = bool(False)  # whether a root may be half the tolerance after the end of the interval
     passing = bool(False)  # whether the interval is the one around that root
-    halved = bool(False)  # whether the interval is half of an undecided one
+    halved = bool(False)  # whether the interval is half of an unsure one
     probing = bool(False)  # whether the shortest interval around the root is tested in place of the interval
     probed = certified_sign(y.k[0], y.bound) != 0
     answer = status

@@ -9,6 +9,7 @@ import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
 from guarded_memory import guard_memory
+from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
@@ -19,6 +20,7 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_addoption(parser):
     """Adds the options that look for access out of bounds."""
     parser.addoption("--guard-memory", action="store_true", help="crash on access out of bounds of an array on the CPU")
+    parser.addoption("--sanitize", action="store_true", help="run kernels on the CPU under Address and UB sanitizers")
     parser.addoption("--warp-debug", action="store_true", help="run all kernels in Warp's debug mode, which asserts")
 
 
@@ -27,6 +29,13 @@ def pytest_configure(config):
     for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
         if signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
             signal.signal(number, handler)
+    if config.getoption("--sanitize"):
+        if not sanitizers_available():
+            raise pytest.UsageError("--sanitize needs clang 16 or later with its sanitizer runtime (libclang-rt-*-dev)")
+        if not SANITIZED:
+            config.pluginmanager.getplugin("capturemanager").stop_global_capturing()
+            restart_with_sanitizers()
+        sanitize_kernels()
     if config.getoption("--guard-memory"):
         guard_memory()
     if config.getoption("--warp-debug"):

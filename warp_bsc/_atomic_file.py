@@ -70,7 +70,7 @@ class OutputFile:
         """Writes the whole of a text.
 
         Raises:
-            OSError: If there is no room. A part of the text may have been written.
+            OSError: If the disk is full. A part of the text may have been written.
         """
         rest = memoryview(text.encode() if isinstance(text, str) else text)
         while rest:

@@ -227,7 +227,7 @@ def _may_touch(points, pairs):
     corners = np.ldexp(corners[filtered], -np.frexp(size[filtered])[1][:, None, None, None])
     # From here on a triangle is three corners of three coordinates, each a polynomial in s.
     start, end = np.ascontiguousarray(corners.transpose(2, 1, 3, 0))
-    undecided = np.zeros(len(corners), dtype=bool)
+    unsure = np.zeros(len(corners), dtype=bool)
     half = (end - start) * (0.5 / _PIECES)
     for piece in range(_PIECES):
         time = (piece + 0.5) / _PIECES
@@ -238,8 +238,8 @@ def _may_touch(points, pairs):
         free = np.abs(volume[0]) > _variation(volume)
         for weight in weights:
             free |= -weight[0] > _variation(weight)
-        undecided |= ~free
-    may_touch[filtered] = undecided
+        unsure |= ~free
+    may_touch[filtered] = unsure
     return may_touch
 
 

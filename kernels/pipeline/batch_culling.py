@@ -1,21 +1,21 @@
-"""The culls of many pairs at once, with the vector instructions of a CPU.
+"""The culls of many pairs at once, by the vector instructions of a CPU.
 
-Boxes are compared pair by pair, all coordinates of both ends at once. What they leave goes on by eight: the other
-culls need additions, multiplications and comparisons alone, the same for every pair, which is what the paper's
-polynomials are good for. The operations are those of :mod:`warp_bsc.kernels.culling` and
-:mod:`warp_bsc.kernels.polynomials`, in the same order, and so are the bounds on their errors.
+The box test compares one pair at a time, all coordinates of both ends in one vector. The pairs that it leaves pass the
+other culls in packets of eight: these culls are additions, multiplications and comparisons, the same for every pair.
+The operations are those of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials`, in the same order,
+and the bounds on their errors are the same.
 
-Pairs are not scaled, because powers of two change nothing but overflow and underflow. Nothing overflows: vectors of
-1e70 and more are culled by boxes alone. What underflows is lost in a component of the normal, 2^-1074 for each of at
-most four products, or 2^-1022 where subnormal numbers are flushed, before w multiplies it: less than the UNDERFLOW that
-bounds add, times the roundoff, 1e-156.
+Pairs are not scaled: scaling by powers of two affects overflow and underflow alone. Overflow does not occur, because
+pairs with vectors of 1e70 or more are culled by boxes only. Underflow loses 2^-1074 in each of at most four products of
+a component of the normal, or 2^-1022 where subnormal numbers are flushed, before the product with w. The loss is below
+the UNDERFLOW that bounds add, times the roundoff, 1e-156.
 
-A processor that is told to take subnormal numbers for zero loses up to delta, the smallest number that is not, from
-each coordinate that it reads, and 2 delta from u, v, w. Of vectors below m a product of three then loses less than 6
-delta m^2, and a coefficient of Y is a mean of sums of six such. A comparison of products with a direction has three of
-each of its components, and loses less than 6 delta times the sum of their sizes. So 40 delta is added to the bounds.
+A processor that flushes subnormal numbers loses less than delta, the smallest normal number, from each coordinate that
+it reads, and 2 delta from u, v and w. A product of three vectors below m then loses less than 6 delta m^2, and a
+coefficient of Y is a mean of sums of six products. A comparison along a direction has three products for each of its
+components, and loses less than 6 delta times the sum of their sizes. The bounds therefore add 40 delta.
 
-Without a roundoff there is nothing to certify.
+With a roundoff of zero (method "float") all bounds are zero.
 """
 
 import functools
@@ -71,12 +71,12 @@ _SNIPPET = """
         }}
     }};
 
-    // positions may be a view: with any number of bytes from one to the next
+    // positions may be a view, with any stride
     auto position = [](const auto& x, int corner) {{
         return (const {scalar}*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
     }};
 
-    // axis boxes, pair by pair: x y z of both ends in one vector, the fourth being the next one's x, if there is one
+    // box test, pair by pair: x y z of both ends in one vector; a fourth number is read with them where there is one
     auto load = [&](const auto& x, int corner) -> Four {{
         const {scalar}* from = position(x, corner);
         if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof({scalar}))
@@ -110,7 +110,7 @@ _SNIPPET = """
     unsigned long long left = 0;
     for (int group = 0; group < near_count; group += 8) {{
         const int filled = near_count - group < 8 ? near_count - group : 8;
-        // the points as they are in memory, x y y z each, transposed to coordinates of all eight
+        // loads x y y z of each point, and transposes to the coordinates of all eight pairs
         int corners[4][8];
         for (int lane = 0; lane < 8; ++lane) {{
             int corner[4];
@@ -164,7 +164,7 @@ _SNIPPET = """
         const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
         const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
         const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
-        // without a roundoff all bounds are zero
+        // with a roundoff of zero all bounds are zero
         Vectors size = {{0.0, 0.0, 0.0}};
         Doubles bound = 0.0;
         double lost = 0.0;
@@ -179,8 +179,8 @@ _SNIPPET = """
             trusted = bits(extent < {largest});
         }}
         auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
-        int undecided = ((1 << filled) - 1) & ~(bits(culled) & trusted);
-        if (!undecided)
+        int unsure = ((1 << filled) - 1) & ~(bits(culled) & trusted);
+        if (!unsure)
             continue;
 
         // separating direction
@@ -202,20 +202,26 @@ _SNIPPET = """
         const Doubles slack
             = roundoff * ({direction_error} * dot(along, size) + {underflow}) + lost * (along.x + along.y + along.z);
         culled = (lowest > slack) | (highest < -slack);
-        undecided &= ~(bits(culled) & trusted);
+        unsure &= ~(bits(culled) & trusted);
         for (int lane = 0; lane < filled; ++lane)
-            left |= (unsigned long long)((undecided >> lane) & 1) << near[group + lane];
+            left |= (unsigned long long)((unsure >> lane) & 1) << near[group + lane];
     }}
     return left;
 """
 
 
 @functools.cache
-def cull_batch_of(dtype, vertex_face: bool):
-    """The function that culls a batch of pairs, for one type of position and one kind of pair.
+def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
+    """Returns the function that culls a batch of pairs, for one type of position and one kind of pair.
 
-    It takes positions at both ends, the vertices of the elements, a queue of pairs, the first of them and how many from
-    there on count, up to :data:`BATCH`, and the roundoff. It returns which of them no cull decides, as bits.
+    Args:
+        dtype: Type of a position, vec3 or vec3d.
+        vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
+
+    Returns:
+        Device function for the CPU. It takes the positions at both ends, the vertices of the elements, a queue of
+        pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
+        returns a bit for each pair, set where no cull decides the pair. It checks no index.
     """
     single = dtype is wp.vec3
     snippet = _SNIPPET.format(
@@ -244,5 +250,5 @@ def cull_batch_of(dtype, vertex_face: bool):
 
 @wp.func_native("return bits ? __builtin_ctzll(bits) : 64;")
 def lowest_bit(bits: wp.uint64) -> int:
-    """The number of the lowest bit that is set; 64 if there is none."""
+    """Returns the number of the lowest bit that is set; 64 if there is none."""
     ...

@@ -8,13 +8,14 @@ from generators import GENERATORS
 from warp_bsc import checker
 from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
 from warp_bsc.detection.narrow_phase import NarrowPhase
+from warp_bsc.detection.settings import PairKind
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
 KINDS = ("vertex_face", "edge_edge")
 
 
 def answer(method, kind, points, device="cpu"):
-    run = MethodRun(method, QuerySet(Queries.of_points(kind, points), device))
+    run = MethodRun(method, QuerySet(Queries.of_points(PairKind[kind.upper()], points), device))
     run.launch()
     return run
 
@@ -83,7 +84,7 @@ def test_stages_are_those_that_decide(kind):
     names = ("uniform", "mostly_hits", "touching", "coplanar")
     points = np.concatenate([GENERATORS[name](rng, 100, kind, np.float32) for name in names])
     points[:50, [0, 1, 4, 5] if kind == "edge_edge" else [0, 4]] += 9.0
-    queries = QuerySet(Queries.of_points(kind, points), "cpu")
+    queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     stages, _ = trace(queries, "exact")
     assert set(stages) == set(range(len(STAGES)))
     assert (stages[:50] == STAGES.index("axis boxes")).all()
@@ -94,7 +95,7 @@ def test_stages_are_those_that_decide(kind):
 
 def test_clock_runs_for_every_query(device):
     points = GENERATORS["uniform"](np.random.default_rng(4), 100, "edge_edge", np.float32)
-    queries = QuerySet(Queries.of_points("edge_edge", points), device)
+    queries = QuerySet(Queries.of_points(PairKind.EDGE_EDGE, points), device)
     for method in METHODS:
         _, cycles = trace(queries, method)
         assert cycles.shape == (100,) and (cycles > 0).all()
@@ -105,7 +106,7 @@ def test_clock_runs_for_every_query(device):
 def test_the_detectors_own_methods_are_its_narrow_phase(monkeypatch, kind, method):
     """A benchmark that launched a copy of the narrow phase would not see what replaces it."""
     points = GENERATORS["mostly_hits"](np.random.default_rng(5), 100, kind, np.float32)
-    run = MethodRun(method, QuerySet(Queries.of_points(kind, points), "cpu"))
+    run = MethodRun(method, QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu"))
     launched = []
     monkeypatch.setattr(NarrowPhase, "run", lambda *_, **options: launched.append(options))
     run.launch()

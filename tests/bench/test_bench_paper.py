@@ -18,6 +18,7 @@ from warp_bsc.bench.worst_case import find_worst
 from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
 from warp_bsc.detection.launch import one_core
+from warp_bsc.detection.settings import PairKind
 
 TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries=50, repeat=1)
 
@@ -74,8 +75,8 @@ def test_json_has_everything(capsys):
         worst = one["worst"][method]
         assert worst["nanoseconds"].keys() == set(METHODS)
         assert np.array(worst["points"]).shape == (8, 3)
-    (trouble,) = found["adversarial"]
-    assert trouble["worst"].keys() == set(METHODS)
+    (adversarial,) = found["adversarial"]
+    assert adversarial["worst"].keys() == set(METHODS)
     assert scene["frame_milliseconds"] > 0.0
     assert list(scene["stage_milliseconds"])[:2] == ["broad phase", "cull"]
 
@@ -93,7 +94,7 @@ def test_tables_files_and_figure(capsys, monkeypatch, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["times.json", "times.png"]
 
 
-def test_peers_are_measured(capsys):
+def test_the_ipc_toolkit_is_measured(capsys):
     pytest.importorskip("ipctk")
     (scene,) = json.loads(bench(capsys, "cloth:1000", "--json"))["scenes"]
     assert scene["peers"].keys() == {"tight inclusion", "additive"}
@@ -104,7 +105,7 @@ def test_peers_are_measured(capsys):
 
 
 @pytest.mark.parametrize(("query", "expected"), [(350, 250), (60, 0)])
-@pytest.mark.parametrize("kind", bench_paper.KINDS)
+@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
 def test_what_a_call_takes_is_taken_off(monkeypatch, kind, query, expected):
     """By a clock that a call advances by 100 ns, where the features are far apart, and a query otherwise."""
     clock = SimpleNamespace(now=0.0)
@@ -121,9 +122,9 @@ def test_what_a_call_takes_is_taken_off(monkeypatch, kind, query, expected):
 
 def test_wrong_answers_are_counted(monkeypatch):
     """Against a checker that says the opposite, every answer that was checked is wrong."""
-    for kind in bench_paper.KINDS:
-        truth = getattr(checker, kind)
-        monkeypatch.setattr(checker, kind, lambda points, truth=truth: ~truth(points))
+    for kind in PairKind:
+        truth = getattr(checker, kind.label)
+        monkeypatch.setattr(checker, kind.label, lambda points, truth=truth: ~truth(points))
     places = find_places([wp.get_device("cpu")])[:1]
     found = benchmark_scene("cloth:1000", load_intervals("cloth:1000", most=1), places, TINY)
     exact = found.errors["exact"]
@@ -145,11 +146,11 @@ def test_worst_query_is_one_of_those_asked():
     intervals = load_intervals("crash:1000", most=1)
     queries, _ = bench_paper._gather(intervals, wp.get_device("cpu"), 2000)
     with one_core():
-        worst = find_worst(queries["edge_edge"], wp.get_device("cpu"), repeat=1)
+        worst = find_worst(queries[PairKind.EDGE_EDGE], wp.get_device("cpu"), repeat=1)
     assert list(worst) == list(METHODS)
     for method, query in worst.items():
         assert query.method == method
-        assert np.array_equal(query.points, queries["edge_edge"].points([query.index])[0])
+        assert np.array_equal(query.points, queries[PairKind.EDGE_EDGE].points([query.index])[0])
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):

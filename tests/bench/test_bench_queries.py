@@ -8,8 +8,9 @@ import pytest
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench import queries as bench_queries
-from warp_bsc.bench.queries import KINDS, MODES, benchmark_queries, generate_queries, generate_touching_queries
+from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
+from warp_bsc.detection.settings import PairKind
 
 
 def measure(capsys, device, *arguments):
@@ -20,17 +21,17 @@ def measure(capsys, device, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
 def test_answers_are_true(kind, device):
     measured = benchmark_queries(kind, count=1000, device=device, repeat=1)
-    truth = getattr(checker, kind.replace("-", "_"))(generate_queries(kind, 1000, device=device).numpy())
+    truth = getattr(checker, kind.label)(generate_queries(kind, 1000, device=device).numpy())
     certain = measured.status != 2
     assert certain.sum() > 990
     assert np.array_equal(measured.status[certain] == 1, truth[certain])
     assert 20 < truth.sum() < 200
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
 def test_culls_leave_a_third(kind, device):
     measured = benchmark_queries(kind, device=device, repeat=1)
     assert len(measured.status) == (2**24 if device.is_cuda else 2**18)
@@ -38,16 +39,16 @@ def test_culls_leave_a_third(kind, device):
     assert measured.hits + measured.unsure < measured.survivors
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
 def test_queries_depend_on_neither_device_nor_count(kind, device):
     many, few = generate_queries(kind, 1000, device=device).numpy(), generate_queries(kind, 10, device="cpu").numpy()
     assert np.array_equal(many[:10], few)
     assert len(np.unique(many.reshape(1000, -1), axis=0)) == 1000
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", PairKind, ids=lambda kind: kind.label)
 def test_touching_queries_are_for_exact_arithmetic_to_decide(kind, device):
-    query = getattr(bsc, f"query_{kind.replace('-', '_')}")
+    query = getattr(bsc, f"query_{kind.label}")
     points = generate_touching_queries(kind, 2000, device=device).numpy()
     answer = query(points, toi=False, device=device)
     assert answer.hit.all()
@@ -57,24 +58,24 @@ def test_touching_queries_are_for_exact_arithmetic_to_decide(kind, device):
 def test_a_wrong_exact_answer_is_noticed(monkeypatch, device):
     monkeypatch.setattr(bench_queries, "generate_touching_queries", generate_queries)
     with pytest.raises(RuntimeError, match="of 1000 touching vertex-face queries were found to be free"):
-        benchmark_queries("vertex-face", count=1000, device=device, repeat=1)
+        benchmark_queries(PairKind.VERTEX_FACE, count=1000, device=device, repeat=1)
 
 
 @pytest.mark.parametrize(("mode", "kernels"), [("impact", slice(1, 2)), ("queued", slice(2, 4))])
 def test_other_answers_are_noticed(monkeypatch, device, mode, kernels):
-    right, wrong = (list(bench_queries._kernels(kind)) for kind in KINDS)
+    right, wrong = (list(bench_queries._kernels(kind)) for kind in PairKind)
     right[kernels] = wrong[kernels]
     monkeypatch.setattr(bench_queries, "_kernels", lambda kind: right)
     with pytest.raises(RuntimeError, match=f"answered differently by mode {mode}"):
-        benchmark_queries(KINDS[0], count=1000, device=device, repeat=1)
+        benchmark_queries(PairKind.VERTEX_FACE, count=1000, device=device, repeat=1)
 
 
 def test_json_is_consistent(capsys, device):
     found = json.loads(measure(capsys, device, "--count", "1000", "--json"))
     assert (found["benchmark"], found["device"], found["repeat"]) == ("queries", str(device), 2)
-    assert [measured["kind"] for measured in found["kinds"]] == list(KINDS)
-    for measured in found["kinds"]:
-        answers = benchmark_queries(measured["kind"], count=1000, device=device, repeat=1)
+    assert [measured["kind"] for measured in found["kinds"]] == ["vertex-face", "edge-edge"]
+    for kind, measured in zip(PairKind, found["kinds"], strict=True):
+        answers = benchmark_queries(kind, count=1000, device=device, repeat=1)
         assert measured["certified"] == {"free": answers.free, "hit": answers.hits, "unsure": answers.unsure}
         assert sum(measured["certified"].values()) == measured["queries"] == 1000
         assert measured["survivor_share"] == measured["survivors"] / 1000 == answers.survivor_share
@@ -90,7 +91,7 @@ def test_tables_fit_a_terminal(capsys, monkeypatch, device):
     monkeypatch.setenv("COLUMNS", "80")
     lines = measure(capsys, device, "--count", "100000").splitlines()
     assert max(map(len, lines)) <= 80
-    for kind in KINDS:
+    for kind in ("vertex-face", "edge-edge"):
         assert sum(line.startswith(f"{kind} ") for line in lines) == 1
         for mode in MODES:
             assert sum(line.startswith(f"{kind}, {mode} ") for line in lines) == 1

@@ -308,7 +308,8 @@ def test_device_that_is_not_there(capsys, falling_scene):
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["replay"], ["query"], ["bench"], ["bench", "paper"], ["bench", "detector"], ["bench", "queries"]]
+    "command",
+    [[], ["replay"], ["query"], ["bench"], *(["bench", name] for name in ("paper", "detector", "queries", "newton"))],
 )
 def test_help_has_examples(capsys, command):
     with pytest.raises(SystemExit) as end:

@@ -7,6 +7,7 @@ from generators import GENERATORS
 
 from warp_bsc import checker
 from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.detection.settings import PairKind
 from warp_bsc.kernels.culling import (
     centroid_direction,
     direction_separates,
@@ -80,7 +81,7 @@ def test_culls_are_those_of_one_query(kind, dtype):
 
 def cull(kind, points, roundoff):
     """What the culls leave, one by one and eight at once."""
-    queries = QuerySet(Queries.of_points(kind, points), "cpu")
+    queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     alone, together = (wp.zeros(queries.count + BATCH, dtype=int, device="cpu") for _ in range(2))
     one, eight = kernels_of(kind, queries.dtype)
     x0, x1, elements, pairs = queries.arrays

@@ -398,7 +398,7 @@ def test_damaged_scenes_are_read_or_refused_in_one_line(tmp_path, part):
     """Of 150 damaged scenes each is read, what is left out being named, or ends in one line that names the file."""
     source = Sdf.Layer.FindOrOpen(write_model(tmp_path / "whole.usda"))
     lots = random.Random(part)
-    outcomes = {"read": 0, "left out": 0, "refused": 0}
+    counts = {"read": 0, "left out": 0, "refused": 0}
     for number in range(25):
         layer = Sdf.Layer.CreateAnonymous(".usda")
         layer.TransferContent(source)
@@ -419,8 +419,8 @@ def test_damaged_scenes_are_read_or_refused_in_one_line(tmp_path, part):
                 assert interval.start < interval.end
                 positions = interval.x0, interval.x1
                 assert all(np.isfinite(x).all() and len(x) == interval.segment.vertex_count for x in positions), done
-            outcomes["left out" if scene.left_out else "read"] += 1
+            counts["left out" if scene.left_out else "read"] += 1
         except ValueError as error:
             assert path in str(error) and "\n" not in str(error), done
-            outcomes["refused"] += 1
-    assert outcomes["read"] and outcomes["left out"], outcomes
+            counts["refused"] += 1
+    assert counts["read"] and counts["left out"], counts

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..detection.settings import PairKind
 from .scenes import BenchmarkScene
 from .timing import count_threads
 
@@ -95,24 +96,24 @@ def version() -> str | None:
     return importlib.metadata.version("ipctk") if is_installed() else None
 
 
-def answer_queries(method: str, kind: str, points: np.ndarray) -> np.ndarray:
+def answer_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
     """Whether each query collides by a method of the IPC Toolkit, bool, shape [n].
 
     Args:
         method: One of :data:`CCD_CLASSES`.
-        kind: "vertex_face" or "edge_edge".
+        kind: Kind of pair.
         points: Queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3].
     """
     ccd = _ccd(method, kind)
     return np.array([ccd(*query)[0] for query in np.asarray(points, dtype=np.float64)], dtype=bool)
 
 
-def time_queries(method: str, kind: str, points: np.ndarray, *, repeat: int = 3) -> tuple[float, float]:
+def time_queries(method: str, kind: PairKind, points: np.ndarray, *, repeat: int = 3) -> tuple[float, float]:
     """Times queries that are called one by one.
 
     Args:
         method: One of :data:`CCD_CLASSES`.
-        kind: "vertex_face" or "edge_edge".
+        kind: Kind of pair.
         points: Queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3].
         repeat: Number of repetitions; their median counts.
 
@@ -122,19 +123,19 @@ def time_queries(method: str, kind: str, points: np.ndarray, *, repeat: int = 3)
     ccd = _ccd(method, kind)
     queries = [tuple(query) for query in np.asarray(points, dtype=np.float64)]
     far = np.asarray(points[0], dtype=np.float64).copy()
-    first = [0, 4] if kind == "vertex_face" else [0, 1, 4, 5]
+    first = [0, 4] if kind == PairKind.VERTEX_FACE else [0, 1, 4, 5]
     far[first] += _FAR * (1.0 + np.abs(far).max())
     whole = _mean_nanoseconds(ccd, queries, repeat)
     call = _mean_nanoseconds(ccd, [tuple(far)] * len(queries), repeat)
     return max(whole - call, 0.0), call
 
 
-def _ccd(method: str, kind: str) -> Callable:
+def _ccd(method: str, kind: PairKind) -> Callable:
     """The function that answers one query of this kind."""
     import ipctk  # noqa: PLC0415 (optional)
 
     ccd = getattr(ipctk, CCD_CLASSES[method])()
-    return ccd.point_triangle_ccd if kind == "vertex_face" else ccd.edge_edge_ccd
+    return ccd.point_triangle_ccd if kind == PairKind.VERTEX_FACE else ccd.edge_edge_ccd
 
 
 def _mean_nanoseconds(ccd: Callable, queries: list[tuple], repeat: int) -> float:

@@ -10,7 +10,7 @@ same question: do the two features meet? They differ as follows:
   them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
   favors ``cubic``.
 - ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
-  so it knows a time as well; that time is not written.
+  so it finds a time as well; that time is not written.
 - ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5,
   :mod:`warp_bsc.bench.baselines.reduced_inside_test`. The culls are those of the narrow phase, in the same order. The
   paper does not subdivide, so a query that classification leaves open is a collision at once, as the paper's weak
@@ -76,13 +76,13 @@ def _clock() -> wp.int64: ...
 
 
 @functools.cache
-def _kernels(kind, dtype):
+def _kernels(kind: PairKind, dtype: type):
     """The kernels for one kind of query and one type of position, each in a module of its own.
 
     Returns:
         Kernels that solve cubics, cull on a GPU, cull on a CPU, classify by the reduced inside tests, and trace.
     """
-    vertex_face = kind == "vertex_face"
+    vertex_face = kind == PairKind.VERTEX_FACE
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
     solve_cubic = cubic_solver_vertex_face if vertex_face else cubic_solver_edge_edge
@@ -228,26 +228,26 @@ class Queries:
     """Queries of one kind as pairs of a mesh's elements.
 
     Attributes:
-        kind: "vertex_face" or "edge_edge".
+        kind: Kind of pair.
         x0: Positions of the mesh at the start of the step, float32 or float64, shape [vertex_count, 3].
         x1: Positions at its end, of the same type.
-        elements: Vertices of its faces (vertex_face) or edges (edge_edge), int32, shape [element_count, 3 or 2].
+        elements: Vertices of its faces (VERTEX_FACE) or edges (EDGE_EDGE), int32, shape [element_count, 3 or 2].
         pairs: (vertex, face) or (edge, edge), no pair twice, int32, shape [n, 2].
     """
 
-    kind: str
+    kind: PairKind
     x0: np.ndarray
     x1: np.ndarray
     elements: np.ndarray
     pairs: np.ndarray
 
     @classmethod
-    def of_points(cls, kind: str, points: np.ndarray) -> "Queries":
+    def of_points(cls, kind: PairKind, points: np.ndarray) -> "Queries":
         """Queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
         n = len(points)
         x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
         vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
-        if kind == "vertex_face":
+        if kind == PairKind.VERTEX_FACE:
             return cls(kind, x0, x1, np.ascontiguousarray(vertices[:, 1:]), np.stack([4 * rows, rows], axis=1))
         return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
 
@@ -264,7 +264,7 @@ class QuerySet:
     """Queries of one kind on a device.
 
     Attributes:
-        kind: "vertex_face" or "edge_edge".
+        kind: Kind of pair.
         count: Number of queries.
         pairs: The queries' pairs on the host, without repetitions, int32, shape [n, 2].
         arrays: The arrays that all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d;
@@ -304,11 +304,10 @@ class MethodRun:
             self._survivor_count = wp.zeros(1, dtype=wp.int64, device=device)
             return
         x0, _, elements, pairs = queries.arrays
-        first_elements = len(x0) if queries.kind == "vertex_face" else len(elements)
+        first_elements = len(x0) if queries.kind == PairKind.VERTEX_FACE else len(elements)
         self._counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
         self._start_counts = wp.array(PairCounts(queued=n).values(), dtype=wp.int64, device=device)
-        kind = PairKind[queries.kind.upper()]
-        self._narrow_phase = NarrowPhase(kind, self._counts, n, (first_elements, len(elements)))
+        self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(elements)))
         wp.copy(self._narrow_phase.queue, pairs)
         retry_until_fits(self.launch, self._narrow_phase, device)
 

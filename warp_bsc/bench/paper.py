@@ -18,6 +18,7 @@ from .. import checker
 from ..detection.launch import one_core, retry_until_fits
 from ..detection.mesh import CollisionMesh
 from ..detection.pipeline import DetectionPipeline
+from ..detection.settings import PairKind
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
 from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
@@ -27,7 +28,6 @@ from .timing import count_threads
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 
 __all__ = [
-    "KINDS",
     "Effort",
     "Errors",
     "Place",
@@ -38,7 +38,6 @@ __all__ = [
     "find_places",
 ]
 
-KINDS = ("vertex_face", "edge_edge")
 SEED = 0
 _TURNS = 8  # of timing all methods
 _CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # in a launch at least: fewer are repeated, so that its start does not count
@@ -149,7 +148,7 @@ class SceneBenchmark:
     precision: int
     intervals: list[int]
     candidates: int
-    queries: dict[str, int]
+    queries: dict[PairKind, int]
     collisions: int
     unsure: int
     checked: int
@@ -247,11 +246,11 @@ def benchmark_scene(
 
 def _gather(
     intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, most: int
-) -> tuple[dict[str, Queries], int]:
+) -> tuple[dict[PairKind, Queries], int]:
     """The candidate pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
     x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
-    elements, pairs = ({kind: [] for kind in KINDS} for _ in range(2))
+    elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
     vertices = candidates = 0
     for _, scene in intervals:
         found = _find_candidates(scene, device)
@@ -260,7 +259,7 @@ def _gather(
         share = min(1.0, most / len(intervals) / max(number, 1))
         for kind, (kind_elements, kind_pairs) in found.items():
             before = [
-                vertices if kind == "vertex_face" else sum(map(len, elements[kind])),
+                vertices if kind == PairKind.VERTEX_FACE else sum(map(len, elements[kind])),
                 sum(map(len, elements[kind])),
             ]
             count = int(np.ceil(share * len(kind_pairs)))
@@ -269,12 +268,12 @@ def _gather(
             elements[kind].append(kind_elements + vertices)
         vertices += len(scene.x0)
     queries = {
-        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in KINDS
+        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in PairKind
     }
     return {kind: found for kind, found in queries.items() if len(found)}, candidates
 
 
-def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
     """Vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     pipeline = DetectionPipeline(mesh)
@@ -286,13 +285,13 @@ def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[str, tupl
     for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):
         pairs = narrow_phase.queue.numpy()[:count]
         # a GPU finds them in an order that varies
-        found[narrow_phase.kind.label] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+        found[narrow_phase.kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     return found
 
 
 def _find_answers(
-    queries: dict[str, Queries], places: list[Place], progress: Callable[[str], None]
-) -> tuple[dict[tuple[str, str], np.ndarray], int, int]:
+    queries: dict[PairKind, Queries], places: list[Place], progress: Callable[[str], None]
+) -> tuple[dict[tuple[PairKind, str], np.ndarray], int, int]:
     """Finds which queries collide by kind and method; and the numbers of UNSURE and of device-dependent answers."""
     answers, unsure, disagreeing = {}, 0, 0
     for place in {str(place.device): place for place in places}.values():
@@ -313,8 +312,8 @@ def _find_answers(
 
 
 def _compare(
-    queries: dict[str, Queries], answers: dict[tuple[str, str], np.ndarray], effort: Effort
-) -> tuple[dict[str, Errors], int, int, int, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    queries: dict[PairKind, Queries], answers: dict[tuple[PairKind, str], np.ndarray], effort: Effort
+) -> tuple[dict[str, Errors], int, int, int, dict[PairKind, tuple[np.ndarray, np.ndarray]]]:
     """Compares the answers with the truth.
 
     Returns:
@@ -332,7 +331,7 @@ def _compare(
         others = np.flatnonzero(~suspicious)
         some = random.permutation(others)[: int(np.ceil(effort.sample * len(found) / total))]
         indices = np.concatenate([np.flatnonzero(suspicious), some])
-        truth = getattr(checker, kind)(found.points(indices))
+        truth = getattr(checker, kind.label)(found.points(indices))
         truths[kind] = indices, truth
         collisions += int(truth.sum())
         checked += len(indices)
@@ -344,7 +343,7 @@ def _compare(
     return errors, collisions, checked, sample, truths
 
 
-def _time_methods(queries: dict[str, Queries], place: Place, effort: Effort) -> Timing:
+def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
     """Mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
     if place.cores == 1:
         with one_core():
@@ -362,7 +361,7 @@ def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Pl
     found = []
     for place in places:
         if place.cores in (1, None):
-            queries = [adversarial_queries(kind, effort.adversaries) for kind in KINDS]
+            queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
             with one_core() if place.cores == 1 else contextlib.nullcontext():
                 found.append((place, _find_slowest(queries, place, effort)))
     return found
@@ -378,7 +377,7 @@ def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> d
     return slowest
 
 
-def _time_methods_here(queries: dict[str, Queries], place: Place, effort: Effort, *, worst: bool) -> Timing:
+def _time_methods_here(queries: dict[PairKind, Queries], place: Place, effort: Effort, *, worst: bool) -> Timing:
     total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
     for found in queries.values():
@@ -396,7 +395,7 @@ def _time_methods_here(queries: dict[str, Queries], place: Place, effort: Effort
 
 
 def _time_ipc_toolkit(
-    method: str, queries: dict[str, Queries], truths: dict[str, tuple[np.ndarray, np.ndarray]], effort: Effort
+    method: str, queries: dict[PairKind, Queries], truths: dict[PairKind, tuple[np.ndarray, np.ndarray]], effort: Effort
 ) -> IpcQueryTiming:
     """Measures a method of the IPC Toolkit, on one core: Python calls it query by query."""
     random = np.random.default_rng(SEED)

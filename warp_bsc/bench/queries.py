@@ -7,20 +7,19 @@ import numpy as np
 import warp as wp
 
 from ..detection.launch import launch_over, launch_over_queue
-from ..detection.settings import TOLERANCE
+from ..detection.settings import TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.exact.first_contact import NONE, decide_in
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.queues import take_slot
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
+from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .timing import median_milliseconds
 
 __all__ = [
-    "KINDS",
     "MODES",
     "SEED",
     "QueryBenchmark",
@@ -30,8 +29,6 @@ __all__ = [
     "generate_queries",
     "generate_touching_queries",
 ]
-
-KINDS: tuple[str, ...] = ("vertex-face", "edge-edge")
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 """The modes that are measured, with the bytes of a query and its answer.
@@ -48,7 +45,7 @@ SEED = 0
 
 _MOST_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
-_MISSES: dict[str, float] = dict(zip(KINDS, (1.32, 2.33), strict=True))
+_MISSES = {PairKind.VERTEX_FACE: 1.32, PairKind.EDGE_EDGE: 2.33}
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
 culls."""
 
@@ -61,13 +58,13 @@ class QueryBenchmark:
     """Answers to the queries of one kind, and the times to find them.
 
     Attributes:
-        kind: "vertex-face" or "edge-edge".
+        kind: Kind of pair.
         status: The answers, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
         survivors: Number of queries that no cull decides.
         milliseconds: Median time to answer all queries, by mode [ms].
     """
 
-    kind: str
+    kind: PairKind
     status: np.ndarray
     survivors: int
     milliseconds: dict[str, float]
@@ -143,10 +140,10 @@ def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
 
 
 @functools.cache
-def _kernels(kind):
+def _kernels(kind: PairKind):
     """The kernels for one kind of query, each in a module of its own."""
-    vertex_face = kind == "vertex-face"
-    number = VERTEX_FACE if vertex_face else EDGE_EDGE
+    vertex_face = kind == PairKind.VERTEX_FACE
+    number = int(kind)
     ccd = ccd_vertex_face if vertex_face else ccd_edge_edge
     first_impact = impact_vertex_face if vertex_face else impact_edge_edge
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
@@ -258,11 +255,11 @@ def check_query_count(count: int) -> None:
         raise ValueError(f"the number of queries must be in [1, {_MOST_QUERIES}], not {count}")
 
 
-def generate_queries(kind: str, count: int, *, device: wp.DeviceLike = None) -> wp.array:
+def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
     """Random queries, the same on every device; a larger number begins with the queries of a smaller one.
 
     Args:
-        kind: "vertex-face" or "edge-edge".
+        kind: Kind of pair.
         count: Number of queries.
         device: Warp device; default: Warp's default.
 
@@ -272,31 +269,31 @@ def generate_queries(kind: str, count: int, *, device: wp.DeviceLike = None) -> 
     """
     device = wp.get_device(device)
     points = wp.empty((count, 8), dtype=wp.vec3, device=device)
-    inputs = [SEED, _MISSES[kind], 1 if kind == "vertex-face" else 2]
+    inputs = [SEED, _MISSES[kind], 1 if kind == PairKind.VERTEX_FACE else 2]
     launch_over(_generate_queries, count, inputs=inputs, outputs=[points], device=device)
     return points
 
 
-def generate_touching_queries(kind: str, count: int, *, device: wp.DeviceLike = None) -> wp.array:
+def generate_touching_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
     """Random queries whose first point touches an edge at half time: floating point can certify almost none.
 
     Arguments and result: as of :func:`generate_queries`, whose queries they are made from.
     """
     points = generate_queries(kind, count, device=device)
-    other = 1 if kind == "vertex-face" else 2
+    other = 1 if kind == PairKind.VERTEX_FACE else 2
     launch_over(_make_touch, count, inputs=[other], outputs=[points], device=points.device)
     return points
 
 
 def benchmark_queries(
-    kind: str, *, count: int | None = None, device: wp.DeviceLike = None, repeat: int = 20
+    kind: PairKind, *, count: int | None = None, device: wp.DeviceLike = None, repeat: int = 20
 ) -> QueryBenchmark:
     """Measures the time of random queries in each mode: replays of a CUDA graph, launches on the CPU.
 
     A first run of each mode is not timed.
 
     Args:
-        kind: "vertex-face" or "edge-edge".
+        kind: Kind of pair.
         count: Number of queries; default: 2^24 on a GPU, 2^18 on the CPU.
         device: Warp device; default: Warp's default.
         repeat: Number of repetitions; their medians count.
@@ -342,11 +339,13 @@ def benchmark_queries(
     answers = {mode: array.numpy() for mode, array in status.items()}
     missed = int((answers["exact"] != HIT).sum())
     if missed:
-        raise RuntimeError(f"{missed} of {count} touching {kind} queries were found to be free")
+        raise RuntimeError(f"{missed} of {count} touching {kind.display_name} queries were found to be free")
     for mode in runs.keys() - {"exact"}:
         different = int((answers[mode] != answers["status"]).sum())
         if different:
-            raise RuntimeError(f"{different} of {count} {kind} queries were answered differently by mode {mode}")
+            raise RuntimeError(
+                f"{different} of {count} {kind.display_name} queries were answered differently by mode {mode}"
+            )
     return QueryBenchmark(kind, answers["status"].copy(), int(counts.numpy()[0]), milliseconds)
 
 

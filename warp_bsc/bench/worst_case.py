@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..detection.settings import PairKind
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 
 __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
@@ -28,14 +29,14 @@ class WorstQuery:
 
     Attributes:
         method: The method.
-        kind: "vertex_face" or "edge_edge".
+        kind: Its kind of pair.
         index: Its index among the queries of its kind.
         points: Its points, rows as of :func:`warp_bsc.query_vertex_face`, shape [8, 3].
         nanoseconds: Its time by each method [ns].
     """
 
     method: str
-    kind: str
+    kind: PairKind
     index: int
     points: np.ndarray
     nanoseconds: dict[str, float]
@@ -65,7 +66,7 @@ def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str,
     return slowest
 
 
-def adversarial_queries(kind: str, count: int, *, seed: int = 0) -> Queries:
+def adversarial_queries(kind: PairKind, count: int, *, seed: int = 0) -> Queries:
     """Random degenerate queries, whose coordinates are small integers, so that many polynomials are exactly zero.
 
     A third of them move in one plane, a third start in one plane and leave it, and a third have points anywhere: these
@@ -87,12 +88,12 @@ def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
     suspects = np.argpartition(cycles, -count)[-count:]
     if method == "exact":
         # the trace has no exact arithmetic
-        undecided = np.flatnonzero(stages == STAGES.index("exact"))
-        suspects = np.concatenate([suspects, np.random.default_rng(0).permutation(undecided)[:count]])
+        left_to_exact = np.flatnonzero(stages == STAGES.index("exact"))
+        suspects = np.concatenate([suspects, np.random.default_rng(0).permutation(left_to_exact)[:count]])
     return suspects
 
 
-def _time_alone(method: str, kind: str, points: np.ndarray, device: wp.Device, repeat: int) -> float:
+def _time_alone(method: str, kind: PairKind, points: np.ndarray, device: wp.Device, repeat: int) -> float:
     """Time of a query [ns] among copies of itself."""
     if device.is_cuda:
         copies = _GPU_COPIES
@@ -103,7 +104,7 @@ def _time_alone(method: str, kind: str, points: np.ndarray, device: wp.Device, r
     return _time_copies(method, kind, points, copies, device, repeat)
 
 
-def _time_copies(method: str, kind: str, points: np.ndarray, copies: int, device: wp.Device, repeat: int) -> float:
+def _time_copies(method: str, kind: PairKind, points: np.ndarray, copies: int, device: wp.Device, repeat: int) -> float:
     queries = QuerySet(Queries.of_points(kind, points[None]), device, repeated=copies)
     run = MethodRun(method, queries)
     return min(measure_nanoseconds(run, repeat=1) for _ in range(repeat))

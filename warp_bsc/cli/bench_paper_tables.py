@@ -129,7 +129,7 @@ def _print_worst(console: Console, rows: _Rows, adversarial: list[tuple[Place, d
                 key=lambda named, method=method: named[1].nanoseconds[method],
             )
             took = (_few_digits(query.nanoseconds[other]) for other in METHODS)
-            table.add_row(f"{method}: {name}", query.kind.replace("_", "-"), str(query.index), *took)
+            table.add_row(f"{method}: {name}", query.kind.display_name, str(query.index), *took)
         console.print(table)
         console.print()
 
@@ -210,7 +210,7 @@ def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
         "precision": found.precision,
         "intervals": found.intervals,
         "candidates": found.candidates,
-        "queries": found.queries,
+        "queries": {kind.label: number for kind, number in found.queries.items()},
         "collisions": found.collisions,
         "unsure": found.unsure,
         "checked": found.checked,
@@ -239,7 +239,7 @@ def _timing_to_dict(timing: Timing) -> dict[str, Any]:
 def _worst_to_dict(worst: dict[str, WorstQuery]) -> dict[str, Any]:
     return {
         method: {
-            "kind": query.kind,
+            "kind": query.kind.label,
             "number": query.index,
             "points": query.points.tolist(),
             "nanoseconds": query.nanoseconds,

@@ -3,8 +3,9 @@
 import argparse
 import json
 
-from ..bench.queries import KINDS, benchmark_copy, benchmark_queries, check_query_count
+from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
 from ..bench.timing import count_threads, limited_threads
+from ..detection.settings import PairKind
 from .bench_queries_tables import print_query_benchmarks, query_benchmarks_to_dict
 from .device import find_device, loading_kernels
 from .options import BENCH_EXIT_STATUS, Commands, add_command, add_device, add_json, add_repeat, add_threads
@@ -48,9 +49,9 @@ def _run(arguments: argparse.Namespace) -> int:
     options = {"device": device, "repeat": arguments.repeat}
     with limited_threads(arguments.threads):
         with loading_kernels(device):
-            for kind in KINDS:
+            for kind in PairKind:
                 benchmark_queries(kind, count=1, device=device, repeat=1)
-        benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in KINDS]
+        benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in PairKind]
         settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
     if arguments.json:
         print(json.dumps(query_benchmarks_to_dict(benchmarks, **settings)))

@@ -37,7 +37,7 @@ def print_query_benchmarks(
     for found in benchmarks:
         numbers = [len(found.status), found.survivors, found.free, found.hits, found.unsure]
         number, survivors, *answers = (f"{number:,}" for number in numbers)
-        table.add_row(found.kind, number, survivors, f"{found.survivor_share:.1%}", *answers)
+        table.add_row(found.kind.display_name, number, survivors, f"{found.survivor_share:.1%}", *answers)
     console.print(table)
     console.print()
 
@@ -53,7 +53,7 @@ def print_query_benchmarks(
         for mode, milliseconds in took.milliseconds.items():
             rate = took.bytes_per_second[mode]
             table.add_row(
-                f"{took.kind}, {mode}",
+                f"{took.kind.display_name}, {mode}",
                 f"{milliseconds:,.2f}",
                 f"{took.queries_per_second[mode] / 1e6:,.1f}",
                 str(MODES[mode]),
@@ -83,7 +83,7 @@ def query_benchmarks_to_dict(
         "copy_bytes_per_second": copy_rate,
         "kinds": [
             {
-                "kind": found.kind,
+                "kind": found.kind.display_name,
                 "queries": len(found.status),
                 "survivors": found.survivors,
                 "survivor_share": found.survivor_share,

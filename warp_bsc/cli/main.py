@@ -5,7 +5,7 @@ import sys
 from typing import NoReturn
 
 from .. import __version__
-from . import bench_detector, bench_paper, bench_queries, query, replay
+from . import bench_detector, bench_newton, bench_paper, bench_queries, query, replay
 from .error_boundary import run_guarded
 from .options import BENCH_EXIT_STATUS, EXIT_STATUS, add_command
 
@@ -31,11 +31,12 @@ examples:
   warp-bsc bench paper --help
   warp-bsc bench detector
   warp-bsc bench queries
+  warp-bsc bench newton
   warp-bsc bench detector --help
 
 {BENCH_EXIT_STATUS}"""
 
-_BENCHMARKS = {"paper": bench_paper, "detector": bench_detector, "queries": bench_queries}
+_BENCHMARKS = {"paper": bench_paper, "detector": bench_detector, "queries": bench_queries, "newton": bench_newton}
 
 
 class _Parser(argparse.ArgumentParser):

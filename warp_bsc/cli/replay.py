@@ -220,7 +220,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
 
     Raises:
         ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
-            disk, as far as there is room.
+            disk, as far as it has space.
     """
     settings = {"method": arguments.method, "device": str(device)}
     with contextlib.ExitStack() as stack:
@@ -264,7 +264,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
                     say(console, f"Wrote {output.file.path}.")
     if interrupt:
         raise interrupt
-    if summary.validation and summary.validation["disagreements"]:
+    if summary.validation and summary.validation.disagreements:
         return _DISAGREES
     if arguments.fail_on_collision and summary.hits:
         return _COLLIDES
@@ -283,9 +283,9 @@ def _explain(error: Exception, scene: Scene) -> str:
 
 
 def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
-    """Puts files in their places, without the last intervals if there is no room for all; returns what is missing.
+    """Puts files in their places, without the last intervals if the disk is full; returns the parts that are missing.
 
-    On a full disk all files shrink, to make room for one another, but not below half: tables matter more than a page.
+    On a full disk all files shrink, but not below half of their intervals: tables matter more than a page.
     """
     problems, shortages = [], {}
     shared = 5  # times an eighth is a half

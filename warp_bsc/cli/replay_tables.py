@@ -1,12 +1,10 @@
 """Shows the results of a replay on the terminal."""
 
-from typing import Any
-
 from rich.console import Console
 from rich.text import Text
 
 from ..replay.intervals import IntervalSummary
-from ..replay.summary import CERTIFIED_FOR, Summary
+from ..replay.summary import CERTIFIED_FOR, Summary, ValidationSummary
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_replay"]
@@ -125,21 +123,21 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
 
 
-def _print_validation(console: Console, found: dict[str, Any]) -> None:
+def _print_validation(console: Console, found: ValidationSummary) -> None:
     """Prints how the answers compare with the exact checker's."""
-    wrong = found["disagreements"]
+    wrong = found.disagreements
     say(
         console,
-        f"Validated by the exact checker: {count(found['hits'], 'collision')} and "
-        f"{count(found['others'], 'other pair')}, {count(len(wrong), 'disagreement')}.",
+        f"Validated by the exact checker: {count(found.hits, 'collision')} and "
+        f"{count(found.others, 'other pair')}, {count(len(wrong), 'disagreement')}.",
     )
     for line in wrong[:LONGEST]:
         say(console, f"  {line}")
     if len(wrong) > LONGEST:
         say(console, f"  and {len(wrong) - LONGEST} more; --json has all.")
-    if found["false_hits"]:
+    if found.false_hits:
         say(
             console,
-            f"False collisions, which method conservative allows: {found['false_hits']:,}.",
+            f"False collisions, which method conservative allows: {found.false_hits:,}.",
         )
-    say(console, f"Certified by floating point: {found['certified']:,} of {found['answers']:,} answers.")
+    say(console, f"Certified by floating point: {found.certified:,} of {found.answers:,} answers.")

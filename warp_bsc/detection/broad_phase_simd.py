@@ -1,6 +1,11 @@
-"""The broad phase of a CPU: a wide BVH of packets of eight boxes, which SIMD instructions compare at once."""
+"""The broad phase on the CPU: a wide BVH of packets of eight boxes, compared by SIMD instructions.
+
+The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are sorted along a Morton curve of a grid
+with 2^10 cells an axis, world by world.
+"""
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -14,28 +19,31 @@ from .settings import NO_GRADIENTS, UNLIMITED, Count
 __all__ = ["BroadPhaseSimd"]
 
 _CODE_BITS = 10
+"""Bits of a Morton code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
 @functools.cache
-def _kernels(dtype):
-    """The kernels that read positions, for one type of them."""
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that encode elements and fill packets, for one type of position."""
 
     @wp.kernel(**NO_GRADIENTS)
     def encode(
         first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         corners: wp.array2d[int],
         worlds: wp.array[int],
         low: wp.vec3d,
         scale: wp.vec3d,
+        # out
         codes: wp.array[wp.int64],
         order: wp.array[int],
     ):
-        """Writes the place of each element's first corner along a Morton curve, one world behind the other."""
+        """Writes for each element its world and the Morton code of its first corner halfway, as one number to sort."""
         i = first + wp.tid()
         vertex = corners[i, 0]
         code = wp.int64(worlds[i])
@@ -52,6 +60,7 @@ def _kernels(dtype):
     @wp.kernel(**NO_GRADIENTS)
     def fill_packets(
         first: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         corners: wp.array2d[int],
@@ -59,11 +68,13 @@ def _kernels(dtype):
         worlds: wp.array[int],
         order: wp.array[int],
         changed: wp.array[int],
+        # out
         boxes: wp.array3d[wp.float32],
         elements: wp.array2d[int],
         nodes: wp.array3d[wp.float32],
         node_worlds: wp.array3d[int],
     ):
+        """Writes the boxes and the elements of each packet, and its entry in its node."""
         packet = first + wp.tid()
         count = wp.min(8, corners.shape[0] - 8 * packet)
         low = wp.vec3(wp.inf)
@@ -108,20 +119,25 @@ def _kernels(dtype):
 @wp.kernel(**NO_GRADIENTS)
 def _pair_packets(
     first: int,
+    # tree of the packets
     boxes: wp.array[wp.float32],
     elements: wp.array[int],
     corners: int,
+    # tree that is traversed
     other_boxes: wp.array[wp.float32],
     other_elements: wp.array[int],
     other_corners: int,
     other_nodes: wp.array[wp.float32],
     other_node_worlds: wp.array[int],
     level_starts: wp.array[int],
+    # options
     symmetric: int,
     keep_separated: int,
+    # out
     counts: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
 ):
+    """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
     pair_packet(
         first + wp.tid(),
         boxes,
@@ -143,15 +159,15 @@ def _pair_packets(
 
 
 class _Tree:
-    """A tree over the elements of one kind: vertices, edges or faces. See :mod:`warp_bsc.kernels.pipeline.wide_bvh`."""
+    """A wide BVH over the elements of one kind: vertices, edges or faces."""
 
-    def __init__(self, corners, numbers, world):
-        """Makes an empty tree.
+    def __init__(self, corners: np.ndarray, numbers: np.ndarray, world: np.ndarray | None):
+        """Allocates a tree without boxes.
 
         Args:
             corners: Vertex indices of the elements, int32, shape [n, 1 to 3].
-            numbers: What the elements are called in pairs, int32, shape [n].
-            world: World of each vertex, int32, or None: all in one.
+            numbers: Number of each element in pairs, int32, shape [n].
+            world: World of each vertex, int32, shape [vertex_count]; None for one world.
         """
         n = len(corners)
         packets = -(-n // 8)
@@ -170,21 +186,21 @@ class _Tree:
         self._level_starts = wp.array(starts, dtype=int, device=device)
         self._codes = wp.empty(2 * n, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * n, dtype=int, device=device)
-        # empty boxes, which overlap nothing, where there are less than eight; worlds of no element
+        # lanes without an element keep an empty box, which overlaps no other, and the world -1
         empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
         self._boxes = wp.array(np.tile(empty, (packets, 6, 8)), dtype=wp.float32, device=device)
         self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
 
-    def sort(self, x0, x1, low, scale):
-        """Sorts the elements of a motion along a Morton curve.
+    def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
+        """Sorts the elements along a Morton curve of a motion's grid.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            low: Lowest coordinates of all, shape [3].
-            scale: Cells of the sorting grid per unit of length, for each axis, shape [3].
+            low: Lowest corner of the grid, float64, shape [3].
+            scale: Cells of the grid per unit of length along each axis, float64, shape [3].
         """
         encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
@@ -192,13 +208,13 @@ class _Tree:
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
 
-    def fit(self, x0, x1, changed=None):
-        """Boxes the elements of a motion, in the order that they are in.
+    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
+        """Computes the boxes of all packets and nodes for a motion, without sorting.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            changed: Which vertices have changed, array of int, None for all.
+            changed: Nonzero for each changed vertex, array of int; None for all.
         """
         _, fill_packets = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed]
@@ -212,16 +228,16 @@ class _Tree:
             _join(worlds[start:end, :1, 0], worlds[end:above, :1])
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
-    def pair(self, other, counts, pairs, *, keep_separated=False):
-        """Enqueues pairs of elements of this tree and of another or the same.
+    def pair(self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False) -> None:
+        """Enqueues the candidates between this tree and another, or within this tree.
 
         See :func:`warp_bsc.kernels.pipeline.wide_bvh.pair_packet`.
 
         Args:
-            other: The other tree.
+            other: The other tree, or this tree.
             counts: By :class:`Count`, array of int64.
-            pairs: Queue of the candidates that no axis separates, array of vec2i.
-            keep_separated: Whether to enqueue those that an axis separates as well.
+            pairs: Queue of the candidates, array of vec2i.
+            keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
         """
         inputs = [
             self._boxes.flatten(),
@@ -240,7 +256,7 @@ class _Tree:
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
 
 
-def _join(children, parents):
+def _join(children: np.ndarray, parents: np.ndarray) -> None:
     """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
     for lane in range(8):
         lanes = children[lane::8]
@@ -248,7 +264,7 @@ def _join(children, parents):
 
 
 class BroadPhaseSimd:
-    """The broad phase by trees of SIMD packets, see :class:`warp_bsc.detection.broad_phase.BroadPhase`.
+    """The broad phase by wide BVHs, one a kind of element; a :class:`warp_bsc.detection.broad_phase.BroadPhase`.
 
     It pairs elements directly, and has no queue for pairs of faces.
     """
@@ -257,7 +273,7 @@ class BroadPhaseSimd:
     capacity: int = UNLIMITED
 
     def __init__(self, mesh: CollisionMesh, count: wp.array):
-        """Allocates trees over the vertices, the edges and the faces of a mesh; the count stays as it is."""
+        """Allocates trees over the vertices, the edges and the faces of a mesh; ``count`` is not used."""
         self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
         self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world)
         self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
@@ -295,15 +311,18 @@ class BroadPhaseSimd:
         self._build([self._edges, self._faces], x, x, False)
         self._edges.pair(self._faces, counts, pairs)
 
-    def _build(self, trees, x0, x1, refit, changed=None):
-        """Builds trees for a motion, sorted on one grid around all that is used of it, or refits them."""
+    def _build(
+        self, trees: Sequence[_Tree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
+    ) -> None:
+        """Builds trees for a motion, or refits their boxes without sorting."""
         if not refit:
             _sort(trees, x0, x1, self._used)
         for tree in trees:
             tree.fit(x0, x1, changed)
 
 
-def _sort(trees, x0, x1, used):
+def _sort(trees: Sequence[_Tree], x0: wp.array, x1: wp.array, used: np.ndarray | slice) -> None:
+    """Sorts trees on one grid around the used vertices of a motion."""
     ends = x0.numpy()[used], x1.numpy()[used]
     low = np.array([min(x[:, axis].min(initial=np.inf) for x in ends) for axis in range(3)])
     high = np.array([max(x[:, axis].max(initial=-np.inf) for x in ends) for axis in range(3)])

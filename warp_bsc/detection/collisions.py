@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .contact_buffer import ContactBuffer, HostContacts, read_contacts
+from .contact_buffer import ContactRows, HostContacts
 from .differentiable import CollisionArrays
 from .settings import Counts, PairCounts
 from .stage_timer import StageTimer
@@ -72,7 +72,7 @@ class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
     They are in arrays of their own, on the device until they are first read, and stay as they are whatever is detected
-    later.
+    later. A detector uses these arrays again once no reference to the result is left.
 
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
@@ -89,17 +89,17 @@ class Collisions:
     arrays: CollisionArrays | None
     _method: str = field(repr=False)
     _counts: Counts = field(repr=False)
-    _vertex_face: ContactBuffer = field(repr=False)
-    _edge_edge: ContactBuffer = field(repr=False)
+    _vertex_face: ContactRows = field(repr=False)
+    _edge_edge: ContactRows = field(repr=False)
     _timer: StageTimer = field(repr=False)
 
     @functools.cached_property
     def _vertex_face_contacts(self) -> HostContacts:
-        return read_contacts(self._vertex_face, len(self._vertex_face.pairs))
+        return self._vertex_face.read()
 
     @functools.cached_property
     def _edge_edge_contacts(self) -> HostContacts:
-        return read_contacts(self._edge_edge, len(self._edge_edge.pairs))
+        return self._edge_edge.read()
 
     @property
     def vertex_face(self) -> np.ndarray:

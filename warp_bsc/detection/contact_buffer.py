@@ -1,13 +1,27 @@
 """The contacts of one kind of pair as parallel arrays on the device, and on the host."""
 
+import weakref
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from ..kernels.signs import FREE
+from .settings import capacity_for
 
-__all__ = ["ContactBuffer", "HostContacts", "contacts_from_host", "make_contact_buffer", "read_contacts"]
+__all__ = [
+    "ContactBuffer",
+    "ContactBufferPool",
+    "ContactRows",
+    "HostContacts",
+    "contacts_from_host",
+    "make_contact_buffer",
+    "read_contacts",
+]
+
+_MOST_FREE = 4
+"""Free buffers that a pool keeps: those of two results."""
 
 
 @wp.struct
@@ -93,3 +107,62 @@ def contacts_from_host(contacts: HostContacts, device: wp.Device) -> ContactBuff
     for name in ContactBuffer.vars:
         getattr(buffer, name).assign(getattr(contacts, name))
     return buffer
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRows:
+    """The first rows of a buffer: the contacts of one kind of pair in a result.
+
+    Attributes:
+        buffer: The buffer.
+        count: Number of rows.
+    """
+
+    buffer: ContactBuffer
+    count: int
+
+    def read(self) -> HostContacts:
+        """Returns copies of the contacts; synchronizes with the device."""
+        return read_contacts(self.buffer, self.count)
+
+
+class ContactBufferPool:
+    """Contact buffers of results, used again once the rows that were taken from the pool are garbage.
+
+    Rows that are still referenced keep their buffer. The pool itself keeps a few free buffers at most. It does not see
+    references to the arrays of a buffer: whoever passes these on must not take the buffer from a pool.
+    """
+
+    def __init__(self, device: wp.Device):
+        """Makes an empty pool.
+
+        Args:
+            device: Device of the buffers.
+        """
+        self._device = device
+        self._free: list[tuple[wp.Stream | None, ContactBuffer]] = []
+        self._returned: deque[tuple[wp.Stream | None, ContactBuffer]] = deque(maxlen=_MOST_FREE)
+        """Appended to by finalizers, which may run at any time."""
+
+    def take(self, count: int) -> ContactRows:
+        """Returns ``count`` rows of a buffer, whose values are undefined.
+
+        The buffer is a free one that the device's current stream has used last, the smallest that suffices, so that
+        work still queued on that stream ends before any of the new owner's; or it is a new one.
+
+        Raises:
+            ValueError: If no buffer can be large enough.
+        """
+        while self._returned:
+            self._free.append(self._returned.popleft())
+        del self._free[:-_MOST_FREE]
+        stream = self._device.stream if self._device.is_cuda else None
+        fitting = [entry for entry in self._free if entry[0] is stream and len(entry[1].pairs) >= count]
+        if fitting:
+            entry = min(fitting, key=lambda entry: len(entry[1].pairs))
+            self._free = [other for other in self._free if other is not entry]
+        else:
+            entry = stream, make_contact_buffer(capacity_for(max(count, 64), "collisions"), self._device)
+        rows = ContactRows(entry[1], count)
+        weakref.finalize(rows, self._returned.append, entry).atexit = False
+        return rows

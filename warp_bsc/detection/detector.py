@@ -1,14 +1,12 @@
 """The collision detector: every collision of a mesh that moves from one configuration to another."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import warp as wp
 
 from .._arrays import check_finite
 from ..kernels.signs import UNSURE
 from .collisions import CapturedCollisions, Collisions
-from .contact_buffer import ContactBuffer, contacts_from_host, read_contacts
+from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays
 from .host_function import run_on_host
 from .intersections import find_intersections
@@ -16,7 +14,7 @@ from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, decide_on_host
 from .pipeline import DetectionPipeline
-from .settings import TOLERANCE, Counts, PairCounts
+from .settings import TOLERANCE, Counts
 from .stage_timer import StageTimer
 
 __all__ = ["CollisionDetector"]
@@ -50,6 +48,7 @@ class CollisionDetector:
         self.method = method
         self.tolerance = tolerance
         self._pipeline = DetectionPipeline(mesh, method=method, tolerance=tolerance, only_used_vertices=True)
+        self._result_buffers = ContactBufferPool(mesh.device)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
 
@@ -87,20 +86,18 @@ class CollisionDetector:
         if counts.not_finite:
             for name, x in (("x0", x0), ("x1", x1)):
                 check_finite(x.numpy(), name, self.mesh.vertices)
+        differentiable = x0.requires_grad or x1.requires_grad
         with timer.stage("sort"):
-            contacts = [
-                narrow_phase.ordered_contacts(kind_counts.collisions)
-                for narrow_phase, kind_counts in self._narrow_phases(counts)
-            ]
+            contacts = self._ordered_contacts(counts, recycle=not differentiable)
         if counts.vertex_face.too_wide_8 or counts.edge_edge.too_wide_8:
             with timer.stage("exact"):  # now, while the positions are what they were
                 contacts = [
-                    self._decide_on_host(narrow_phase, buffer, x0, x1)
-                    for narrow_phase, buffer in zip(self._pipeline.narrow_phases, contacts, strict=True)
+                    self._decide_on_host(narrow_phase, rows, x0, x1)
+                    for narrow_phase, rows in zip(self._pipeline.narrow_phases, contacts, strict=True)
                 ]
         arrays = None
-        if x0.requires_grad or x1.requires_grad:
-            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *contacts)
+        if differentiable:
+            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *(rows.buffer for rows in contacts))
         vertex_face, edge_edge = contacts
         return Collisions(self.method != "float", (), arrays, self.method, counts, vertex_face, edge_edge, timer)
 
@@ -120,18 +117,34 @@ class CollisionDetector:
         """
         return find_intersections(self.mesh, x)
 
-    def _narrow_phases(self, counts: Counts) -> Iterator[tuple[NarrowPhase, PairCounts]]:
-        """Returns each narrow phase with its counts on the host."""
-        return zip(self._pipeline.narrow_phases, (counts.vertex_face, counts.edge_edge), strict=True)
+    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> list[ContactRows]:
+        """Returns the sorted contacts of both kinds of pair, as far as the buffers held them.
 
-    def _decide_on_host(
-        self, narrow_phase: NarrowPhase, buffer: ContactBuffer, x0: wp.array, x1: wp.array
-    ) -> ContactBuffer:
+        Args:
+            counts: The counts of the detection.
+            recycle: Whether to take buffers of earlier results that are garbage, and to let later results take these;
+                not where others refer to the arrays. Otherwise the buffers are new, with no row to spare.
+        """
+        contacts = []
+        for narrow_phase, found in zip(
+            self._pipeline.narrow_phases, (counts.vertex_face, counts.edge_edge), strict=True
+        ):
+            count = min(found.collisions, len(narrow_phase.contacts.pairs))
+            if recycle:
+                rows = self._result_buffers.take(count)
+            else:
+                rows = ContactRows(make_contact_buffer(count, self.mesh.device), count)
+            narrow_phase.ordered_contacts(count, rows.buffer)
+            contacts.append(rows)
+        return contacts
+
+    def _decide_on_host(self, narrow_phase: NarrowPhase, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
         """Returns the contacts without those that the host refutes, and with what it finds of the others."""
-        contacts = read_contacts(buffer, len(buffer.pairs))
+        contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
         decide_on_host(narrow_phase.kind, x0, x1, self.mesh.device_elements(narrow_phase.kind), contacts, which)
-        return contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
+        buffer = contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
+        return ContactRows(buffer, len(buffer.pairs))
 
     def _capture_on_cpu(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
         """Adds a detection to the graph that the CPU captures."""
@@ -167,15 +180,16 @@ class CollisionDetector:
             overflows = tuple(pipeline.overflows(counts))
             left_to_host = counts.vertex_face.too_wide_8 + counts.edge_edge.too_wide_8
             certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            vertex_face, edge_edge = (
-                narrow_phase.ordered_contacts(min(kind_counts.collisions, len(narrow_phase.contacts.pairs)))
-                for narrow_phase, kind_counts in self._narrow_phases(counts)
-            )
+            vertex_face, edge_edge = self._ordered_contacts(counts, recycle=True)
             timer = StageTimer(None)
             return Collisions(certified, overflows, arrays, self.method, counts, vertex_face, edge_edge, timer)
 
         arrays = None
         if x0.requires_grad or x1.requires_grad:
-            whole = [n.ordered_contacts(len(n.contacts.pairs)) for n in pipeline.narrow_phases]
+            capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
+            whole = [
+                narrow_phase.ordered_contacts(capacity, make_contact_buffer(capacity, self.mesh.device))
+                for narrow_phase, capacity in zip(pipeline.narrow_phases, capacities, strict=True)
+            ]
             arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *whole)
         return CapturedCollisions(arrays, read)

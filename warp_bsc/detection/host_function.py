@@ -1,8 +1,9 @@
-"""Python functions as nodes of a graph on the CPU: they run at each replay, as cudaLaunchHostFunc has it on CUDA.
+"""Python functions as nodes of a graph on the CPU, which run at each replay, like cudaLaunchHostFunc on CUDA.
 
-Warp captures a graph on the CPU as the list of the kernels that are launched, with their dimensions, and runs none of
-them meanwhile. A function that reads numbers between launches (how full a queue is, whether to go on) cannot be
-captured like this: its branches and dimensions would be fixed at the first capture.
+Warp captures a graph on the CPU as a list of kernel launches with their dimensions, and runs no kernel while it
+captures. A function that reads numbers between launches (the length of a queue, whether to go on) cannot be captured as
+such a list: its branches and dimensions would stay those of the capture. Here the list holds one kernel, which calls
+the function.
 """
 
 import ctypes
@@ -11,41 +12,58 @@ import itertools
 import threading
 import traceback
 import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import warp as wp
 
 __all__ = ["run_on_host"]
 
-_functions = {}
-"""The functions in all graphs that exist, by their numbers, each with what says that its graph has failed."""
+
+@dataclass(eq=False)
+class _Failure:
+    """Failure of a graph in its current replay.
+
+    Attributes:
+        flag: Whether one of its functions has failed, array of one int.
+        raise_error: The C function that raises the error, which must live until the kernel has called it.
+    """
+
+    flag: wp.array
+    raise_error: object = None
+
+
+_functions: dict[int, tuple[Callable[[], object], _Failure]] = {}
+"""By number, each function in a graph that exists, with the failure of its graph."""
 
 _numbers = itertools.count()
 
-_failures = weakref.WeakKeyDictionary()
-"""By graph whether a function of it has failed in the present replay, array of one int."""
+_failures: weakref.WeakKeyDictionary[object, _Failure] = weakref.WeakKeyDictionary()
 
 
 @ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int64)
-def _call(number):
-    """Calls a function; returns None or the address of a function without arguments that raises its error.
+def _call(number: int) -> int | None:
+    """Calls a function, and returns None or the address of a C function that raises its error in this thread.
 
-    Raised here an error would only be printed: it is raised when the graph has returned to Python.
+    ctypes would print an error that is raised here, and go on. The C function, which the kernel calls, sets an
+    exception that Python raises once the launch of the graph has returned to it.
     """
-    function, failed = _functions[number]
+    function, failure = _functions[number]
     try:
         function()
     except BaseException as error:  # Ctrl-C as well
         traceback.print_exc()
-        failed.fill_(1)
+        failure.flag.fill_(1)
         kind, text = type(error), str(error)
+        # Python makes the exception from a class alone, so that the class must hold the message
         members = {"__init__": lambda self: kind.__init__(self, text), "__module__": kind.__module__}
         set_error = functools.partial(
             ctypes.pythonapi.PyThreadState_SetAsyncExc,
             ctypes.c_ulong(threading.get_ident()),
             ctypes.py_object(type(kind.__name__, (kind,), members)),
         )
-        failed.raise_error = ctypes.CFUNCTYPE(ctypes.c_int)(set_error)  # kept, as only its address goes on from here
-        return ctypes.cast(failed.raise_error, ctypes.c_void_p).value
+        failure.raise_error = raise_error = ctypes.CFUNCTYPE(ctypes.c_int)(set_error)
+        return ctypes.cast(raise_error, ctypes.c_void_p).value
     return None
 
 
@@ -58,7 +76,9 @@ def _call(number):
         ((wp::int32 (*)())raise_error)();
     """
 )
-def _call_native(call: wp.uint64, number: wp.int64, failed: wp.array[int]): ...
+def _call_native(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
+    """Calls :func:`_call`, whose address is given, unless a function has failed in this replay; raises its error."""
+    ...
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -66,15 +86,15 @@ def _call_kernel(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
     _call_native(call, number, failed)
 
 
-def run_on_host(function, device) -> None:
-    """Calls a function or, while the CPU captures a graph, makes it a node of that: called at each replay.
+def run_on_host(function: Callable[[], object], device: wp.Device) -> None:
+    """Calls a function now or, while the CPU captures a graph, at each replay of that graph.
 
-    An error of the function at a replay is raised where the graph is launched, and its traceback printed; the graph's
-    other functions do not run any more in that replay.
+    If the function fails at a replay, its traceback is printed, the remaining functions of the graph are skipped in
+    that replay, and the error is raised where the graph is launched.
 
     Args:
-        function: Takes nothing, and refers to all arrays that it uses.
-        device: Device that the function launches kernels on.
+        function: Function without arguments. It must hold references to all arrays that it uses.
+        device: Device on which the function launches kernels.
 
     Raises:
         RuntimeError: If the graph is to be saved to a file, which cannot hold a function.
@@ -82,14 +102,15 @@ def run_on_host(function, device) -> None:
     if not (device.is_cpu and device.is_capturing):
         function()
         return
-    graph = wp._src.context.runtime._apic_graph  # there is no public way to ask
+    graph = wp._src.context.runtime._apic_graph  # Warp has no public access to it
     if graph.apic:
         raise RuntimeError("a graph that is to be saved cannot hold this: it runs Python at each replay")
     if graph not in _failures:
-        _failures[graph] = wp.empty(1, dtype=int, device=device)
-        _failures[graph].zero_()  # at the start of each replay
+        _failures[graph] = _Failure(wp.empty(1, dtype=int, device=device))
+        _failures[graph].flag.zero_()  # at the start of each replay
+    failure = _failures[graph]
     number = next(_numbers)
-    _functions[number] = function, _failures[graph]
+    _functions[number] = function, failure
     weakref.finalize(graph, _functions.pop, number)
     call = ctypes.cast(_call, ctypes.c_void_p).value
-    wp.launch(_call_kernel, 1, inputs=[call, number, _failures[graph]], device=device, record_tape=False)
+    wp.launch(_call_kernel, 1, inputs=[call, number, failure.flag], device=device, record_tape=False)

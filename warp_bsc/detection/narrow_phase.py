@@ -164,16 +164,19 @@ class NarrowPhase:
             launch_over(pad_keys, entries, inputs=inputs, outputs=outputs, device=device)
         wp.utils.radix_sort_pairs(self._keys, self._order, entries, end_bit=sum(self._bits) + 1)
 
-    def ordered_contacts(self, rows: int) -> ContactBuffer:
-        """Returns a copy of the first contacts in their order, after :meth:`sort`, without synchronizing with a GPU.
+    def ordered_contacts(self, rows: int, buffer: ContactBuffer) -> ContactBuffer:
+        """Copies the first contacts in their order, after :meth:`sort`, without synchronizing with a GPU.
 
         Args:
             rows: Number of contacts; those without one have the pair (-1, -1).
+            buffer: Buffer to copy to, with at least that many rows.
+
+        Returns:
+            The buffer.
         """
-        ordered = make_contact_buffer(rows, self.counts.device)
         inputs = [self.counts, self._order, self.contacts]
-        launch_over(gather_contacts, rows, inputs=inputs, outputs=[ordered], device=self.counts.device)
-        return ordered
+        launch_over(gather_contacts, rows, inputs=inputs, outputs=[buffer], device=self.counts.device)
+        return buffer
 
 
 def run_narrow_phases(

@@ -52,6 +52,11 @@ class PairKind(enum.IntEnum):
         """The name in attributes of results: "vertex_face" or "edge_edge"."""
         return self.name.lower()
 
+    @property
+    def display_name(self) -> str:
+        """The name in tables and messages: "vertex-face" or "edge-edge"."""
+        return self.label.replace("_", "-")
+
 
 def check_method(method: str) -> None:
     """Raises ValueError if there is no such method."""

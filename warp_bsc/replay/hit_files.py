@@ -86,7 +86,7 @@ class HitsJson(RecordFile):
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
             "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
-            "validation": summary.validation,
+            "validation": asdict(summary.validation) if summary.validation else None,
         }
         return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
 

@@ -138,13 +138,13 @@ def _data(summary: Summary, worst: IntervalResult | None) -> dict:
             f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
         )
     if found := summary.validation:
-        wrong = len(found["disagreements"])
+        wrong = len(found.disagreements)
         text = (
-            f"{found['hits']:,} collisions and {found['others']:,} other pairs were asked again of the exact checker: "
+            f"{found.hits:,} collisions and {found.others:,} other pairs were asked again of the exact checker: "
             f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
-            f"{found['certified']:,} of all {found['answers']:,} answers."
+            f"{found.certified:,} of all {found.answers:,} answers."
         )
-        data["validation"] = {"text": text, "disagreements": found["disagreements"][:_MAX_DISAGREEMENTS]}
+        data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
     return data
 
 

@@ -27,7 +27,7 @@ class ReplayOutput(Protocol):
         """Adds an interval.
 
         Raises:
-            OSError: If there is no room for it. After that the output can only be shrunk, finished or discarded.
+            OSError: If the disk is full. After that the output can only be shrunk, finished or discarded.
         """
         ...
 
@@ -38,12 +38,12 @@ class ReplayOutput(Protocol):
             summary: The whole replay. The last of its intervals may be missing in this file.
 
         Raises:
-            OSError: If there is no room. After shrinking, finishing may be tried again.
+            OSError: If the disk is full. After shrinking, finishing may be tried again.
         """
         ...
 
     def shrink(self) -> bool:
-        """Makes room: drops the last eighth of the intervals. Returns whether the file becomes smaller."""
+        """Drops the last eighth of the intervals to save space, and returns whether the file becomes smaller."""
         ...
 
     def discard(self) -> None:

@@ -1,4 +1,4 @@
-"""Names the collisions of one interval as the artist knows them: prims, their own elements, places in world space."""
+"""Names the collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
 from dataclasses import dataclass, field
 

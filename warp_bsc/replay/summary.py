@@ -7,10 +7,31 @@ from functools import cached_property
 from ..usd.scene import Scene
 from .intervals import TOI_BINS, Contact, IntervalSummary
 
-__all__ = ["CERTIFIED_FOR", "Summary"]
+__all__ = ["CERTIFIED_FOR", "Summary", "ValidationSummary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
 """The motion that a certificate holds for."""
+
+
+@dataclass(frozen=True)
+class ValidationSummary:
+    """Comparison of a whole replay with the exact checker.
+
+    Attributes:
+        hits: Number of reported collisions that the checker decided.
+        others: Number of unreported pairs with overlapping swept boxes that the checker decided.
+        answers: Number of pairs that the detector decided.
+        certified: Number of these that floating point certified.
+        false_hits: Number of reported pairs of method "conservative" that do not collide, as that method permits.
+        disagreements: The pairs that the checker decides differently, a sentence with the interval each.
+    """
+
+    hits: int
+    others: int
+    answers: int
+    certified: int
+    false_hits: int
+    disagreements: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -89,21 +110,23 @@ class Summary:
         return dict(total)
 
     @property
-    def validation(self) -> dict | None:
+    def validation(self) -> ValidationSummary | None:
         """The comparison with the exact checker, None if none was asked for."""
         found = [(interval, interval.validation) for interval in self.intervals if interval.validation]
         if not found:
             return None
-        sums = {
-            name: sum(getattr(validation, name) for _, validation in found)
-            for name in ("hits", "others", "answers", "certified", "false_hits")
-        }
-        disagreements = [
-            f"from time {interval.start:g} to {interval.end:g}: {line}"
-            for interval, validation in found
-            for line in validation.disagreements
-        ]
-        return {**sums, "disagreements": disagreements}
+        return ValidationSummary(
+            hits=sum(validation.hits for _, validation in found),
+            others=sum(validation.others for _, validation in found),
+            answers=sum(validation.answers for _, validation in found),
+            certified=sum(validation.certified for _, validation in found),
+            false_hits=sum(validation.false_hits for _, validation in found),
+            disagreements=tuple(
+                f"from time {interval.start:g} to {interval.end:g}: {line}"
+                for interval, validation in found
+                for line in validation.disagreements
+            ),
+        )
 
     @property
     def motion(self) -> str:

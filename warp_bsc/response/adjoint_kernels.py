@@ -24,6 +24,7 @@ from .constraints import (
     contact_weights,
     feasible,
     feasible_in_contact,
+    is_excluded,
     longest_path,
     to_double,
     to_single,
@@ -363,16 +364,22 @@ def truncate_paths(
     velocity[entry] = to_single(path / dt)
 
 
-@wp.kernel(enable_backward=False)
-def count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, record: StepRecord):
-    """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
-    i = wp.tid()
+@wp.func
+def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: int, record: StepRecord):
     if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
         return
     corners = contact_vertices(contacts, i)
-    if wp.min(corners) >= motion.movable:
+    if is_excluded(motion, contacts, i, corners):
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]
     impact = _impact(motion, vertices, corners, kind, contacts.localized[i], contacts.toi[i], at, contacts.normal[i])
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)
+
+
+@wp.kernel(enable_backward=False)
+def count_grazing(motion: Motion, vertices: Vertices, vertex_face: Contacts, edge_edge: Contacts, record: StepRecord):
+    """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
+    i = wp.tid()
+    _count_grazing(motion, vertices, vertex_face, i, record)
+    _count_grazing(motion, vertices, edge_edge, i, record)

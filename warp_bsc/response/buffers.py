@@ -3,7 +3,9 @@
 import warp as wp
 
 __all__ = [
+    "DIVIDED",
     "FROZEN",
+    "LOST",
     "NEVER",
     "PROJECTED",
     "TRUNCATED",
@@ -17,8 +19,9 @@ __all__ = [
     "allocate_vertices",
 ]
 
-PROJECTED, TRUNCATED, FROZEN = (wp.constant(bit) for bit in (1, 2, 4))
-"""Bits of the outcome of a vertex: constraints moved it, its path was cut, it was left where it was."""
+PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST = (wp.constant(bit) for bit in (1, 2, 4, 8, 16))
+"""Bits of the outcome of a vertex: constraints moved it, a dividing plane did, its path was cut, it was left where it
+was, it was left there because its wanted position was not finite."""
 
 NEVER = wp.constant(wp.int64(2**62))
 """The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
@@ -31,10 +34,10 @@ class Motion:
     x0: wp.array[wp.vec3]  # positions at the start of the step [m]
     x1: wp.array[wp.vec3]  # wanted positions at its end [m]
     velocity: wp.array[wp.vec3]  # wanted velocities at its end [m/s]
+    is_lost: wp.array[int]  # 1 where what was wanted is not finite: the vertex stands
     inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved
     friction: wp.array[float]  # coefficient
     world: wp.array[int]
-    movable: int  # vertices from here on belong to shapes: contacts of only these do not count
 
 
 @wp.struct
@@ -48,7 +51,7 @@ class Vertices:
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
     first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
-    outcome: wp.array[int]  # bits of PROJECTED, TRUNCATED, FROZEN
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST
 
 
 @wp.struct
@@ -82,13 +85,19 @@ class SolveStatus:
     """How far the response to a step is, and what came of it; each field is an array of one element."""
 
     active: wp.array[int]  # 1 while another iteration is needed
+    unfinished: wp.array[int]  # 1 if the first detection leaves something to do
     iteration: wp.array[int]  # iterations of detect and project so far
     certified: wp.array[int]  # 1 if the last detection was complete and found no contact
     hits: wp.array[int]  # contacts found so far by the detection in progress
+    crossed_hits: wp.array[int]  # of elements that crossed at the start, found so far by the detection in progress
     first_hits: wp.array[int]  # contacts of the wanted motion
     remaining: wp.array[int]  # contacts that the last detection found
+    excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
+    truncated: wp.array[int]  # 1 if a path was cut
+    frozen: wp.array[int]  # 1 if a vertex was frozen
+    lost: wp.array[int]  # vertices whose wanted position was not finite
 
 
 @wp.struct
@@ -105,7 +114,8 @@ class Progress:
 
     status: SolveStatus
     sweep: SweepStatus
-    max_iterations: int  # of detect and project; after them paths are truncated
+    max_iterations: int  # of detect and project; after them vertices are divided, or their paths truncated
+    max_truncations: int  # iterations of that; after them vertices are frozen
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
 
 

@@ -1,16 +1,15 @@
-"""Contacts as constraints on the ends of paths, collected from detections; :mod:`.projection` solves them."""
+"""Contacts as constraints on the ends of paths; :mod:`.projection` solves them."""
 
 import warp as wp
 
-from ..detection.settings import Count
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.pipeline.queues import is_filled
-from ..kernels.signs import FREE
 from .buffers import Constraints, Motion, Progress, Vertices
+from .exclusion import Connectivity, crossed_at_start, is_movable
 
 __all__ = [
     "EDGE_EDGE_CONTACT",
     "EDGE_EDGE_PROXIMITY",
+    "MAX_DIVISIONS",
     "MAX_ITERATIONS",
     "MAX_TRUNCATIONS",
     "PLANE_CONTACT",
@@ -20,13 +19,13 @@ __all__ = [
     "Contacts",
     "add_constraint",
     "approach_of",
-    "collect_contacts",
     "contact_vertices",
     "contact_weights",
     "count_contact",
     "feasible",
     "feasible_in_contact",
     "gap",
+    "is_excluded",
     "is_projecting",
     "is_slow",
     "longest_path",
@@ -40,8 +39,10 @@ __all__ = [
 
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which the paths of vertices that still collide are truncated."""
+MAX_DIVISIONS = 32
+"""Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.dividing_planes`."""
 MAX_TRUNCATIONS = wp.constant(8)
-"""Iterations of detect and truncate, after which vertices that still collide are frozen."""
+"""Iterations of detect and truncate of a step that is recorded, after which vertices that still collide are frozen."""
 
 VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, PLANE_CONTACT, VERTEX_FACE_PROXIMITY, EDGE_EDGE_PROXIMITY = (
     wp.constant(i) for i in range(5)
@@ -61,17 +62,18 @@ _SLOW = wp.constant(wp.float64(0.5))
 _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
-_CONTACTS = wp.constant(int(Count.CONTACTS))
+_LEAST = wp.constant(wp.float64(0.1))
+"""Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
+nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
-
-_KERNEL = {"enable_backward": False}
 
 
 @wp.struct
 class Contacts:
     """The contacts of one kind of pair, unsorted, as the last detection found them."""
 
+    mesh: Connectivity
     edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
@@ -132,6 +134,14 @@ def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
 
 
 @wp.func
+def is_excluded(motion: Motion, contacts: Contacts, i: int, corners: wp.vec4i) -> bool:
+    """Returns whether a contact is none that the response resolves, see :mod:`.exclusion`."""
+    return not is_movable(motion, corners) or crossed_at_start(
+        motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]
+    )
+
+
+@wp.func
 def contact_weights(edges: int, c: wp.vec3d) -> wp.vec4d:
     """Returns the weights of four vertices in the vector from the second contact point to the first.
 
@@ -173,7 +183,8 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 @wp.func
 def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    return wp.min(target, wp.max(start, wp.min(separation, start + _RECOVERY * path)))
+    recovered = wp.max(start + _RECOVERY * path, _LEAST * separation)
+    return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
 @wp.func
@@ -261,50 +272,3 @@ def add_constraint(
         constraints.velocity_multiplier[i] = wp.vec3d()
         constraints.previous_multiplier[i] = wp.vec3d()
         constraints.last_sweep[i] = -2
-
-
-@wp.kernel(**_KERNEL)
-def collect_contacts(
-    motion: Motion,
-    vertices: Vertices,
-    contacts: Contacts,
-    constraints: Constraints,
-    progress: Progress,
-    separation: wp.float64,
-):
-    """Counts the contacts, and adds constraints for them; after the last projection, finds the first of each vertex."""
-    i = wp.tid()
-    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
-        return
-    corners = contact_vertices(contacts, i)
-    if wp.min(corners) >= motion.movable:
-        return
-    count_contact(progress, motion.world[corners[0]])
-    for j in range(4):
-        vertices.changed[corners[j]] = 1
-    if progress.status.iteration[0] < progress.max_iterations:
-        friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
-        weights = contact_weights(contacts.edges, contacts.coordinates[i])
-        normal = contacts.normal[i]
-        target = widened(separation, progress)
-        slow = is_slow(motion, corners, contacts.edges)
-        if slow == 1:
-            target = feasible_in_contact(motion, corners, weights, normal, target, separation)
-        kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
-        add_constraint(
-            motion,
-            vertices,
-            constraints,
-            corners,
-            weights,
-            normal,
-            target,
-            friction,
-            slow,
-            kind,
-            contacts.localized[i],
-            contacts.toi[i],
-        )
-    else:
-        for j in range(4):
-            update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)

@@ -1,24 +1,165 @@
-"""Kernels between a detection and the next: the decision whether to iterate again, and the truncation of paths."""
+"""Kernels between a detection and the next: contacts are collected, and paths changed that projection does not."""
 
 import warp as wp
 
-from .buffers import FROZEN, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
+from ..detection.settings import Count
+from ..kernels.pipeline.queues import is_filled
+from ..kernels.signs import FREE
+from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
-    MAX_TRUNCATIONS,
     PLANE_CONTACT,
     TIME_UNITS,
+    VERTEX_FACE_CONTACT,
     Contacts,
+    add_constraint,
     contact_vertices,
+    contact_weights,
+    count_contact,
+    feasible_in_contact,
+    is_slow,
     to_double,
     to_single,
     truncated_path,
+    update_first_contact,
+    widened,
 )
+from .dividing_planes import DividingPlanes, add_dividing_planes, position_on_sides
+from .exclusion import crossed_at_start, is_movable
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
-__all__ = ["decide", "drop_if_full", "freeze_undetected", "record_offsets", "truncate_vertices"]
+__all__ = [
+    "begin_step",
+    "collect_contacts",
+    "decide",
+    "drop_if_full",
+    "freeze_undetected",
+    "record_offsets",
+    "truncate_vertices",
+]
+
+_CONTACTS = wp.constant(int(Count.CONTACTS))
 
 _KERNEL = {"enable_backward": False}
+
+
+@wp.kernel(**_KERNEL)
+def begin_step(
+    # in
+    motion: Motion,
+    worlds: int,
+    # out
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+):
+    """Initializes the vertices by what is wanted of them, and clears everything else."""
+    i = wp.tid()
+    if i == 0:
+        status = progress.status
+        status.active[0] = 0
+        status.unfinished[0] = 0
+        status.iteration[0] = 0
+        status.certified[0] = 0
+        status.hits[0] = 0
+        status.crossed_hits[0] = 0
+        status.first_hits[0] = 0
+        status.remaining[0] = 0
+        status.excluded[0] = 0
+        status.newly_frozen[0] = 0
+        status.undetected[0] = 0
+        status.truncated[0] = 0
+        status.frozen[0] = 0
+        status.lost[0] = 0
+        constraints.count[0] = 0
+        dividing.count[0] = 0
+    if i < worlds:
+        progress.contact_iteration[i] = -1
+    if i >= vertices.x1.shape[0]:
+        return
+    vertices.x1[i] = motion.x1[i]
+    vertices.velocity[i] = motion.velocity[i]
+    for axis in range(3):
+        vertices.particle_delta_x[i, axis] = wp.int64(0)
+        vertices.particle_delta_v[i, axis] = wp.int64(0)
+    vertices.first_contact[i] = NEVER
+    vertices.changed[i] = 0
+    vertices.outcome[i] = wp.where(motion.is_lost[i] != 0, LOST, 0)
+    dividing.first[i] = -1
+
+
+@wp.func
+def _collect_contact(
+    motion: Motion,
+    vertices: Vertices,
+    contacts: Contacts,
+    i: int,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
+    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
+        return
+    corners = contact_vertices(contacts, i)
+    if not is_movable(motion, corners):
+        return
+    if crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
+        wp.atomic_add(progress.status.crossed_hits, 0, 1)
+        return
+    count_contact(progress, motion.world[corners[0]])
+    for j in range(4):
+        vertices.changed[corners[j]] = 1
+    if progress.status.iteration[0] < progress.max_iterations:
+        friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
+        weights = contact_weights(contacts.edges, contacts.coordinates[i])
+        normal = contacts.normal[i]
+        target = widened(separation, progress)
+        slow = is_slow(motion, corners, contacts.edges)
+        if slow == 1:
+            target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+        kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
+        add_constraint(
+            motion,
+            vertices,
+            constraints,
+            corners,
+            weights,
+            normal,
+            target,
+            friction,
+            slow,
+            kind,
+            contacts.localized[i],
+            contacts.toi[i],
+        )
+    else:
+        if dividing.first:
+            add_dividing_planes(motion, vertices, contacts, i, dividing)
+        for j in range(4):
+            update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
+
+
+@wp.kernel(**_KERNEL)
+def collect_contacts(
+    motion: Motion,
+    vertices: Vertices,
+    vertex_face: Contacts,
+    edge_edge: Contacts,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Counts the contacts of both kinds, and adds constraints for them; after the last projection, dividing planes.
+
+    Then it finds the first contact of each vertex as well.
+    """
+    i = wp.tid()
+    _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, progress, separation)
+    _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, progress, separation)
 
 
 @wp.kernel(**_KERNEL)
@@ -33,14 +174,14 @@ def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
 @wp.kernel(**_KERNEL)
 def record_offsets(constraints: Constraints, progress: Progress, record: StepRecord, after: int):
     """Records the offsets of an iteration, or those after the last; iterations that freeze share one offset."""
-    last = progress.max_iterations + MAX_TRUNCATIONS + 1
+    last = progress.max_iterations + progress.max_truncations + 1
     iteration = progress.status.iteration[0]
     if after == 1 or iteration <= last:
         begin_iteration(record, wp.min(iteration, last) + after, constraints.count[0])
 
 
 @wp.kernel(**_KERNEL)
-def decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
+def decide(constraints: Constraints, progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed."""
     overflowed = bool(False)
     for i in range(counts.shape[0]):
@@ -49,14 +190,17 @@ def decide(progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[
     hits = status.hits[0]
     status.hits[0] = 0
     status.remaining[0] = hits
+    status.excluded[0] = status.crossed_hits[0]
+    status.crossed_hits[0] = 0
     if status.iteration[0] == 0:
         status.first_hits[0] = status.first_hits[0] + hits
-    stuck = status.iteration[0] > progress.max_iterations + MAX_TRUNCATIONS and status.newly_frozen[0] == 0
+    stuck = status.iteration[0] > progress.max_iterations + progress.max_truncations and status.newly_frozen[0] == 0
     status.newly_frozen[0] = 0
     status.certified[0] = wp.where(hits == 0 and not overflowed, 1, 0)
     status.undetected[0] = wp.where(overflowed, 1, 0)
     status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
+    status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
 
 
 @wp.func
@@ -88,11 +232,16 @@ def truncate_vertices(
     vertices: Vertices,
     progress: Progress,
     record: StepRecord,
+    dividing: DividingPlanes,
     vertex_face: Contacts,
     edge_edge: Contacts,
     dt: wp.float64,
 ):
-    """Truncates the path of each vertex before its first contact; after MAX_TRUNCATIONS iterations, freezes it."""
+    """Moves each vertex of a contact that is left onto its side, or truncates its path before its first contact.
+
+    Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
+    ``max_truncations`` iterations vertices that still collide are frozen.
+    """
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
     if key == NEVER:
@@ -101,14 +250,20 @@ def truncate_vertices(
     if motion.inverse_mass[vertex] == 0.0:
         return
     time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
-    cuts = progress.status.iteration[0] <= progress.max_iterations + MAX_TRUNCATIONS
+    cuts = progress.status.iteration[0] <= progress.max_iterations + progress.max_truncations
     if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
         first = int(key & wp.int64(0xFFFFFFFF))
         if first & 3 == EDGE_EDGE_CONTACT:
             _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
         else:
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
-    if cuts:
+    if cuts and dividing.first[vertex] >= 0:
+        end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
+        vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, TRUNCATED, DIVIDED)
+    elif cuts:
         x0 = to_double(motion.x0[vertex])
         path = truncated_path(x0, to_double(vertices.x1[vertex]), time)
         vertices.x1[vertex] = to_single(x0 + path)

@@ -8,7 +8,7 @@ from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["ModelMesh", "Planes", "ShapeVertices"]
+__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "vertex_position"]
 
 _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
@@ -52,6 +52,14 @@ class Planes(NamedTuple, Generic[_Array]):
     world: _Array
 
 
+@wp.struct
+class Incidence:
+    """The elements that each element belongs to: those of element ``i`` are ``items[first[i]:first[i + 1]]``."""
+
+    first: wp.array[int]
+    items: wp.array[int]
+
+
 class ModelMesh(CollisionMesh):
     """The triangles of a Newton model that particles can collide with, as one mesh.
 
@@ -71,6 +79,8 @@ class ModelMesh(CollisionMesh):
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
+        device_vertex_edges: The edges of each vertex, :class:`Incidence`.
+        device_edge_faces: The faces of each edge, :class:`Incidence`.
     """
 
     def __init__(self, model: Model):
@@ -129,6 +139,8 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
+        self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
+        self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
 
@@ -154,6 +166,14 @@ class ModelMesh(CollisionMesh):
         Raises:
             ValueError: If an array has another length.
         """
+        self.check_lengths(particle_q, body_q, out)
+        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
+
+    def check_lengths(
+        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
+    ) -> None:
+        """Raises ValueError if an array as of :meth:`positions` has another length."""
         for name, array, count in (
             ("particle_q", particle_q, self.model.particle_count),
             ("body_q", body_q, self.model.body_count),
@@ -162,8 +182,6 @@ class ModelMesh(CollisionMesh):
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
-        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
-        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
 
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
@@ -175,22 +193,35 @@ class ModelMesh(CollisionMesh):
         wp.launch(_write_inverse_masses, model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def _write_positions(
+@wp.func
+def vertex_position(
+    vertex: int,
     particle_q: wp.array[wp.vec3],
     body_q: wp.array[wp.transform],
     shape_vertex_position: wp.array[wp.vec3],
     shape_vertex_body: wp.array[int],
+) -> wp.vec3:
+    """Returns the position of a vertex of a :class:`ModelMesh` [m], see :meth:`ModelMesh.positions`."""
+    i = vertex - particle_q.shape[0]
+    if i < 0:
+        return particle_q[vertex]
+    if shape_vertex_body[i] < 0:
+        return shape_vertex_position[i]
+    return wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_positions(
+    # in
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    shape_vertex_position: wp.array[wp.vec3],
+    shape_vertex_body: wp.array[int],
+    # out
     positions: wp.array[wp.vec3],
 ):
     vertex = wp.tid()
-    i = vertex - particle_q.shape[0]
-    if i < 0:
-        positions[vertex] = particle_q[vertex]
-    elif shape_vertex_body[i] < 0:
-        positions[vertex] = shape_vertex_position[i]
-    else:
-        positions[vertex] = wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+    positions[vertex] = vertex_position(vertex, particle_q, body_q, shape_vertex_position, shape_vertex_body)
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -208,6 +239,18 @@ def _finalized(array: wp.array | None) -> wp.array:
     """Returns an array that a model has once it is finalized."""
     assert array is not None
     return array
+
+
+def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
+    """Returns the rows of ``elements`` that each of ``count`` numbers is in; negative numbers are left out."""
+    numbers = elements.ravel()
+    rows = np.repeat(np.arange(len(elements)), elements.shape[1])
+    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+    incidence = Incidence()
+    first = np.concatenate([[0], np.cumsum(np.bincount(numbers[order], minlength=count))])
+    incidence.first = wp.array(first, dtype=int, device=device)
+    incidence.items = wp.array(rows[order], dtype=int, device=device)
+    return incidence
 
 
 def _soft_faces(model):

@@ -4,11 +4,14 @@ import warp as wp
 
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import PLANE_CONTACT, add_constraint, count_contact, to_double, update_first_contact, widened
+from .dividing_planes import DividingPlanes, add_plane
 
-__all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transform_planes"]
+__all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transformed_plane"]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
+_MARGIN = wp.constant(wp.float64(0.1))
+"""Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
 _ZERO = wp.constant(wp.float64(0.0))
 
 _KERNEL = {"enable_backward": False}
@@ -27,25 +30,14 @@ class MovingPlanes:
     world: wp.array[int]  # -1 for all
 
 
-@wp.kernel(**_KERNEL)
-def transform_planes(
-    # in
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    bodies: wp.array[int],
-    body_q: wp.array[wp.transform],
-    # out
-    planes: wp.array[wp.vec4d],
-):
-    """Writes planes as they are where their bodies are."""
-    i = wp.tid()
-    point = points[i]
-    direction = normals[i]
-    if bodies[i] >= 0:
-        point = wp.transform_point(body_q[bodies[i]], point)
-        direction = wp.transform_vector(body_q[bodies[i]], direction)
-    normal = wp.normalize(to_double(direction))
-    planes[i] = wp.vec4d(normal[0], normal[1], normal[2], wp.dot(normal, to_double(point)))
+@wp.func
+def transformed_plane(point: wp.vec3, normal: wp.vec3, body: int, body_q: wp.array[wp.transform]) -> wp.vec4d:
+    """Returns a plane where its body is, if it has one, as its unit normal and its offset [m]."""
+    if body >= 0:
+        point = wp.transform_point(body_q[body], point)
+        normal = wp.transform_vector(body_q[body], normal)
+    unit = wp.normalize(to_double(normal))
+    return wp.vec4d(unit[0], unit[1], unit[2], wp.dot(unit, to_double(point)))
 
 
 @wp.func
@@ -76,6 +68,7 @@ def collect_penetrations(
     vertices: Vertices,
     planes: MovingPlanes,
     constraints: Constraints,
+    dividing: DividingPlanes,
     progress: Progress,
     separation: wp.float64,
     ahead: bool,
@@ -118,4 +111,9 @@ def collect_penetrations(
                 _ZERO,
             )
         else:
+            if dividing.first:
+                plane = planes.end[i]
+                normal = wp.vec3d(plane[0], plane[1], plane[2])
+                margin = _MARGIN * separation
+                add_plane(dividing, vertex, normal, plane[3] + wp.min(wp.float64(2.0) * error_after, margin), margin)
             update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices
-from .constraints import gap, is_projecting, relative, to_double, to_single
+from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
@@ -39,6 +39,8 @@ _SLIDING = wp.constant(wp.float64(0.999))
 """Share of the friction limit from which a contact slides."""
 _CREEP = wp.constant(wp.float64(0.1))
 """Longest path of a contact that friction holds, as a share of the tolerance; it adds up over steps."""
+_SHARE_OF_DISTANCE = wp.constant(wp.float64(0.5))
+"""Largest tolerance of a position constraint as a share of its separation: elements that it holds stay apart."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Units in a metre; sums are of integers in these units, so that they are the same in any order."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -197,6 +199,8 @@ def activate_position_constraints(
     if i >= constraints.count[0] or not is_projecting(progress, motion.world[constraints.vertices[i][0]]):
         return
     distance = gap(vertices, constraints, i)
+    if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
+        tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * constraints.separation[i])
     active = distance < -tolerance
     if not active and is_reversible(constraints, progress, i):
         multiplier = constraints.position_multiplier[i]

@@ -19,6 +19,7 @@ from .constraints import (
     relative,
     to_double,
 )
+from .exclusion import Connectivity, crossed_at_start, is_movable
 
 __all__ = ["Proximities", "closest_vector", "collect_proximities", "drop_proximities"]
 
@@ -35,6 +36,7 @@ _KERNEL = {"enable_backward": False}
 class Proximities:
     """The candidate pairs of one kind, among which proximities are looked for."""
 
+    mesh: Connectivity
     edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
@@ -75,11 +77,45 @@ def closest_vector(motion: Motion, corners: wp.vec4i, edges: int):
     return weights, relative(weights, corners, motion.x0)
 
 
+@wp.func
+def _collect_proximity(
+    motion: Motion,
+    vertices: Vertices,
+    near: Proximities,
+    i: int,
+    constraints: Constraints,
+    progress: Progress,
+    separation: wp.float64,
+):
+    if not is_filled(i, near.pairs, near.counts, _QUEUED):
+        return
+    corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
+    if not is_movable(motion, corners) or not is_projecting(progress, motion.world[corners[0]]):
+        return
+    if is_slow(motion, corners, near.edges) == 0:
+        return
+    weights, between = closest_vector(motion, corners, near.edges)
+    if not _is_within(weights, near.edges):
+        return
+    distance = wp.length(between)
+    path = longest_path(motion, corners)
+    if distance == _ZERO or distance > wp.max(path, _REACH * separation):
+        return
+    if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+        return
+    friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
+    target = feasible(separation, distance, separation, path)
+    kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
+    normal = between / distance
+    add_constraint(motion, vertices, constraints, corners, weights, normal, target, friction, 1, kind, True, _ZERO)
+
+
 @wp.kernel(**_KERNEL)
 def collect_proximities(
     motion: Motion,
     vertices: Vertices,
-    near: Proximities,
+    vertex_face: Proximities,
+    edge_edge: Proximities,
     constraints: Constraints,
     progress: Progress,
     separation: wp.float64,
@@ -91,25 +127,8 @@ def collect_proximities(
     whose closest points are within both elements are used, because others soon are those of other elements.
     """
     i = wp.tid()
-    if not is_filled(i, near.pairs, near.counts, _QUEUED):
-        return
-    corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
-    if wp.min(corners) >= motion.movable or not is_projecting(progress, motion.world[corners[0]]):
-        return
-    if is_slow(motion, corners, near.edges) == 0:
-        return
-    weights, between = closest_vector(motion, corners, near.edges)
-    if not _is_within(weights, near.edges):
-        return
-    distance = wp.length(between)
-    path = longest_path(motion, corners)
-    if distance == _ZERO or distance > wp.max(path, _REACH * separation):
-        return
-    friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
-    target = feasible(separation, distance, separation, path)
-    kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
-    normal = between / distance
-    add_constraint(motion, vertices, constraints, corners, weights, normal, target, friction, 1, kind, True, _ZERO)
+    _collect_proximity(motion, vertices, vertex_face, i, constraints, progress, separation)
+    _collect_proximity(motion, vertices, edge_edge, i, constraints, progress, separation)
 
 
 @wp.kernel(**_KERNEL)

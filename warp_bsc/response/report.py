@@ -22,6 +22,7 @@ class StepTotals:
     undetected_steps: wp.array[int]
     truncated_steps: wp.array[int]
     frozen_steps: wp.array[int]
+    lost_steps: wp.array[int]
     grazing: wp.array[int]  # contacts whose gradients are clamped
     lost_gradients: wp.array[int]  # steps with an incomplete record
 

@@ -11,7 +11,6 @@ from ..detection.settings import Count, PairKind, capacity_for
 from .adjoint_kernels import count_grazing
 from .angular_momentum import SUMS, sum_moments, sum_torques, turn_vertices
 from .buffers import (
-    NEVER,
     Constraints,
     Progress,
     SolveStatus,
@@ -20,8 +19,18 @@ from .buffers import (
     allocate_constraints,
     allocate_vertices,
 )
-from .constraints import MAX_ITERATIONS, Contacts, collect_contacts
-from .kernels import decide, drop_if_full, freeze_undetected, record_offsets, truncate_vertices
+from .constraints import MAX_DIVISIONS, MAX_ITERATIONS, MAX_TRUNCATIONS, Contacts
+from .dividing_planes import DividingPlanes, allocate_dividing_planes
+from .exclusion import Connectivity
+from .kernels import (
+    begin_step,
+    collect_contacts,
+    decide,
+    drop_if_full,
+    freeze_undetected,
+    record_offsets,
+    truncate_vertices,
+)
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .planes import collect_penetrations
@@ -46,6 +55,12 @@ MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
 
 _MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
+_PAIRS_PER_FACE = 32
+"""Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow."""
+_BLOCKS = 8
+"""Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
+_DIVIDING_PLANES = 16
+"""Capacity for dividing planes, for each particle."""
 _ITERATIONS_RESERVED = 2
 """Iterations for whose contacts constraints are reserved."""
 
@@ -97,12 +112,16 @@ class Response:
             tolerance: Tolerance of constraints, as a share of the separation.
         """
         self.device = device = mesh.device
-        self.detector = DetectionPipeline(mesh)
+        self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
         self.separation, self.restitution = separation, restitution
         self._tolerance = tolerance * separation
         self.worlds = max(1, mesh.model.world_count)
+        self._most_blocks = _BLOCKS * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
+        self._connectivity = connectivity = Connectivity()
+        connectivity.faces, connectivity.edges = mesh.device_faces, mesh.device_edges
+        connectivity.vertex_edges, connectivity.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
         self._status_values = wp.zeros(len(SolveStatus.vars), dtype=int, device=device)
         self.status = name_elements(SolveStatus, self._status_values)
         self._sweep_values = wp.zeros(len(SweepStatus.vars), dtype=int, device=device)
@@ -118,6 +137,10 @@ class Response:
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self._most_penetrations = self._movable * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
+        self._dividing_planes = allocate_dividing_planes(
+            mesh.vertex_count, _DIVIDING_PLANES * self._movable + 1024, device
+        )
+        self._dividing: DividingPlanes  # none in a step that is recorded, as the adjoint has no such planes
         self.constraints = allocate_constraints(0, device)
         self._retired = []
 
@@ -150,38 +173,44 @@ class Response:
         self._motion, self._recorder = motion, record
         wanted, vertices = motion.vertices, self.vertices
         self._record = StepRecord()  # which records nothing
+        self._dividing = self._dividing_planes if record is None else DividingPlanes()
+        self._progress.max_truncations = MAX_DIVISIONS if record is None else int(MAX_TRUNCATIONS)
         if record is not None:
             if not self.device.is_capturing:
                 record.reserve_entries(_MIN_ENTRIES)
             elif not len(record.record.constraint):
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             self._record = record.begin()
-        wp.copy(vertices.x1, wanted.x1)
-        wp.copy(vertices.velocity, wanted.velocity)
-        self._status_values.zero_()
-        self._progress.contact_iteration.fill_(-1)
-        self.constraints.count.zero_()
-        for array in (vertices.particle_delta_x, vertices.particle_delta_v, vertices.outcome, vertices.changed):
-            array.zero_()
-        vertices.first_contact.fill_(int(NEVER))
+        inputs, outputs = [wanted, self.worlds], [vertices, self.constraints, self._dividing_planes, self._progress]
+        size = max(len(vertices.x1), self.worlds)
+        wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
         if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
             self._collect_penetrations(ahead=True)
             self._record_offsets()
-            self._start_sweeps()
-            self._reserve_entries(1)
-            self._sweep_positions()
+            wp.capture_if(self.constraints.count, self._leave_planes)
         self._detect(refit=False)
+        self._record_offsets(after=1)
+        wp.capture_if(self.status.unfinished, self._finish, dt=dt)
+        return Resolution(vertices, self.constraints, self.status, self._status_values)
+
+    def _leave_planes(self):
+        """Sweeps over the constraints once, ahead of the first detection."""
+        self._start_sweeps()
+        self._reserve_entries(1)
+        self._sweep_positions()
+
+    def _finish(self, dt):
+        """Iterates as long as there are contacts, and changes velocities."""
         wp.capture_if(self.status.active, self._collect_near_pairs)
         wp.capture_while(self.status.active, self._iterate, dt=dt)
         self._record_offsets(after=1)
         wp.capture_if(self.constraints.count, self._change_velocities, dt=dt)
-        self._launch_over_particles(freeze_undetected, [wanted, vertices, self._progress])
-        return Resolution(vertices, self.constraints, self.status, self._status_values)
+        self._launch_over_particles(freeze_undetected, [self._motion.vertices, self.vertices, self._progress])
 
     def _collect_penetrations(self, ahead):
         motion = self._motion
-        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._progress]
+        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._dividing, self._progress]
         self._launch_over_particles(collect_penetrations, [*inputs, self.separation, ahead])
 
     def _collect_near_pairs(self):
@@ -191,12 +220,16 @@ class Response:
         wp.copy(self._kept, self.constraints.count)
 
         def collect() -> None:
+            kinds = []
             for narrow_phase, elements in self._with_elements():
                 near = Proximities()
+                kinds.append(near)
+                near.mesh = self._connectivity
                 near.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
                 near.elements, near.pairs, near.counts = elements, narrow_phase.queue, narrow_phase.counts
-                inputs = [motion, vertices, near, self.constraints, self._progress, self.separation]
-                self._launch_over(collect_proximities, near.pairs, near.counts, Count.QUEUED, inputs)
+            queues = [(near.pairs, near.counts, Count.QUEUED) for near in kinds]
+            inputs = [motion, vertices, *kinds, self.constraints, self._progress, self.separation]
+            self._launch_over(collect_proximities, queues, inputs)
 
         retry_until_fits(collect, self, self.device)
         inputs = [self.constraints, self._kept, self._most_contacts, detector.counters.array, detector.capacities]
@@ -215,7 +248,7 @@ class Response:
         inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
         self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
         inputs.append(self._record)
-        self._launch_over(project_positions, constraints.active_set, constraints.active_count, 0, inputs)
+        self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, inputs)
 
     def _sweep_velocities(self, dt):
@@ -224,7 +257,7 @@ class Response:
         inputs = [self._motion.vertices, self.vertices, constraints]
         self._launch_over_constraints(activate_velocity_constraints, [*inputs, self.restitution, self._tolerance, dt])
         inputs = [*inputs, self._progress, self._record, self.restitution]
-        self._launch_over(project_velocities, constraints.active_set, constraints.active_count, 0, inputs)
+        self._launch_over(project_velocities, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._update_velocities()
 
     def _update_velocities(self):
@@ -269,7 +302,8 @@ class Response:
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
             self._record = self._recorder.reserve_truncations(self._movable)
-        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, *self._contacts(), dt]
+        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, self._dividing]
+        inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._detect(refit=True)
 
@@ -283,25 +317,28 @@ class Response:
             detector,
             self.device,
         )
-        vertices.changed.zero_()
         self._reserve(self._most_contacts)
-        inputs = [self.constraints, self._record, self._most_contacts]
-        wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
-        for contacts in self._contacts():
-            inputs = [motion, vertices, contacts, self.constraints, progress, self.separation]
-            self._launch_over(collect_contacts, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
-            if self._recorder is not None:
-                inputs = [motion, vertices, contacts, self._record]
-                self._launch_over(count_grazing, contacts.pairs, contacts.counts, Count.CONTACTS, inputs)
+        if refit:  # before, nothing has changed, and there is always enough
+            vertices.changed.zero_()
+            inputs = [self.constraints, self._record, self._most_contacts]
+            wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
+        contacts = list(self._contacts())
+        queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
+        inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
+        self._launch_over(collect_contacts, queues, inputs)
+        if self._recorder is not None:
+            self._launch_over(count_grazing, queues, [motion, vertices, *contacts, self._record])
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
-        wp.launch(decide, 1, inputs=[progress, detector.counters.array, detector.capacities], device=self.device)
+        inputs = [self.constraints, progress, detector.counters.array, detector.capacities]
+        wp.launch(decide, 1, inputs=inputs, device=self.device)
 
     def _contacts(self):
         """Yields the contacts that the last detection found, vertex-face and edge-edge."""
         for narrow_phase, elements in self._with_elements():
             found = narrow_phase.contacts
             contacts = Contacts()
+            contacts.mesh = self._connectivity
             contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
             contacts.elements, contacts.counts = elements, narrow_phase.counts
             contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.within_tolerance
@@ -339,19 +376,26 @@ class Response:
         self._reserve(self._most_contacts + capacity_for(found - kept, "proximities"))
         return True
 
-    def _launch_over(self, kernel, queue, counts, count, inputs):
-        """Launches a kernel over a queue: over its entries on the CPU, over its capacity on a GPU.
+    def _launch_over(self, kernel, queues, inputs):
+        """Launches a kernel over queues at once: over their entries on the CPU, over their capacity on a GPU.
 
         On the CPU it runs on one thread, unlike :func:`warp_bsc.detection.launch.launch_over_queue`, because Warp's
-        additions are not atomic there.
+        additions are not atomic there. On a GPU each thread takes several entries, so that capacity costs little.
+
+        Args:
+            kernel: The kernel, which takes an entry of each queue.
+            queues: Queues, each with its counts and the place of its own.
+            inputs: Arguments of the kernel.
         """
-        entries = len(queue)
         if self.device.is_cpu:
-            entries = min(entries, int(counts.numpy()[count]))
-        wp.launch(kernel, entries, inputs=inputs, device=self.device)
+            entries = max(min(len(queue), int(counts.numpy()[count])) for queue, counts, count in queues)
+            wp.launch(kernel, entries, inputs=inputs, device=self.device)
+        else:
+            entries = max(len(queue) for queue, _counts, _count in queues)
+            wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._most_blocks)
 
     def _launch_over_constraints(self, kernel, inputs):
-        self._launch_over(kernel, self.constraints.vertices, self.constraints.count, 0, inputs)
+        self._launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
 
     def _launch_over_particles(self, kernel, inputs):
         wp.launch(kernel, self._movable, inputs=inputs, device=self.device)

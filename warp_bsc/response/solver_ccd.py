@@ -10,7 +10,7 @@ from newton.solvers import SolverBase
 
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
-from .buffers import FROZEN, TRUNCATED, SolveStatus
+from .buffers import FROZEN, LOST, TRUNCATED, SolveStatus
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -36,8 +36,7 @@ def _write_back(
     # out
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
-    truncated: wp.array[int],
-    frozen: wp.array[int],
+    status: SolveStatus,
 ):
     """Writes the particles that the response changed; the others keep every bit of what they are."""
     particle = wp.tid()
@@ -45,19 +44,22 @@ def _write_back(
         particle_q[particle] = x1[particle]
         particle_qd[particle] = velocity[particle]
     if outcome[particle] & TRUNCATED != 0:
-        truncated[0] = 1
+        status.truncated[0] = 1
     if outcome[particle] & FROZEN != 0:
-        frozen[0] = 1
+        status.frozen[0] = 1
+    if outcome[particle] & LOST != 0:
+        wp.atomic_add(status.lost, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
-def _count_step(status: SolveStatus, truncated: wp.array[int], frozen: wp.array[int], totals: StepTotals):
+def _count_step(status: SolveStatus, totals: StepTotals):
     """Adds a step to the totals."""
     totals.steps[0] = totals.steps[0] + 1
     totals.uncertified_steps[0] = totals.uncertified_steps[0] + 1 - status.certified[0]
     totals.undetected_steps[0] = totals.undetected_steps[0] + status.undetected[0]
-    totals.truncated_steps[0] = totals.truncated_steps[0] + truncated[0]
-    totals.frozen_steps[0] = totals.frozen_steps[0] + frozen[0]
+    totals.truncated_steps[0] = totals.truncated_steps[0] + status.truncated[0]
+    totals.frozen_steps[0] = totals.frozen_steps[0] + status.frozen[0]
+    totals.lost_steps[0] = totals.lost_steps[0] + wp.min(status.lost[0], 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -159,8 +161,6 @@ class SolverCCD(SolverBase):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
         self._response.prepare(self._motion)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self._fallbacks = wp.zeros(2, dtype=int, device=mesh.device)
-        self._truncated, self._frozen = self._fallbacks[:1], self._fallbacks[1:]  # 1 if the step has such a vertex
         self.report = SolverReport(self._motion, self._response)
 
     def _median_edge(self):
@@ -235,12 +235,10 @@ class SolverCCD(SolverBase):
             self._motion.set_end(particle_q, particle_qd, body_q, dt)
             resolution = self._response.resolve(self._motion, dt, record)
             vertices = resolution.vertices
-            self._fallbacks.zero_()
             inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-            outputs = [particle_q, particle_qd, self._truncated, self._frozen]
+            outputs = [particle_q, particle_qd, resolution.status]
             wp.launch(_write_back, self.model.particle_count, inputs=inputs, outputs=outputs, device=device)
-            inputs = [resolution.status, self._truncated, self._frozen]
-            wp.launch(_count_step, 1, inputs=inputs, outputs=[totals], device=device)
+            wp.launch(_count_step, 1, inputs=[resolution.status], outputs=[totals], device=device)
         return resolution
 
     @contextlib.contextmanager

@@ -1,0 +1,627 @@
+"""Measures Newton's own examples, unchanged, plain and with the collision stage behind their solver.
+
+Each run is a process of its own, ``python -m warp_bsc.bench.newton_examples``: the stage is put in place of solver
+classes of :mod:`newton.solvers`, and neither that nor a crash reaches another run. The process runs the example as
+``python -m newton.examples`` does, with a frame loop that measures in place of ``newton.examples.run``.
+"""
+
+import ast
+import contextlib
+import difflib
+import importlib
+import importlib.util
+import json
+import os
+import runpy
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+__all__ = [
+    "CPU_FRAMES",
+    "FOLDERS",
+    "FRAMES",
+    "MODES",
+    "WARM_UP",
+    "ExampleMeasurement",
+    "ExampleRun",
+    "NewtonExample",
+    "StageTotals",
+    "describe_needs",
+    "find_examples",
+    "measure_example",
+]
+
+FOLDERS = ("cloth", "softbody", "multiphysics")
+"""The folders of Newton's examples that are measured by default."""
+
+MODES = ("plain", "stage")
+"""The modes: the example as it is, and with :class:`warp_bsc.SolverCCD` behind its solver."""
+
+WARM_UP = 2
+"""Frames at the start whose times are left out: kernels are compiled and buffers grow in them."""
+
+FRAMES = 300
+"""Frames of an example that sets no number of its own."""
+
+CPU_FRAMES = 10
+"""Largest default number of frames on the CPU."""
+
+_SOLVERS = ("SolverVBD", "SolverXPBD", "SolverStyle3D", "SolverSemiImplicit")
+"""The solvers of Newton that move cloth and soft bodies."""
+
+_BUILDERS = ("add_cloth", "add_soft", "add_triangle", "add_tetrahedr")
+"""How the names of the functions begin that add cloth and soft bodies to a model."""
+
+_DOWNLOADS = ("download_asset", "download_external_git_folder")
+"""Functions of Newton that download files of examples."""
+
+
+@dataclass(frozen=True)
+class NewtonExample:
+    """An example of Newton.
+
+    Attributes:
+        name: Its name, as ``python -m newton.examples`` takes it.
+        module: The module, which runs the example if it is the main one.
+        options: Options of the example itself.
+        deformable: Whether its source adds cloth or soft bodies to a model.
+        downloads: Names of the assets that it downloads, "" for one that the source does not name.
+        missing: Packages that it imports and that are not installed.
+    """
+
+    name: str
+    module: str
+    options: tuple[str, ...] = ()
+    deformable: bool = True
+    downloads: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The name and the options."""
+        return shlex.join([self.name, *self.options])
+
+
+@dataclass(frozen=True)
+class StageTotals:
+    """Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`.
+
+    Attributes:
+        steps: Steps.
+        uncertified_steps: Steps that were not certified.
+        truncated_steps: Steps in which a path was truncated.
+        frozen_steps: Steps in which a vertex was frozen.
+    """
+
+    steps: int
+    uncertified_steps: int
+    truncated_steps: int
+    frozen_steps: int
+
+
+@dataclass(frozen=True)
+class ExampleMeasurement:
+    """Times of an example's frames, and its crossings.
+
+    A crossing is an edge that meets a face of which it shares no vertex, found in exact arithmetic; at least one of the
+    two belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not seen.
+
+    Attributes:
+        device: The Warp device.
+        particles: Number of particles.
+        triangles: Number of triangles of cloth and of the surfaces of soft bodies that the model lists.
+        tetrahedra: Number of tetrahedra.
+        shapes: Number of rigid shapes.
+        frames: Number of frames.
+        frame_milliseconds: Time of each frame but the first :data:`WARM_UP` [ms]; drawing is not in it.
+        crossings_at_start: Number of crossings before the first frame.
+        most_crossings: Largest number of crossings at a checked frame end.
+        first_frame_with_crossings: The first checked frame, counted from 0, with more crossings than the start; None if
+            there is none.
+        first_frame_not_finite: The first checked frame, counted from 0, with positions that are not finite; None if
+            there is none. No later frame is checked for crossings.
+        stage: What the stage reports; None without it.
+        test_final: What the example's ``test_final`` finds: "ok" or the first line of its message; None without one.
+        test_post_step: The same of ``test_post_step``, which is called after each frame until it fails.
+    """
+
+    device: str
+    particles: int
+    triangles: int
+    tetrahedra: int
+    shapes: int
+    frames: int
+    frame_milliseconds: list[float]
+    crossings_at_start: int
+    most_crossings: int
+    first_frame_with_crossings: int | None
+    first_frame_not_finite: int | None
+    stage: StageTotals | None
+    test_final: str | None
+    test_post_step: str | None
+
+    @property
+    def median(self) -> float:
+        """Median time of a frame [ms]."""
+        return float(np.median(self.frame_milliseconds))
+
+    @property
+    def percentile_95(self) -> float:
+        """95th percentile of the time of a frame [ms]."""
+        return float(np.percentile(self.frame_milliseconds, 95))
+
+    @property
+    def worst(self) -> float:
+        """Longest time of a frame [ms]."""
+        return max(self.frame_milliseconds)
+
+
+@dataclass(frozen=True)
+class ExampleRun:
+    """A run of an example in a mode.
+
+    Attributes:
+        example: Name and options of the example.
+        mode: One of :data:`MODES`.
+        measured: The measurement; None if there is none.
+        problem: Why there is no measurement; None if there is one.
+    """
+
+    example: str
+    mode: str
+    measured: ExampleMeasurement | None = None
+    problem: str | None = None
+
+
+class _NotApplicable(Exception):
+    """The example cannot be measured in this mode; the message says why."""
+
+
+class _NeedsDownload(Exception):
+    """The example needs an asset that may not be downloaded; the message names it."""
+
+
+def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
+    """Returns examples of Newton by name; without one, those with cloth or soft bodies in :data:`FOLDERS`.
+
+    The sources are read, and no example is imported.
+
+    Args:
+        requests: Names of examples, each followed by options of the example itself, as in a shell:
+            ``"cloth_hanging --solver xpbd"``.
+
+    Raises:
+        ValueError: If Newton has no example of a name, or quotes in a request have no end.
+    """
+    from newton.examples import get_examples  # noqa: PLC0415 (slow)
+
+    modules = get_examples()
+    if not requests:
+        found = [_read_example(name, module) for name, module in modules.items() if module.split(".")[2] in FOLDERS]
+        return [example for example in found if example.deformable]
+    examples = []
+    for request in requests:
+        try:
+            name, *options = shlex.split(request) or [""]
+        except ValueError as error:
+            raise ValueError(f"{request!r}: {error}") from None
+        if name not in modules:
+            close = difflib.get_close_matches(name, modules, n=3)
+            hint = f"; did you mean {' or '.join(close)}?" if close else ""
+            raise ValueError(f"{name!r}: Newton has no example of this name{hint}")
+        examples.append(_read_example(name, modules[name], tuple(options)))
+    return examples
+
+
+def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> NewtonExample:
+    """Reads an example's source for what it needs."""
+    specification = importlib.util.find_spec(module)
+    assert specification is not None and specification.origin is not None
+    tree = ast.parse(Path(specification.origin).read_text(encoding="utf-8"))
+    calls = [(_called_name(node), node) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    deformable = any(called.startswith(_BUILDERS) for called, _ in calls)
+    downloads = dict.fromkeys(_first_string(node) for called, node in calls if called in _DOWNLOADS)
+    imported = []
+    for node in tree.body:  # an import within a function or a "try" may have a substitute
+        if isinstance(node, ast.Import):
+            imported += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            imported.append(node.module)
+    packages = dict.fromkeys(name.split(".")[0] for name in imported)
+    missing = [package for package in packages if importlib.util.find_spec(package) is None]
+    return NewtonExample(name, module, options, deformable, tuple(downloads), tuple(missing))
+
+
+def _called_name(call: ast.Call) -> str:
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
+
+
+def _first_string(call: ast.Call) -> str:
+    strings = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]
+    return next((string for string in strings if isinstance(string, str)), "")
+
+
+def measure_example(
+    example: NewtonExample,
+    mode: str,
+    *,
+    device: str,
+    frames: int | None = None,
+    check_every: int = 5,
+    download: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> ExampleRun:
+    """Runs an example in a process of its own and measures its frames.
+
+    Args:
+        example: The example.
+        mode: One of :data:`MODES`.
+        device: Name of the Warp device.
+        frames: Number of frames, more than :data:`WARM_UP`; default: the number that the example sets, otherwise
+            :data:`FRAMES`; on the CPU at most :data:`CPU_FRAMES`.
+        check_every: Crossings are counted at the end of every so many frames, and of the last.
+        download: Whether the example may download assets.
+        progress: Called with the number of frames done and the number of all.
+
+    Returns:
+        The measurement, or the reason why there is none; an error of the example, or a crash, is such a reason.
+
+    Raises:
+        ValueError: If the mode or a number is out of range.
+    """
+    if mode not in MODES:
+        raise ValueError(f"mode must be one of {', '.join(MODES)}, not {mode!r}")
+    if frames is not None and frames <= WARM_UP:
+        raise ValueError(f"the number of frames must be more than {WARM_UP}, whose times are left out, not {frames}")
+    if check_every < 1:
+        raise ValueError(f"crossings must be counted every frame or every few frames, not every {check_every}")
+    needs = describe_needs(example, download=download)
+    if needs:
+        return ExampleRun(example.title, mode, problem=needs[0])
+    request = {
+        "module": example.module,
+        "options": example.options,
+        "mode": mode,
+        "device": device,
+        "frames": frames,
+        "check_every": check_every,
+        "download": download,
+    }
+    with tempfile.TemporaryFile() as errors:
+        last: dict[str, Any] = {}
+        for reply in _replies(request, errors):
+            last = reply
+            if "frame" in reply and progress:
+                progress(reply["frame"], reply["frames"])
+        if "measured" in last:
+            values = last["measured"]
+            totals = values["stage"]
+            values["stage"] = None if totals is None else StageTotals(**totals)
+            return ExampleRun(example.title, mode, measured=ExampleMeasurement(**values))
+        problem = last.get("problem")
+        if problem is None:
+            problem = _describe_end(last["status"], _last_line(errors))
+    return ExampleRun(example.title, mode, problem=problem)
+
+
+def describe_needs(example: NewtonExample, *, download: bool = False) -> list[str]:
+    """Returns what an example needs and has not, a line each, as far as its source says.
+
+    Args:
+        example: The example.
+        download: Whether it may download assets.
+    """
+    needs = [f"needs the package {package}" for package in example.missing]
+    if example.downloads and not download:
+        needs.append(_describe_download(", ".join(filter(None, example.downloads))))
+    return needs
+
+
+def _describe_download(asset: str) -> str:
+    return f"needs a download: {asset or 'an asset'}"
+
+
+def _replies(request: dict[str, Any], errors) -> Iterator[dict[str, Any]]:
+    """Starts a process that serves a request, and yields its replies; the last is its exit status, or its result.
+
+    The process ends with the iteration, whatever ends it.
+    """
+    command = [sys.executable, "-m", __name__, json.dumps(request)]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True)
+    assert process.stdout is not None
+    complete = False
+    try:
+        for line in process.stdout:
+            reply = json.loads(line)
+            complete = "frame" not in reply
+            yield reply
+        status = process.wait()
+        if not complete:
+            yield {"status": status}
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+
+def _last_line(errors) -> str:
+    """The last line of a file that is not blank, "" if there is none."""
+    errors.seek(0)
+    lines = errors.read().decode(errors="replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "")
+
+
+def _describe_end(status: int, line: str) -> str:
+    """How a process ended that gave no result."""
+    if status < 0:
+        with contextlib.suppress(ValueError):  # a signal without a name
+            return f"failed: the process was ended by {signal.Signals(-status).name}"
+        return f"failed: the process was ended by signal {-status}"
+    return f"failed: the process ended with status {status}" + (f": {line}" if line else "")
+
+
+def _describe_error(error: BaseException) -> str:
+    """The type of an error and the first line of its message."""
+    line = _first_line(error)
+    return line if line == type(error).__name__ else f"{type(error).__name__}: {line}"
+
+
+def _first_line(error: BaseException) -> str:
+    """The first line of an error's message, its type if there is none."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
+def _serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> None:
+    """Serves a request of :func:`measure_example` in this process, which is good for no other one afterwards."""
+    try:
+        measured = _measure_here(request, lambda frame, frames: reply({"frame": frame, "frames": frames}))
+    except _NotApplicable as reason:
+        reply({"problem": f"not applicable: {reason}"})
+    except _NeedsDownload as reason:
+        reply({"problem": _describe_download(str(reason))})
+    except ModuleNotFoundError as error:
+        reply({"problem": f"needs the package {error.name}"})
+    except Exception as error:
+        reply({"problem": f"failed: {_describe_error(error)}"})
+    else:
+        reply({"measured": asdict(measured)})
+
+
+def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None]) -> ExampleMeasurement:
+    """Runs an example as the main module, with the frame loop that measures."""
+    import newton.examples  # noqa: PLC0415 (slow)
+    import newton.utils  # noqa: PLC0415 (slow)
+
+    measurements: list[ExampleMeasurement] = []
+    stages: list[Any] = []
+
+    def run(example, arguments):
+        own = arguments.num_frames != newton.examples.create_parser().get_default("num_frames")
+        frames = request["frames"]
+        if frames is None:
+            frames = arguments.num_frames if own else FRAMES
+            frames = min(frames, CPU_FRAMES) if wp.get_device().is_cpu else frames
+        if request["mode"] == "stage" and not stages:
+            raise _NotApplicable(f"no solver is one of {', '.join(_SOLVERS)}")
+        measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
+
+    newton.examples.run = run
+    if not request["download"]:
+        newton.utils.download_asset = newton.examples.download_external_git_folder = _refuse_download
+    if request["mode"] == "stage":
+        _stage_solvers(stages)
+    options = ["--viewer", "null", "--quiet", "--device", request["device"], *request["options"]]
+    if request["frames"] is not None:
+        options += ["--num-frames", str(request["frames"])]
+    sys.argv = [request["module"], *options]
+    runpy.run_module(request["module"], run_name="__main__")
+    if not measurements:
+        raise _NotApplicable("it does not call newton.examples.run")
+    return measurements[0]
+
+
+def _refuse_download(*arguments, **options):
+    """Stands in for the functions of Newton that download."""
+    raise _NeedsDownload(next((str(argument) for argument in (*arguments, *options.values())), ""))
+
+
+class _StagedType(type):
+    """The type of solver classes whose instances come with the collision stage behind them.
+
+    They are subclasses of Newton's, so that examples may read their attributes and derive from them.
+    """
+
+    stages: list[Any]
+
+    def __call__(cls, *arguments, **options):
+        """Makes a solver and returns the stage behind it."""
+        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
+
+        stage = SolverCCD(super().__call__(*arguments, **options))
+        cls.stages.append(stage)
+        return stage
+
+    def __instancecheck__(cls, instance):
+        """Whether an instance, or the solver before a stage, is of the class."""
+        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
+
+        return super().__instancecheck__(instance.solver if isinstance(instance, SolverCCD) else instance)
+
+
+def _stage_solvers(stages: list[Any]) -> None:
+    """Replaces the solvers in :mod:`newton.solvers` by staged ones, which list their stages.
+
+    This must come before the example is imported: it may import the classes by name.
+    """
+    import newton.solvers  # noqa: PLC0415 (slow)
+    from newton.solvers.experimental.coupled import SolverCoupled  # noqa: PLC0415 (slow)
+
+    for name in _SOLVERS:
+        solver = getattr(newton.solvers, name)
+        names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages}
+        setattr(newton.solvers, name, _StagedType(name, (solver,), names))
+
+    def refuse(self, *arguments, **options):
+        raise _NotApplicable(f"SolverCCD cannot be a part of {type(self).__name__}")
+
+    SolverCoupled.__init__ = refuse
+
+
+def _measure_frames(
+    example: Any, frames: int, check_every: int, stages: list[Any], progress: Callable[[int, int], None]
+) -> ExampleMeasurement:
+    """Runs the frames of an example as ``newton.examples.run`` does, and its tests.
+
+    Args:
+        example: The example, constructed.
+        frames: Number of frames.
+        check_every: Crossings are counted at the end of every so many frames, and of the last.
+        stages: The stages behind its solvers.
+        progress: Called with the number of frames done and the number of all.
+    """
+    crossings = _Crossings(example)
+    model = example.model
+    post_step = _Test(example, "test_post_step")
+    seconds = []
+    at_start = crossings.count()
+    most, first_crossed, first_not_finite = 0, None, None
+    for frame in range(frames):
+        progress(frame, frames)
+        wp.synchronize_device(model.device)
+        start = time.perf_counter()
+        example.step()
+        wp.synchronize_device(model.device)
+        seconds.append(time.perf_counter() - start)
+        post_step.run()
+        example.render()
+        if first_not_finite is None and (frame % check_every == check_every - 1 or frame == frames - 1):
+            if crossings.are_finite():
+                count = crossings.count()
+                most = max(most, count)
+                if count > at_start and first_crossed is None:
+                    first_crossed = frame
+            else:
+                first_not_finite = frame
+    progress(frames, frames)
+    final = _Test(example, "test_final")
+    final.run()
+    totals = [
+        {total.name: getattr(stage.report, total.name) for total in fields(StageTotals)}  # each reads the device
+        for stage in stages
+    ]
+    return ExampleMeasurement(
+        device=str(model.device),
+        particles=model.particle_count,
+        triangles=model.tri_count,
+        tetrahedra=model.tet_count,
+        shapes=model.shape_count,
+        frames=frames,
+        frame_milliseconds=[1e3 * took for took in seconds[WARM_UP:]],
+        crossings_at_start=at_start,
+        most_crossings=most,
+        first_frame_with_crossings=first_crossed,
+        first_frame_not_finite=first_not_finite,
+        stage=StageTotals(**{name: sum(total[name] for total in totals) for name in totals[0]}) if totals else None,
+        test_final=final.result,
+        test_post_step=post_step.result,
+    )
+
+
+class _Test:
+    """A test of an example, by name.
+
+    Attributes:
+        result: "ok", the first line of the message if it failed, None if the example has no such test or it did not
+            run.
+    """
+
+    def __init__(self, example: Any, name: str):
+        self._test = getattr(example, name, None)
+        self.result: str | None = None
+
+    def run(self) -> None:
+        """Runs the test, unless it failed before."""
+        if self._test is None or self.result not in (None, "ok"):
+            return
+        try:
+            self._test()
+            self.result = "ok"
+        except (AssertionError, ValueError) as error:
+            self.result = _first_line(error)
+        except Exception as error:
+            self.result = _describe_error(error)
+
+
+class _Crossings:
+    """Counts the crossings of an example's cloth and soft bodies in its present state.
+
+    Raises:
+        _NotApplicable: If the example has no cloth and no soft bodies, or its state is not where Newton's examples have
+            theirs.
+    """
+
+    def __init__(self, example: Any):
+        from ..detection.detector import CollisionDetector  # noqa: PLC0415 (response, below, imports Newton)
+        from ..response.model_mesh import ModelMesh  # noqa: PLC0415 (imports Newton)
+
+        model = getattr(example, "model", None)
+        self._example = example
+        self._name = next((name for name in ("state_0", "state") if hasattr(example, name)), "")
+        if model is None or not self._name:
+            raise _NotApplicable("it has no attributes model and state_0")
+        if not model.tri_count + model.tet_count:
+            raise _NotApplicable("it has neither cloth nor soft bodies")
+        self._mesh = ModelMesh(model)
+        self._detector = CollisionDetector(self._mesh, method="exact")
+        self._x = wp.zeros(self._mesh.vertex_count, dtype=wp.vec3, device=model.device)
+        particles = model.particle_count
+        self._edge_is_soft, self._face_is_soft = (
+            elements.min(axis=1) < particles for elements in (self._mesh.edges, self._mesh.faces)
+        )
+
+    def count(self) -> int:
+        """Number of crossings that an edge or a face of cloth or of a soft body takes part in."""
+        self._read_positions()
+        edges, faces = self._detector.find_intersections(self._x).T
+        return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())
+
+    def are_finite(self) -> bool:
+        """Whether the positions of all vertices of faces are finite."""
+        self._read_positions()
+        return bool(np.isfinite(self._x.numpy()[self._mesh.vertices]).all())
+
+    def _read_positions(self) -> None:
+        """Reads the positions of the state, which the example may have replaced by another."""
+        state = getattr(self._example, self._name)
+        self._mesh.positions(state.particle_q, state.body_q, self._x)
+
+
+def _main() -> None:
+    """Serves the request in the argument, and writes replies as lines of JSON to standard output.
+
+    All other output, also that of native code, goes to standard error.
+    """
+    replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+    def reply(values: dict[str, Any]) -> None:
+        replies.write(json.dumps(values) + "\n")
+        replies.flush()
+
+    _serve(json.loads(sys.argv[1]), reply)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,160 @@
+"""The command ``warp-bsc bench newton``: measures Newton's own examples, plain and with the collision stage."""
+
+import argparse
+import json
+
+import warp as wp
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from .._atomic_file import STDOUT, OutputFile
+from ..bench.newton_examples import MODES, ExampleRun, NewtonExample, find_examples, measure_example
+from .bench_newton_tables import example_runs_to_dict, print_example_runs, print_examples
+from .device import find_device
+from .interrupts import INTERRUPTS
+from .options import BENCH_EXIT_STATUS, Commands, add_command, add_device, positive
+from .tables import Console, say
+
+__all__ = ["add_to"]
+
+_DESCRIPTION = """\
+Run Newton's own examples, unchanged, and measure them: plain, and with
+SolverCCD put behind their solver. Each run is a process of its own, in which
+the example captures its own CUDA graph and runs its own tests. Reported are the
+times of frames, without drawing and without the first two; the edges of cloth
+or soft bodies that cross faces at the start, and the most at frame ends, found
+in exact arithmetic; what the stage could not certify; and whether the example's
+own tests pass. Default: the examples of newton.examples.cloth, softbody and
+multiphysics that have cloth or soft bodies. Any other example of Newton can be
+named. Options of the example itself follow its name, in quotes. A run that
+fails is a row, and a line below the table says why. Tests that expect a state
+at rest fail in short runs, in both modes."""
+
+_EPILOG = f"""\
+examples:
+  warp-bsc bench newton --list
+  warp-bsc bench newton cloth_twist softbody_hanging --device cuda:0
+  warp-bsc bench newton "cloth_hanging --solver xpbd" --frames 20 --modes stage
+  warp-bsc bench newton --json examples.json
+
+{BENCH_EXIT_STATUS}
+After a signal, the runs that were complete are printed or written first."""
+
+
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands, "newton", _run, summary="measure Newton's own examples", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    command.add_argument(
+        "examples", metavar="EXAMPLE", nargs="*", help="the examples to run, by name, with their options in quotes"
+    )
+    command.add_argument(
+        "--frames",
+        type=positive,
+        metavar="N",
+        help="frames of each run (default: the number that the example sets, else 300; on the CPU at most 10)",
+    )
+    command.add_argument(
+        "--modes",
+        type=_modes,
+        default=MODES,
+        metavar="MODE,...",
+        help="plain: the example as it is; stage: with SolverCCD behind its solver (default: plain,stage)",
+    )
+    command.add_argument(
+        "--check-every",
+        type=positive,
+        default=5,
+        metavar="N",
+        help="count crossings at the end of every Nth frame, and of the last (default: %(default)s)",
+    )
+    command.add_argument(
+        "--download", action="store_true", help="let examples download assets; without it, their rows name the assets"
+    )
+    command.add_argument("--list", action="store_true", help="list the examples and what they need, and run none")
+    command.add_argument(
+        "--json",
+        metavar="FILE",
+        nargs="?",
+        const=STDOUT,
+        help="write all results as JSON to a file; without FILE, print them instead of tables",
+    )
+    add_device(command)
+
+
+def _modes(text: str) -> tuple[str, ...]:
+    """The modes that an argument lists, each once."""
+    modes = tuple(dict.fromkeys(text.split(",")))
+    for mode in modes:
+        if mode not in MODES:
+            raise argparse.ArgumentTypeError(f"must be one of {', '.join(MODES)}, not {mode!r}")
+    return modes
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    device = find_device(arguments.device)
+    with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
+        examples = find_examples(arguments.examples)
+        names = {example.name for example in find_examples()} if arguments.json else set()
+    INTERRUPTS.check()
+    if arguments.json and arguments.json.split(" ")[0] in names:
+        raise ValueError(f"--json {arguments.json}: this is an example; name examples before the options")
+    if arguments.list:
+        print_examples(Console(), examples)
+        return 0
+    file = OutputFile(arguments.json) if arguments.json not in (None, STDOUT) else None
+    try:
+        runs: list[ExampleRun] = []
+        interrupt = None
+        try:
+            _measure(runs, examples, arguments, device)
+        except KeyboardInterrupt as signal:
+            interrupt = signal
+        with INTERRUPTS.held():
+            settings = {"device": device, "partial": interrupt is not None}
+            found = example_runs_to_dict(runs, **settings)
+            if arguments.json == STDOUT:
+                print(json.dumps(found))
+            else:
+                print_example_runs(Console(), runs, **settings)
+            if file:
+                file.write(json.dumps(found))
+                file.commit()
+        if interrupt:
+            raise interrupt
+    finally:
+        if file:
+            file.discard()
+    return 0
+
+
+def _measure(
+    runs: list[ExampleRun], examples: list[NewtonExample], arguments: argparse.Namespace, device: wp.Device
+) -> None:
+    """Adds a run for each example and mode to a list, with a progress bar on standard error."""
+    console = Console(stderr=True)
+    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        total = len(examples) * len(arguments.modes)
+        task = progress.add_task("Measuring", total=total)
+        for example in examples:
+            for mode in arguments.modes:
+                title, done = f"{example.name}, {mode}", len(runs)
+                progress.update(task, completed=done, description=f"{title}: starts")
+
+                def show(frame: int, frames: int, title: str = title, done: int = done) -> None:
+                    description = f"{title}: frame {frame} of {frames}"
+                    progress.update(task, completed=done + frame / frames, description=description)
+
+                run = measure_example(
+                    example,
+                    mode,
+                    device=str(device),
+                    frames=arguments.frames,
+                    check_every=arguments.check_every,
+                    download=arguments.download,
+                    progress=show,
+                )
+                runs.append(run)
+                if run.problem and console.is_terminal:
+                    say(progress.console, f"{title}: {run.problem}")

@@ -1,0 +1,192 @@
+"""Dividing planes: what projection cannot keep apart, a plane between the two elements keeps apart for certain.
+
+If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
+at all times of a linear motion. After the last projection, each contact that is left gets a plane across the shortest
+vector between its elements at the start, and every vertex of the two is projected onto its side. Vertices that stand
+still are on their sides, so that there is a solution for the vertices of all contacts at once, each by itself. What
+slides along a plane goes on sliding, unlike what is truncated.
+"""
+
+import warp as wp
+
+from .buffers import Motion, Vertices
+from .constraints import Contacts, contact_vertices, to_double, to_single
+from .proximities import closest_vector
+
+__all__ = ["DividingPlanes", "add_dividing_planes", "add_plane", "allocate_dividing_planes", "position_on_sides"]
+
+_NONE = wp.constant(-1)
+_PASSES = wp.constant(32)
+"""Passes over the planes of a vertex, each projecting onto all of them in turn."""
+_MARGIN = wp.constant(wp.float64(0.25))
+"""Least distance of a plane from the elements at the start, as a share of their distance."""
+_ROUNDING = wp.constant(wp.float64(0.05))
+"""Distance from a plane that vertices are projected to, as a share of the elements' distance: room for rounding."""
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_FAR = wp.constant(wp.float64(1.0e300))
+
+
+@wp.struct
+class DividingPlanes:
+    """Planes that vertices stay above, in a list for each vertex."""
+
+    count: wp.array[int]
+    normal: wp.array[wp.vec3d]
+    offset: wp.array[wp.float64]  # least coordinate of the vertex along the normal [m]
+    margin: wp.array[wp.float64]  # by which projection exceeds it [m]
+    next: wp.array[int]  # plane of the same vertex, or -1
+    first: wp.array[int]  # plane of a vertex, or -1
+
+
+def allocate_dividing_planes(vertices: int, capacity: int, device: wp.Device) -> DividingPlanes:
+    """Returns lists without planes for this many vertices, with a capacity for all planes together."""
+    planes = DividingPlanes()
+    planes.count = wp.zeros(1, dtype=int, device=device)
+    planes.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
+    planes.offset = wp.empty(capacity, dtype=wp.float64, device=device)
+    planes.margin = wp.empty(capacity, dtype=wp.float64, device=device)
+    planes.next = wp.empty(capacity, dtype=int, device=device)
+    planes.first = wp.full(vertices, int(_NONE), dtype=int, device=device)
+    return planes
+
+
+@wp.func
+def add_plane(planes: DividingPlanes, vertex: int, normal: wp.vec3d, offset: wp.float64, margin: wp.float64):
+    """Adds a plane to the list of a vertex if it fits; a contact without its planes is found again, and frozen."""
+    plane = wp.atomic_add(planes.count, 0, 1)
+    if plane < planes.normal.shape[0]:
+        planes.normal[plane] = normal
+        planes.offset[plane] = offset
+        planes.margin[plane] = margin
+        planes.next[plane] = wp.atomic_exch(planes.first, vertex, plane)
+
+
+@wp.struct
+class _Side:
+    """How far one of two elements reaches towards the other, along the vector between them [m]."""
+
+    start: wp.float64  # at the start
+    end: wp.float64  # at the end
+    fixed: wp.float64  # those of its vertices that cannot be moved, at the end
+    inverse_mass: wp.float64  # sum over its vertices
+
+
+@wp.func
+def _side(
+    motion: Motion, vertices: Vertices, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d, normal: wp.vec3d
+) -> _Side:
+    """Returns how far the vertices from ``begin`` to ``end`` reach against a normal."""
+    side = _Side()
+    side.start = _FAR
+    side.end = _FAR
+    side.fixed = _FAR
+    for j in range(begin, end):
+        vertex = corners[j]
+        x1 = wp.dot(normal, to_double(vertices.x1[vertex]) - origin)
+        side.start = wp.min(side.start, wp.dot(normal, to_double(motion.x0[vertex]) - origin))
+        side.end = wp.min(side.end, x1)
+        inverse_mass = wp.float64(motion.inverse_mass[vertex])
+        side.inverse_mass += inverse_mass
+        if inverse_mass == _ZERO:
+            side.fixed = wp.min(side.fixed, x1)
+    return side
+
+
+@wp.func
+def add_dividing_planes(motion: Motion, vertices: Vertices, contacts: Contacts, i: int, planes: DividingPlanes):
+    """Adds planes between the elements of a contact to the lists of those of its vertices that can be moved.
+
+    The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
+    vertex that cannot be moved. Elements that touch at the start get none.
+    """
+    corners = contact_vertices(contacts, i)
+    _weights, between = closest_vector(motion, corners, contacts.edges)
+    if wp.length(between) == _ZERO:
+        return
+    normal = wp.normalize(between)
+    origin = to_double(motion.x0[corners[3]])
+    split = wp.where(contacts.edges == 1, 2, 1)
+    above = _side(motion, vertices, corners, 0, split, origin, normal)
+    below = _side(motion, vertices, corners, split, 4, origin, -normal)
+    distance = above.start + below.start
+    if distance <= _ZERO:
+        return
+    margin = _ROUNDING * distance
+    share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
+    offset = above.end + share * (-below.end - above.end)
+    offset = wp.clamp(offset, _MARGIN * distance - below.start, above.start - _MARGIN * distance)
+    # last, what cannot be moved decides
+    offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
+    at_origin = wp.dot(normal, origin)
+    for j in range(4):
+        vertex = corners[j]
+        if motion.inverse_mass[vertex] > 0.0:
+            if j < split:
+                add_plane(planes, vertex, normal, at_origin + offset, margin)
+            else:
+                add_plane(planes, vertex, -normal, -at_origin - offset, margin)
+
+
+@wp.func
+def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
+    """Returns whether a position of a vertex is above all of its planes."""
+    plane = planes.first[vertex]
+    while plane >= 0:
+        if wp.dot(planes.normal[plane], x) <= planes.offset[plane]:
+            return False
+        plane = planes.next[plane]
+    return True
+
+
+@wp.func
+def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
+    """Returns a position projected a few times onto the plane that it is farthest below, whatever their order."""
+    passes = int(0)
+    while passes < _PASSES:
+        most = _ZERO
+        step = wp.vec3d()
+        plane = planes.first[vertex]
+        while plane >= 0:
+            missing = planes.offset[plane] - wp.dot(planes.normal[plane], x) + planes.margin[plane]
+            if missing > planes.margin[plane] and missing > most:
+                most = missing
+                step = missing * planes.normal[plane]
+            plane = planes.next[plane]
+        x += step
+        passes = wp.where(most == _ZERO, _PASSES, passes + 1)
+    return x
+
+
+@wp.func
+def _share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
+    """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
+    share = _ONE
+    plane = planes.first[vertex]
+    while plane >= 0:
+        before = wp.dot(planes.normal[plane], x0) - planes.offset[plane]
+        after = wp.dot(planes.normal[plane], x1) - planes.offset[plane]
+        if after <= _ZERO and before > after:
+            share = wp.min(share, wp.max(before - planes.margin[plane], _ZERO) / (before - after))
+        plane = planes.next[plane]
+    return share
+
+
+@wp.func
+def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec3):
+    """Returns an end of a vertex's path above all of its planes, near to ``x1``, and whether the path was cut for that.
+
+    Where projection does not find one, the path is cut; where rounding leaves none, it ends at ``x0``.
+    """
+    x = to_double(x1)
+    if _is_above(planes, vertex, x):
+        return x1, False
+    end = to_single(_projected(planes, vertex, x))
+    if _is_above(planes, vertex, to_double(end)):
+        return end, False
+    start = to_double(x0)
+    x = to_double(end)
+    end = to_single(start + _share_of_path(planes, vertex, start, x) * (x - start))
+    if _is_above(planes, vertex, to_double(end)):
+        return end, True
+    return x0, True

@@ -1,0 +1,78 @@
+"""Pairs that the response leaves alone: pairs that crossed at the start of the step, and pairs that it cannot move."""
+
+import warp as wp
+
+from ..kernels.crossing import edge_crosses_face
+from ..kernels.signs import FREE, HIT
+from .buffers import Motion
+from .model_mesh import Incidence
+
+__all__ = ["Connectivity", "crossed_at_start", "is_movable"]
+
+
+@wp.struct
+class Connectivity:
+    """The elements of a mesh, and the elements that each belongs to."""
+
+    faces: wp.array2d[int]
+    edges: wp.array2d[int]
+    vertex_edges: Incidence
+    edge_faces: Incidence
+
+
+@wp.func
+def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
+    """Returns whether the response can move one of four vertices: contacts of other pairs are not its own."""
+    for j in range(4):
+        if motion.inverse_mass[corners[j]] > 0.0:
+            return True
+    return False
+
+
+@wp.func
+def _edge_meets_face(motion: Motion, mesh: Connectivity, edge: int, face: int, touches: bool) -> bool:
+    """Returns whether an edge crosses a face at the start; where rounding hides it, whether their pair ``touches``."""
+    for end in range(2):
+        for corner in range(3):
+            if mesh.edges[edge, end] == mesh.faces[face, corner]:
+                return False
+    x = motion.x0
+    p = mesh.edges[edge, 0]
+    q = mesh.edges[edge, 1]
+    a = x[mesh.faces[face, 0]]
+    b = x[mesh.faces[face, 1]]
+    c = x[mesh.faces[face, 2]]
+    status = edge_crosses_face(x[p], x[q], a, b, c)
+    return status == HIT or (touches and status != FREE)
+
+
+@wp.func
+def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i, toi: wp.float64) -> bool:
+    """Returns whether the elements of a contact already crossed at the start of the step, or touched there.
+
+    A vertex that passes through a face changes which of the vertex's edges cross that face; an edge that passes through
+    another changes which of the faces at either edge the other crosses. So the contact of a vertex and a face belongs
+    to a crossing if one of the vertex's edges crosses that face, and the contact of two edges if one of them crosses a
+    face of the other. Such contacts are how crossing surfaces come apart.
+
+    Args:
+        motion: The motion.
+        mesh: Its connectivity.
+        edges: 1 where the contact is of edges.
+        pair: The elements of the contact.
+        toi: Its time of impact; elements that touch at the start have 0.
+    """
+    touches = toi <= wp.float64(0.0)
+    if edges == 1:
+        for side in range(2):
+            edge = pair[side]
+            other = pair[1 - side]
+            for i in range(mesh.edge_faces.first[other], mesh.edge_faces.first[other + 1]):
+                if _edge_meets_face(motion, mesh, edge, mesh.edge_faces.items[i], touches):
+                    return True
+        return False
+    vertex = pair[0]
+    for i in range(mesh.vertex_edges.first[vertex], mesh.vertex_edges.first[vertex + 1]):
+        if _edge_meets_face(motion, mesh, mesh.vertex_edges.items[i], pair[1], touches):
+            return True
+    return False
