@@ -14,6 +14,9 @@ __all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "most_blocks", 
 
 _THREADS = os.cpu_count() or 1
 
+_THREADS_OF_MULTIPROCESSOR = 1024
+"""Threads of a launch over a queue for each multiprocessor of a GPU."""
+
 _threads = contextvars.ContextVar("threads", default=_THREADS)
 
 
@@ -45,23 +48,22 @@ def _may_share(kernel: wp.Kernel) -> bool:
     return mode == "release" and level != 0
 
 
-def most_blocks(device: wp.Device, block_dim: int, threads: int = 1024) -> int:
+def most_blocks(device: wp.Device, block_dim: int) -> int:
     """Returns the most blocks of a launch over a queue, so that a capacity costs next to nothing beside what is filled.
 
-    Their threads go on to further entries, in Warp's loop around a kernel.
+    Their threads go on to further entries, in Warp's loop around a kernel. Up to four times as many as run at once
+    balance the work; more cost time where the queue is empty.
 
     Args:
         device: The device.
         block_dim: Threads of a block.
-        threads: Threads of a multiprocessor; twice as many as it holds balance the work, more cost time if the queue
-            is empty.
 
     Returns:
         The number of blocks; 0, without a limit, for the CPU and where Warp is configured to make no such loops.
     """
     if device.is_cpu or not getattr(wp.config, "default_grid_stride", True):
         return 0
-    return device.sm_count * max(1, threads // block_dim)
+    return device.sm_count * max(1, _THREADS_OF_MULTIPROCESSOR // block_dim)
 
 
 def launch_over(

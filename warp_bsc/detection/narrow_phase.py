@@ -207,7 +207,7 @@ def run_narrow_phases(
     kernels = pair_kernels(x0.dtype)
     stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
 
-    def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int, threads: int) -> None:
+    def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int) -> None:
         """Launches a kernel over a buffer of both kinds, of one after the other on the CPU and if they are too long."""
         entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
         together = [list(stages)]
@@ -218,7 +218,7 @@ def run_narrow_phases(
             dim = sum(entries[kind] for kind in kinds)
             if device.is_cpu:
                 dim = min(dim, int(stages[kinds[0]].counts.numpy()[count]))
-            blocks = most_blocks(device, block_dim, threads)
+            blocks = most_blocks(device, block_dim)
             inputs = [*motion, *arguments]
             launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
 
@@ -232,9 +232,9 @@ def run_narrow_phases(
                 kernel = culling_kernel(kind, x0.dtype)
                 launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=motion, outputs=[s])
     with timer.stage("classify"):
-        launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64, 512)
+        launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64)
     with timer.stage("time of impact"):
-        launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32, 512)
+        launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32)
     if method == "exact":
         with timer.stage("exact"):
             for narrow_phase, elements in narrow_phases:
