@@ -81,7 +81,10 @@ class FaceHierarchy:
 
 @functools.cache
 def _box_elements(dtype: type) -> wp.Kernel:
-    """The kernel that boxes moving elements and clusters, for one type of position."""
+    """The kernel that boxes moving elements and clusters, for one type of position.
+
+    Its threads are the places of faces, then the edges, then the vertices.
+    """
 
     @wp.kernel(**NO_GRADIENTS)
     def box_elements(
@@ -96,28 +99,8 @@ def _box_elements(dtype: type) -> wp.Kernel:
         not_finite: wp.array[wp.int64],
     ):
         i = wp.tid()
-        if i < mesh.vertex_boxes.shape[0]:
-            if not_finite:
-                if not (wp.isfinite(x0[i]) and wp.isfinite(x1[i])):
-                    found = int(1)
-                    if checked:
-                        found = checked[i]
-                    if found != 0:
-                        raise_count(not_finite, 0, 1)
-            start = rounded(x0[i])
-            end = rounded(x1[i])
-            mesh.vertex_boxes[i, 0] = start
-            mesh.vertex_boxes[i, 1] = start
-            mesh.vertex_boxes[i, 2] = end
-            mesh.vertex_boxes[i, 3] = end
-        if i < mesh.edges.shape[0]:
-            a = mesh.edges[i, 0]
-            b = mesh.edges[i, 1]
-            mesh.edge_boxes[i, 0] = rounded(wp.min(x0[a], x0[b]))
-            mesh.edge_boxes[i, 1] = rounded(wp.max(x0[a], x0[b]))
-            mesh.edge_boxes[i, 2] = rounded(wp.min(x1[a], x1[b]))
-            mesh.edge_boxes[i, 3] = rounded(wp.max(x1[a], x1[b]))
-        if i < mesh.order.shape[0]:  # the same for all threads of a warp
+        places = mesh.order.shape[0]
+        if i < places:  # the same for all threads of a warp
             low = wp.vec3(wp.inf, wp.inf, wp.inf)
             high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
             has_changed = int(0)
@@ -142,6 +125,30 @@ def _box_elements(dtype: type) -> wp.Kernel:
             mesh.places.uppers[i] = high
             mesh.places.changed[i] = has_changed
             fit_parent(i, low, high, has_changed, mesh.clusters)
+            return
+        edge = i - places
+        if edge < mesh.edges.shape[0]:
+            a = mesh.edges[edge, 0]
+            b = mesh.edges[edge, 1]
+            mesh.edge_boxes[edge, 0] = rounded(wp.min(x0[a], x0[b]))
+            mesh.edge_boxes[edge, 1] = rounded(wp.max(x0[a], x0[b]))
+            mesh.edge_boxes[edge, 2] = rounded(wp.min(x1[a], x1[b]))
+            mesh.edge_boxes[edge, 3] = rounded(wp.max(x1[a], x1[b]))
+            return
+        vertex = edge - mesh.edges.shape[0]
+        if not_finite:
+            if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
+                counted = int(1)
+                if checked:
+                    counted = checked[vertex]
+                if counted != 0:
+                    raise_count(not_finite, 0, 1)
+        start = rounded(x0[vertex])
+        end = rounded(x1[vertex])
+        mesh.vertex_boxes[vertex, 0] = start
+        mesh.vertex_boxes[vertex, 1] = start
+        mesh.vertex_boxes[vertex, 2] = end
+        mesh.vertex_boxes[vertex, 3] = end
 
     return box_elements
 
@@ -505,7 +512,7 @@ class BroadPhaseHierarchy:
         self._not_finite, self._checked = not_finite, checked
         self.hierarchy = _make_hierarchy(mesh)
         places = len(mesh.face_order)
-        self._elements = max(mesh.vertex_count, len(mesh.edges), places)
+        self._elements = places + len(mesh.edges) + mesh.vertex_count
         self._clusters = places // WIDTH
         self._groups = _group_count(places)
         self._warps_of_cluster = 1
