@@ -50,7 +50,9 @@ _TRAVERSAL_BLOCK = 64
 class FaceHierarchy:
     """The faces in the order of their places, the boxes of elements, and the nodes above the faces.
 
-    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end.
+    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end. Those of vertices and
+    edges lie beside one another where the face is that represents them: row ``3 place + corner`` or side. Other rows
+    are not set.
 
     Attributes:
         order: Face at each place, -1 for none.
@@ -58,8 +60,10 @@ class FaceHierarchy:
         face_edges: Edges of the face at each place.
         owned: What the face at each place is the representative of.
         edges: Vertices of each edge.
-        vertex_boxes: Box of each vertex.
-        edge_boxes: Box of each edge.
+        vertex_rows: Row of each vertex in ``vertex_boxes``, -1 if no face uses it.
+        edge_rows: Row of each edge in ``edge_boxes``.
+        vertex_boxes: Boxes of the vertices that each face represents.
+        edge_boxes: Boxes of the edges that each face represents.
         face_boxes: Box of the face at each place.
         places: Level of the faces.
         clusters: Level above.
@@ -71,6 +75,8 @@ class FaceHierarchy:
     face_edges: wp.array2d[int]
     owned: wp.array[int]
     edges: wp.array2d[int]
+    vertex_rows: wp.array[int]
+    edge_rows: wp.array[int]
     vertex_boxes: wp.array2d[wp.vec3]
     edge_boxes: wp.array2d[wp.vec3]
     face_boxes: wp.array2d[wp.vec3]
@@ -130,10 +136,11 @@ def _box_elements(dtype: type) -> wp.Kernel:
         if edge < mesh.edges.shape[0]:
             a = mesh.edges[edge, 0]
             b = mesh.edges[edge, 1]
-            mesh.edge_boxes[edge, 0] = rounded(wp.min(x0[a], x0[b]))
-            mesh.edge_boxes[edge, 1] = rounded(wp.max(x0[a], x0[b]))
-            mesh.edge_boxes[edge, 2] = rounded(wp.min(x1[a], x1[b]))
-            mesh.edge_boxes[edge, 3] = rounded(wp.max(x1[a], x1[b]))
+            row = mesh.edge_rows[edge]
+            mesh.edge_boxes[row, 0] = rounded(wp.min(x0[a], x0[b]))
+            mesh.edge_boxes[row, 1] = rounded(wp.max(x0[a], x0[b]))
+            mesh.edge_boxes[row, 2] = rounded(wp.min(x1[a], x1[b]))
+            mesh.edge_boxes[row, 3] = rounded(wp.max(x1[a], x1[b]))
             return
         vertex = edge - mesh.edges.shape[0]
         if not_finite:
@@ -143,12 +150,14 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     counted = checked[vertex]
                 if counted != 0:
                     raise_count(not_finite, 0, 1)
-        start = rounded(x0[vertex])
-        end = rounded(x1[vertex])
-        mesh.vertex_boxes[vertex, 0] = start
-        mesh.vertex_boxes[vertex, 1] = start
-        mesh.vertex_boxes[vertex, 2] = end
-        mesh.vertex_boxes[vertex, 3] = end
+        row = mesh.vertex_rows[vertex]
+        if row >= 0:
+            start = rounded(x0[vertex])
+            end = rounded(x1[vertex])
+            mesh.vertex_boxes[row, 0] = start
+            mesh.vertex_boxes[row, 1] = start
+            mesh.vertex_boxes[row, 2] = end
+            mesh.vertex_boxes[row, 3] = end
 
     return box_elements
 
@@ -284,11 +293,11 @@ def _overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separ
     corners = wp.where(owned & 7 == 0, 0, 3)
     for corner in range(corners):
         if owns_vertex(owned, corner):
-            vertex = mesh.faces[face, corner]
-            if boxes_overlap(_low(mesh.vertex_boxes, vertex), _high(mesh.vertex_boxes, vertex), low, high):
-                if not _has_vertex(mesh.faces, other, vertex):
+            row = 3 * face + corner
+            if boxes_overlap(_low(mesh.vertex_boxes, row), _high(mesh.vertex_boxes, row), low, high):
+                if not _has_vertex(mesh.faces, other, mesh.faces[face, corner]):
                     found = found | (1 << corner)
-                    if keep_separated or not _apart(mesh.vertex_boxes, vertex, mesh.face_boxes, other):
+                    if keep_separated or not _apart(mesh.vertex_boxes, row, mesh.face_boxes, other):
                         found = found | (8 << corner)
     return found
 
@@ -305,24 +314,24 @@ def _overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separate
     sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
     for side in range(sides):
         if owns_edge(owned, side):
-            edge = mesh.face_edges[face, side]
-            low = _low(mesh.edge_boxes, edge)
-            high = _high(mesh.edge_boxes, edge)
+            row = 3 * face + side
+            low = _low(mesh.edge_boxes, row)
+            high = _high(mesh.edge_boxes, row)
             if boxes_overlap(low, high, mesh.places.lowers[other], mesh.places.uppers[other]):
                 a = mesh.faces[face, side]
                 b = mesh.faces[face, _next(side)]
                 for other_side in range(sides):
                     if owns_edge(other_owned, other_side):
-                        other_edge = mesh.face_edges[other, other_side]
+                        other_row = 3 * other + other_side
                         if boxes_overlap(
-                            low, high, _low(mesh.edge_boxes, other_edge), _high(mesh.edge_boxes, other_edge)
+                            low, high, _low(mesh.edge_boxes, other_row), _high(mesh.edge_boxes, other_row)
                         ):
                             c = mesh.faces[other, other_side]
                             d = mesh.faces[other, _next(other_side)]
                             if a != c and a != d and b != c and b != d:
                                 bit = 3 * side + other_side
                                 found = found | (1 << bit)
-                                if keep_separated or not _apart(mesh.edge_boxes, edge, mesh.edge_boxes, other_edge):
+                                if keep_separated or not _apart(mesh.edge_boxes, row, mesh.edge_boxes, other_row):
                                     found = found | (512 << bit)
     return found
 
@@ -395,17 +404,17 @@ def _pair_edges_with_face(
     sides = wp.where(owned >> 3 == 0, 0, 3)
     for side in range(sides):
         if owns_edge(owned, side):
-            edge = mesh.face_edges[face, side]
+            row = 3 * face + side
             a = mesh.faces[face, side]
             b = mesh.faces[face, _next(side)]
             if boxes_overlap(
-                _low(mesh.edge_boxes, edge),
-                _high(mesh.edge_boxes, edge),
+                _low(mesh.edge_boxes, row),
+                _high(mesh.edge_boxes, row),
                 mesh.places.lowers[other],
                 mesh.places.uppers[other],
             ):
                 if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
-                    append(wp.vec2i(edge, mesh.order[other]), pairs, counts, _QUEUED)
+                    append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -463,8 +472,16 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
     hierarchy.face_edges = by_place(mesh.face_edges)
     hierarchy.owned = by_place(mesh.owned)
     hierarchy.edges = mesh.device_edges
-    hierarchy.vertex_boxes = wp.empty((mesh.vertex_count, 4), dtype=wp.vec3, device=device)
-    hierarchy.edge_boxes = wp.empty((len(mesh.edges), 4), dtype=wp.vec3, device=device)
+    vertex_rows, edge_rows = np.full(mesh.vertex_count, -1), np.empty(len(mesh.edges))
+    filled = np.flatnonzero(order >= 0)
+    for i in range(3):
+        for rows, elements, bit in ((vertex_rows, mesh.faces, i), (edge_rows, mesh.face_edges, 3 + i)):
+            representing = filled[(mesh.owned[order[filled]] >> bit) & 1 == 1]
+            rows[elements[order[representing], i]] = 3 * representing + i
+    hierarchy.vertex_rows = wp.array(vertex_rows.astype(np.int32), dtype=int, device=device)
+    hierarchy.edge_rows = wp.array(edge_rows.astype(np.int32), dtype=int, device=device)
+    hierarchy.vertex_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
+    hierarchy.edge_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
     hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)
     worlds = None
     if mesh.world is not None and len(order):
