@@ -25,7 +25,7 @@ from warp_bsc.kernels.signs import FREE
 METHODS = ("float", "conservative", "exact")
 
 
-@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseHierarchy], ids=["simd", "bvh"])
+@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseHierarchy], ids=["simd", "hierarchy"])
 def broad_phase(request, monkeypatch, device):
     """Both broad phases where both run, whatever the detector would choose."""
     if device.is_cuda and request.param is BroadPhaseSimd:

@@ -3,14 +3,15 @@
 import numpy as np
 import warp as wp
 
+from ..kernels.pipeline.hierarchy import WIDTH
 from .settings import NO_GRADIENTS
 
 __all__ = ["CLUSTER", "GROUP", "order_faces"]
 
-CLUSTER = 32
-"""Places of a cluster: a warp's threads."""
+CLUSTER = WIDTH
+"""Places of a cluster."""
 
-GROUP = CLUSTER * CLUSTER
+GROUP = WIDTH * CLUSTER
 """Places of a group of clusters."""
 
 _CLUSTER = wp.constant(CLUSTER)
