@@ -75,8 +75,8 @@ def collect_penetrations(
 ):
     """Adds constraints for vertices that may have entered solids; after the last projection, finds when they did.
 
-    Vertices inside at the start are moved out as well, but if they cannot be, that is not a new contact. Ahead of the
-    first detection, contacts are counted as those of the wanted motion only.
+    Vertices that were inside at the start are excluded, like pairs of elements that crossed. Ahead of the first
+    detection, contacts are counted as those of the wanted motion only.
     """
     vertex = wp.tid()
     world = motion.world[vertex]
@@ -89,9 +89,13 @@ def collect_penetrations(
         if after > error_after:
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
+        if before < -error_before:
+            if not ahead:
+                wp.atomic_add(progress.status.crossed_hits, 0, 1)
+            continue
         if ahead:
             wp.atomic_add(progress.status.first_hits, 0, 1)
-        elif before >= -error_before:
+        else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
         if progress.status.iteration[0] < progress.max_iterations:
