@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import warp_bsc as bsc
+from warp_bsc import checker
+from warp_bsc.replay import validation
 from warp_bsc.replay.validation import overlapping_boxes, validate
 
 
@@ -69,6 +71,22 @@ def test_right_answers(crossing):
     assert found.hits == len(collisions.vertex_face) + len(collisions.edge_edge)
     assert found.hits + found.others == found.answers  # the grid and the detector find the same candidates
     assert 0 < found.certified <= found.answers
+
+
+@pytest.mark.parametrize("fewest", [1, 7, 1 << 30])
+def test_answers_do_not_depend_on_how_many_pairs_are_decided_at_a_time(crossing, monkeypatch, fewest):
+    detector, x0, x1, collisions = crossing
+    missing = Answers(
+        collisions, vertex_face=collisions.vertex_face[::2], vertex_face_toi=collisions.vertex_face_toi[::2]
+    )
+    expected = validate(detector, missing, x0, x1, most=None, seed=0)
+    assert len(expected.disagreements) == len(collisions.vertex_face) // 2
+    monkeypatch.setattr(validation, "_FEWEST", fewest)
+    calls = []
+    edge_edge = checker.edge_edge
+    monkeypatch.setattr(checker, "edge_edge", lambda points: calls.append(len(points)) or edge_edge(points))
+    assert validate(detector, missing, x0, x1, most=None, seed=0) == expected
+    assert len(calls) == 1 if fewest == 1 << 30 else min(calls[:-1]) >= fewest
 
 
 def test_some_answers(crossing):

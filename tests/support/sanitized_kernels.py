@@ -10,6 +10,7 @@ import os
 import shutil
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import warp as wp
@@ -19,8 +20,7 @@ __all__ = ["SANITIZED", "restart_with_sanitizers", "sanitize_kernels", "sanitize
 _FLAGS = [
     *("-std=c++17", "-O1", "-g", "-fPIC", "-shared", "-march=native", "-fms-extensions", "-fdeclspec", "-w"),
     *("-fsanitize=address,undefined", "-fno-sanitize=vptr,function", "-fno-sanitize-recover=all", "-shared-libasan"),
-    # Warp's array addressing multiplies by strides and offsets null pointers of arrays that are empty
-    *("-fno-sanitize=pointer-overflow", "-DWP_ENABLE_TILES_IN_STACK_MEMORY", "-DNDEBUG"),
+    *("-DWP_ENABLE_TILES_IN_STACK_MEMORY", "-DNDEBUG"),
 ]
 _NATIVE = Path(wp.__file__).parent / "native"
 _MARK = "WARP_BSC_SANITIZED"
@@ -48,8 +48,10 @@ def sanitizers_available() -> bool:
 
 def restart_with_sanitizers() -> None:
     """Starts this run of pytest anew with the sanitizers' runtime, which must come before all other libraries."""
-    _, runtime = _find_clang()
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "warp-bsc-sanitized"
+    clang, runtime = _find_clang()
+    # Warp's own keys for kernels do not have this compiler
+    key = zlib.crc32(" ".join([os.path.realpath(clang), *_FLAGS]).encode())
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / f"warp-bsc-sanitized-{key:08x}"
     environment = {
         "LD_PRELOAD": f"{runtime}:libstdc++.so.6",
         # Python keeps memory until its end, on purpose

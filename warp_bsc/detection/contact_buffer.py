@@ -96,7 +96,13 @@ def read_contacts(buffer: ContactBuffer, count: int) -> HostContacts:
     """Returns copies of the first ``count`` contacts of a buffer; synchronizes with the device."""
 
     def read(array: wp.array) -> np.ndarray:
-        return (array if count == len(array) else array[:count]).numpy().copy()
+        if array.device.is_cpu:
+            return array.numpy()[:count].copy()
+        host = wp.empty(count, dtype=array.dtype, device="cpu")
+        if count:  # 0 stands for the whole array
+            with wp.ScopedStream(array.device.null_stream):  # waits for all streams, as wp.array.numpy does
+                wp.copy(host, array, count=count)
+        return host.numpy()
 
     return HostContacts(**{name: read(getattr(buffer, name)) for name in ContactBuffer.vars})
 

@@ -12,6 +12,7 @@ from ..detection.query_points import query_points
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 
 _CHUNK = 1 << 18  # pairs in memory at a time
+_FEWEST = 1 << 14  # pairs that the checker decides at a time, if there are as many: a call of it takes long
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -87,7 +88,7 @@ def validate(
                 disagreements.append(f"{pair} was reported at {toi[row]!r} and collides at {earliest!r} only")
 
         others = _unreported(mesh, kind, first, second, found, x0, x1)
-        for pairs in others if most is None else [_choose(others, most, random)]:
+        for pairs in _merged(others) if most is None else [_choose(others, most, random)]:
             decided_others += len(pairs)
             collides = getattr(checker, kind)(query_points(second, pairs, x0, x1))
             name = kind.replace("_", "-")
@@ -186,6 +187,19 @@ def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         places = np.arange(some.sum()) - np.repeat(starts - begin[rows[at:stop]], some)
         yield np.repeat(rows[at:stop], some), places
         at = stop
+
+
+def _merged(chunks: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
+    """Yields the pairs of all chunks in their order, in fewer and larger chunks."""
+    waiting, count = [], 0
+    for pairs in chunks:
+        waiting.append(pairs)
+        count += len(pairs)
+        if count >= _FEWEST:
+            yield np.concatenate(waiting)
+            waiting, count = [], 0
+    if count:
+        yield np.concatenate(waiting)
 
 
 def _choose(chunks, most, random) -> np.ndarray:
