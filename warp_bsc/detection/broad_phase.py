@@ -17,7 +17,7 @@ class BroadPhase(Protocol):
     """Finds the candidates of a mesh: pairs of elements that share no vertex and whose swept boxes overlap.
 
     A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
-    single precision, rounded so that no overlap is lost.
+    single precision, rounded so that no overlap is lost. An element with a position that is not finite has no pairs.
     """
 
     @property

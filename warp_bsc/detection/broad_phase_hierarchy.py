@@ -30,7 +30,14 @@ from .launch import most_blocks
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, Count, capacity_for
 
-__all__ = ["BroadPhaseHierarchy", "FaceHierarchy", "traversal_kernel"]
+__all__ = [
+    "BroadPhaseHierarchy",
+    "FaceHierarchy",
+    "lowest_bit",
+    "overlapping_edges",
+    "overlapping_vertices",
+    "traversal_kernel",
+]
 
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -92,6 +99,11 @@ def _box_elements(dtype: type) -> wp.Kernel:
     Its threads are the places of faces, then the edges, then the vertices.
     """
 
+    @wp.func
+    def _is_finite(x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, c: int) -> bool:
+        start = wp.isfinite(x0[a]) and wp.isfinite(x0[b]) and wp.isfinite(x0[c])
+        return start and wp.isfinite(x1[a]) and wp.isfinite(x1[b]) and wp.isfinite(x1[c])
+
     @wp.kernel(**NO_GRADIENTS)
     def box_elements(
         # in
@@ -110,7 +122,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
             low = wp.vec3(wp.inf, wp.inf, wp.inf)
             high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
             has_changed = int(0)
-            if mesh.order[i] >= 0:
+            if mesh.order[i] >= 0 and _is_finite(x0, x1, mesh.faces[i, 0], mesh.faces[i, 1], mesh.faces[i, 2]):
                 a = mesh.faces[i, 0]
                 b = mesh.faces[i, 1]
                 c = mesh.faces[i, 2]
@@ -281,7 +293,7 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
-def _overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
     Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
@@ -303,7 +315,7 @@ def _overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separ
 
 
 @wp.func
-def _overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Which edges of a face and of another, each of its own, have overlapping boxes: bit 3 i + j for sides i and j.
 
     Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well.
@@ -346,7 +358,7 @@ def _bit_count(bits: int):
 
 
 @wp.func
-def _lowest_bit(bits: int):
+def lowest_bit(bits: int):
     """The place of the lowest bit that is set."""
     return _bit_count((bits & -bits) - 1)
 
@@ -368,9 +380,9 @@ def _pair_elements(
         return
     face = face_pairs[i][0]
     other = face_pairs[i][1]
-    vertices = _overlapping_vertices(mesh, face, other, keep_separated)
-    vertices = vertices | (_overlapping_vertices(mesh, other, face, keep_separated) << 6)
-    edges = _overlapping_edges(mesh, face, other, keep_separated)
+    vertices = overlapping_vertices(mesh, face, other, keep_separated)
+    vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
+    edges = overlapping_edges(mesh, face, other, keep_separated)
     raise_count(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
     raise_count(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
     # of the rest only what no axis separates
@@ -378,7 +390,7 @@ def _pair_elements(
     edges = edges >> 9
     slot = take_slots(vertex_face_counts, _QUEUED, _bit_count(vertices))
     while vertices != 0:
-        corner = _lowest_bit(vertices)
+        corner = lowest_bit(vertices)
         vertices = vertices & (vertices - 1)
         if corner < 3:
             write(wp.vec2i(mesh.faces[face, corner], mesh.order[other]), vertex_face, slot)
@@ -387,7 +399,7 @@ def _pair_elements(
         slot += wp.int64(1)
     slot = take_slots(edge_edge_counts, _QUEUED, _bit_count(edges))
     while edges != 0:
-        bit = _lowest_bit(edges)
+        bit = lowest_bit(edges)
         edges = edges & (edges - 1)
         edge = mesh.face_edges[face, bit / 3]
         other_edge = mesh.face_edges[other, bit % 3]

@@ -86,6 +86,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
             high0 = wp.vec3(-wp.inf)
             low1 = wp.vec3(wp.inf)
             high1 = wp.vec3(-wp.inf)
+            finite = bool(True)
             elements[packet, lane] = numbers[i]
             elements[packet, 32 + lane] = worlds[i]
             for corner in range(corners.shape[1]):
@@ -93,12 +94,18 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
                 elements[packet, 8 + 8 * corner + lane] = vertex
                 if not changed or changed[vertex] != 0:
                     changed_lanes = changed_lanes | (1 << lane)
+                finite = finite and wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
                 start = rounded(x0[vertex])
                 end = rounded(x1[vertex])
                 low0 = wp.min(low0, start)
                 high0 = wp.max(high0, start)
                 low1 = wp.min(low1, end)
                 high1 = wp.max(high1, end)
+            if not finite:  # an empty box overlaps none
+                low0 = wp.vec3(wp.inf)
+                high0 = wp.vec3(-wp.inf)
+                low1 = wp.vec3(wp.inf)
+                high1 = wp.vec3(-wp.inf)
             for axis in range(3):
                 boxes[packet, 4 * axis, lane] = low0[axis]
                 boxes[packet, 4 * axis + 1, lane] = high0[axis]

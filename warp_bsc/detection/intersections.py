@@ -14,7 +14,7 @@ from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, Counters, capacity_for
 
-__all__ = ["find_intersections"]
+__all__ = ["CrossingCandidates", "find_intersections"]
 
 
 @functools.cache
@@ -42,25 +42,27 @@ def _classify_crossings(dtype: type) -> wp.Kernel:
     return classify_crossings
 
 
-class _Candidates:
+class CrossingCandidates:
     """The pairs (edge, face) whose boxes overlap.
 
     Attributes:
         pairs: Queue of the pairs, array of vec2i.
+        counts: Counts of the pairs by :class:`Count`, on the device, array of int64.
         count: Number of pairs that the last :meth:`grow` has read.
     """
 
     def __init__(self, mesh: CollisionMesh):
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        # the counts of the edges' pairs with faces take the place of those with edges
+        self.counts = self._counters.edge_edge
         self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self.count = 0
 
     def find(self, x: wp.array) -> None:
         """Launches the broad phase."""
         self._counters.array.zero_()
-        # the counts of the edges' pairs with faces take the place of those with edges
-        self._broad_phase.pair_edges_with_faces(x, self._counters.edge_edge, self.pairs)
+        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs)
 
     def grow(self) -> bool:
         """Enlarges the queues that were too small, and returns whether any was; synchronizes with the device."""
@@ -93,7 +95,7 @@ def find_intersections(mesh: CollisionMesh, x: np.ndarray | wp.array) -> np.ndar
     x = mesh.device_positions(x, "x")
     positions = x.numpy()
     check_finite(positions, "x", mesh.vertices)
-    candidates = _Candidates(mesh)
+    candidates = CrossingCandidates(mesh)
     retry_until_fits(lambda: candidates.find(x), candidates, mesh.device)
     status = wp.empty(candidates.count, dtype=int, device=mesh.device)
     inputs = [x, mesh.device_edges, mesh.device_faces, candidates.pairs]

@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from .broad_phase import make_broad_phase
+from .broad_phase import BroadPhase, make_broad_phase
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
 from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, PairKind, check_method, check_tolerance
@@ -161,6 +161,11 @@ class DetectionPipeline:
                 narrow_phase.sort()
         if side_stream is not None:
             wp.wait_stream(side_stream)
+
+    @property
+    def broad_phase(self) -> BroadPhase:
+        """The broad phase, whose boxes are those of the last run."""
+        return self._broad_phase
 
     def find_candidates(self) -> None:
         """Enqueues all candidates of the last run in the queues of the narrow phases, which do not run.

@@ -95,6 +95,8 @@ class SolveStatus:
     excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
+    crossings: wp.array[int]  # edges that cross faces at the start
+    recount: wp.array[int]  # 1 if crossings may have changed since they were counted
     truncated: wp.array[int]  # 1 if a path was cut
     frozen: wp.array[int]  # 1 if a vertex was frozen
     lost: wp.array[int]  # vertices whose wanted position was not finite

@@ -10,7 +10,7 @@ slides along a plane goes on sliding, unlike what is truncated.
 import warp as wp
 
 from .buffers import Motion, Vertices
-from .constraints import Contacts, contact_vertices, to_double, to_single
+from .constraints import to_double, to_single
 from .proximities import closest_vector
 
 __all__ = ["DividingPlanes", "add_dividing_planes", "add_plane", "allocate_dividing_planes", "position_on_sides"]
@@ -94,19 +94,18 @@ def _side(
 
 
 @wp.func
-def add_dividing_planes(motion: Motion, vertices: Vertices, contacts: Contacts, i: int, planes: DividingPlanes):
-    """Adds planes between the elements of a contact to the lists of those of its vertices that can be moved.
+def add_dividing_planes(motion: Motion, vertices: Vertices, corners: wp.vec4i, edges: int, planes: DividingPlanes):
+    """Adds planes between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start get none.
     """
-    corners = contact_vertices(contacts, i)
-    _weights, between = closest_vector(motion, corners, contacts.edges)
+    _weights, between = closest_vector(motion, corners, edges)
     if wp.length(between) == _ZERO:
         return
     normal = wp.normalize(between)
     origin = to_double(motion.x0[corners[3]])
-    split = wp.where(contacts.edges == 1, 2, 1)
+    split = wp.where(edges == 1, 2, 1)
     above = _side(motion, vertices, corners, 0, split, origin, normal)
     below = _side(motion, vertices, corners, split, 4, origin, -normal)
     distance = above.start + below.start

@@ -2,12 +2,16 @@
 
 import warp as wp
 
+from ..detection.settings import Count
 from ..kernels.crossing import edge_crosses_face
+from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE, HIT
 from .buffers import Motion
 from .model_mesh import Incidence
 
-__all__ = ["Connectivity", "crossed_at_start", "is_movable"]
+__all__ = ["Connectivity", "count_crossings", "crossed_at_start", "is_movable"]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
 
 
 @wp.struct
@@ -76,3 +80,25 @@ def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.ve
         if _edge_meets_face(motion, mesh, mesh.vertex_edges.items[i], pair[1], touches):
             return True
     return False
+
+
+@wp.kernel(enable_backward=False)
+def count_crossings(
+    # in
+    motion: Motion,
+    mesh: Connectivity,
+    pairs: wp.array[wp.vec2i],
+    counts: wp.array[wp.int64],
+    # out
+    count: wp.array[int],
+):
+    """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
+    i = wp.tid()
+    if not is_filled(i, pairs, counts, _QUEUED):
+        return
+    edge = pairs[i][0]
+    face = pairs[i][1]
+    corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
+    if is_movable(motion, corners) or motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+        if _edge_meets_face(motion, mesh, edge, face, False):
+            wp.atomic_add(count, 0, 1)

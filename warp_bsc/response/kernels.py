@@ -78,6 +78,9 @@ def begin_step(
         progress.contact_iteration[i] = -1
     if i >= vertices.x1.shape[0]:
         return
+    for axis in range(3):
+        if motion.x0[i][axis] != vertices.x1[i][axis]:  # moved between steps
+            progress.status.recount[0] = 1
     vertices.x1[i] = motion.x1[i]
     vertices.velocity[i] = motion.velocity[i]
     for axis in range(3):
@@ -137,7 +140,7 @@ def _collect_contact(
         )
     else:
         if dividing.first:
-            add_dividing_planes(motion, vertices, contacts, i, dividing)
+            add_dividing_planes(motion, vertices, corners, contacts.edges, dividing)
         for j in range(4):
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
 
@@ -181,12 +184,31 @@ def record_offsets(constraints: Constraints, progress: Progress, record: StepRec
 
 
 @wp.kernel(**_KERNEL)
-def decide(constraints: Constraints, progress: Progress, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]):
-    """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed."""
-    overflowed = bool(False)
-    for i in range(counts.shape[0]):
-        overflowed = overflowed or counts[i] > capacities[i]
+def decide(
+    constraints: Constraints,
+    progress: Progress,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    can_search: bool,
+):
+    """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
+
+    If a queue overflowed, the detection is incomplete. With ``can_search`` it is to be completed by
+    :mod:`.queueless`, and decided upon by another launch.
+    """
     status = progress.status
+    overflowed = bool(False)
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
+        overflowed = overflowed or counts[i] > capacities[i]
+    if can_search and overflowed and status.undetected[0] == 0:
+        status.undetected[0] = 1
+        if status.iteration[0] == 0:
+            status.first_hits[0] = status.first_hits[0] + status.hits[0]
+        status.hits[0] = 0
+        status.crossed_hits[0] = 0
+        status.iteration[0] = wp.max(status.iteration[0], progress.max_iterations)
+        return
+    overflowed = overflowed and not can_search
     hits = status.hits[0]
     status.hits[0] = 0
     status.remaining[0] = hits
@@ -196,7 +218,7 @@ def decide(constraints: Constraints, progress: Progress, counts: wp.array[wp.int
         status.first_hits[0] = status.first_hits[0] + hits
     stuck = status.iteration[0] > progress.max_iterations + progress.max_truncations and status.newly_frozen[0] == 0
     status.newly_frozen[0] = 0
-    status.certified[0] = wp.where(hits == 0 and not overflowed, 1, 0)
+    status.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
     status.undetected[0] = wp.where(overflowed, 1, 0)
     status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]

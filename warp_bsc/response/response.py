@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from ..detection.intersections import CrossingCandidates
 from ..detection.launch import retry_until_fits
 from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import Count, PairKind, capacity_for
@@ -21,7 +23,7 @@ from .buffers import (
 )
 from .constraints import MAX_DIVISIONS, MAX_ITERATIONS, MAX_TRUNCATIONS, Contacts
 from .dividing_planes import DividingPlanes, allocate_dividing_planes
-from .exclusion import Connectivity
+from .exclusion import Connectivity, count_crossings
 from .kernels import (
     begin_step,
     collect_contacts,
@@ -46,6 +48,7 @@ from .projection import (
     update_velocities,
 )
 from .proximities import Proximities, collect_proximities, drop_proximities
+from .queueless import find_contacts_without_queues
 from .step_record import StepRecord, StepRecorder, name_elements
 
 __all__ = ["MAX_SWEEPS_PER_STEP", "Resolution", "Response"]
@@ -137,6 +140,7 @@ class Response:
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self._most_penetrations = self._movable * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
+        self._crossing_candidates = CrossingCandidates(mesh)
         self._dividing_planes = allocate_dividing_planes(
             mesh.vertex_count, _DIVIDING_PLANES * self._movable + 1024, device
         )
@@ -184,6 +188,7 @@ class Response:
         inputs, outputs = [wanted, self.worlds], [vertices, self.constraints, self._dividing_planes, self._progress]
         size = max(len(vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
+        wp.capture_if(self.status.recount, self._count_crossings)
         if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
             self._collect_penetrations(ahead=True)
@@ -193,6 +198,14 @@ class Response:
         self._record_offsets(after=1)
         wp.capture_if(self.status.unfinished, self._finish, dt=dt)
         return Resolution(vertices, self.constraints, self.status, self._status_values)
+
+    def _count_crossings(self):
+        """Counts the edges that cross faces at the start, of which one is movable."""
+        motion, candidates = self._motion.vertices, self._crossing_candidates
+        self.status.crossings.zero_()
+        retry_until_fits(lambda: candidates.find(motion.x0), candidates, self.device)
+        inputs = [motion, self._connectivity, candidates.pairs, candidates.counts, self.status.crossings]
+        self._launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
 
     def _leave_planes(self):
         """Sweeps over the constraints once, ahead of the first detection."""
@@ -330,8 +343,30 @@ class Response:
             self._launch_over(count_grazing, queues, [motion, vertices, *contacts, self._record])
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
-        inputs = [self.constraints, progress, detector.counters.array, detector.capacities]
+        self._decide()
+        if self._can_search:
+            wp.capture_if(self.status.undetected, self._search)
+
+    @property
+    def _can_search(self):
+        """Whether detections can do without queues; on the CPU these grow, and the adjoint needs what is in them."""
+        return self._recorder is None and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
+
+    def _decide(self):
+        counts, capacities = self.detector.counters.array, self.detector.capacities
+        inputs = [self.constraints, self._progress, counts, capacities, self._can_search]
         wp.launch(decide, 1, inputs=inputs, device=self.device)
+
+    def _search(self):
+        """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
+        broad_phase, motion = self.detector.broad_phase, self._motion.vertices
+        broad_phase.fit(motion.x0, self.vertices.x1)
+        find_contacts_without_queues(
+            broad_phase, self._connectivity, motion, self.vertices, self._dividing, self._progress
+        )
+        if self._most_penetrations:
+            self._collect_penetrations(ahead=False)
+        self._decide()
 
     def _contacts(self):
         """Yields the contacts that the last detection found, vertex-face and edge-edge."""

@@ -54,6 +54,9 @@ def _write_back(
 @wp.kernel(enable_backward=False)
 def _count_step(status: SolveStatus, totals: StepTotals):
     """Adds a step to the totals."""
+    # a certified motion of elements that did not cross makes no crossings
+    unchanged = status.certified[0] == 1 and status.crossings[0] == 0 and status.excluded[0] == 0
+    status.recount[0] = wp.where(unchanged, 0, 1)
     totals.steps[0] = totals.steps[0] + 1
     totals.uncertified_steps[0] = totals.uncertified_steps[0] + 1 - status.certified[0]
     totals.undetected_steps[0] = totals.undetected_steps[0] + status.undetected[0]
