@@ -174,21 +174,7 @@ class Response:
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
-        self._motion, self._recorder = motion, record
-        wanted, vertices = motion.vertices, self.vertices
-        self._record = StepRecord()  # which records nothing
-        self._dividing = self._dividing_planes if record is None else DividingPlanes()
-        self._progress.max_truncations = MAX_DIVISIONS if record is None else int(MAX_TRUNCATIONS)
-        if record is not None:
-            if not self.device.is_capturing:
-                record.reserve_entries(_MIN_ENTRIES)
-            elif not len(record.record.constraint):
-                raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
-            self._record = record.begin()
-        inputs, outputs = [wanted, self.worlds], [vertices, self.constraints, self._dividing_planes, self._progress]
-        size = max(len(vertices.x1), self.worlds)
-        wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
-        wp.capture_if(self.status.recount, self._count_crossings)
+        self._begin(motion, record)
         if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
             self._collect_penetrations(ahead=True)
@@ -198,6 +184,34 @@ class Response:
         self._record_offsets(after=1)
         wp.capture_if(self.status.unfinished, self._finish, dt=dt)
         return Resolution(vertices, self.constraints, self.status, self._status_values)
+
+    def inspect(self, motion: ModelMotion) -> Resolution:
+        """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
+
+        Args:
+            motion: The motion that is wanted; it is only read.
+        """
+        self._begin(motion, None)
+        self._detect(refit=False)
+        return Resolution(self.vertices, self.constraints, self.status, self._status_values)
+
+    def _begin(self, motion, recorder):
+        """Initializes everything for a step, and counts crossings at its start."""
+        self._motion, self._recorder = motion, recorder
+        self._record = StepRecord()  # which records nothing
+        self._dividing = self._dividing_planes if recorder is None else DividingPlanes()
+        self._progress.max_truncations = MAX_DIVISIONS if recorder is None else int(MAX_TRUNCATIONS)
+        if recorder is not None:
+            if not self.device.is_capturing:
+                recorder.reserve_entries(_MIN_ENTRIES)
+            elif not len(recorder.record.constraint):
+                raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
+            self._record = recorder.begin()
+        inputs = [motion.vertices, self.worlds]
+        outputs = [self.vertices, self.constraints, self._dividing_planes, self._progress]
+        size = max(len(self.vertices.x1), self.worlds)
+        wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
+        wp.capture_if(self.status.recount, self._count_crossings)
 
     def _count_crossings(self):
         """Counts the edges that cross faces at the start, of which one is movable."""
