@@ -183,7 +183,7 @@ class Response:
         self._detect(refit=False)
         self._record_offsets(after=1)
         wp.capture_if(self.status.unfinished, self._finish, dt=dt)
-        return Resolution(vertices, self.constraints, self.status, self._status_values)
+        return Resolution(self.vertices, self.constraints, self.status, self._status_values)
 
     def inspect(self, motion: ModelMotion) -> Resolution:
         """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
