@@ -65,7 +65,7 @@ class SolverReport:
     @property
     def rounds(self) -> int:
         """Iterations of detection and projection or truncation in the last step."""
-        return _read(self._response.status.iteration)
+        return _read(self._response.status.rounds)
 
     @property
     def truncated(self) -> int:
