@@ -41,8 +41,8 @@ __all__ = [
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which the paths of vertices that still collide are truncated."""
 MAX_SLOW_ITERATIONS = 1
-"""Iterations of detect and project in a step whose contacts are all of slow elements: vertices that then still collide are
-divided, which moves slow elements hardly at all, and costs no sweeps."""
+"""Iterations of detect and project in a step whose contacts are all of slow elements. Vertices that then still collide
+are divided, which hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.dividing_planes`."""
 MAX_TRUNCATIONS = wp.constant(8)
