@@ -133,7 +133,8 @@ class Response:
         self._progress = progress = Progress()
         progress.status, progress.sweep = self.status, self._sweep
         progress.max_iterations = MAX_ITERATIONS
-        progress.contact_iteration = wp.zeros(self.worlds, dtype=int, device=device)
+        for name in ("contact_iteration", "fast"):
+            setattr(progress, name, wp.zeros(self.worlds, dtype=int, device=device))
         self._motion: ModelMotion  # of the step that is being resolved
         self._recorder: StepRecorder | None = None
         self._turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
