@@ -51,27 +51,40 @@ def bits(*states):
 
 
 def exact_contacts(rollout, x0, x1):
-    """Vertices of the contacts of a motion, shape [n, 4], in which floating point leaves nothing open."""
+    """The vertices of each contact of a motion, shape [n, 4], and how many pairs floating point leaves open."""
     c = rollout.detector.detect(x0, x1)
-    assert c.stats.vertex_face.unsure == c.stats.edge_edge.unsure == 0
     mesh = rollout.detector.mesh
     of_faces = np.concatenate([c.vertex_face[:, :1], mesh.faces[c.vertex_face[:, 1]]], axis=1)
-    return np.concatenate([of_faces, mesh.edges[c.edge_edge].reshape(-1, 4)])
+    contacts = np.concatenate([of_faces, mesh.edges[c.edge_edge].reshape(-1, 4)])
+    return contacts, c.stats.vertex_face.unsure + c.stats.edge_edge.unsure
 
 
-@pytest.mark.parametrize("speed", [10.0, 60.0])
-def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(speed, device):
-    model = bullet(speed, device=device)
+def blade(speed, *, device):
+    """A patch that falls through a held sheet edge on, so that it crosses the sheet for some steps."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 16, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    tilt = wp.quat_from_axis_angle(wp.vec3(1.0, 0.2, 0.0), 1.3)
+    size = {"dim_x": 8, "dim_y": 8, "cell_x": 0.03, "cell_y": 0.03, "mass": 0.001}
+    builder.add_cloth_grid(pos=wp.vec3(-0.11, -0.04, 0.05), rot=tilt, vel=wp.vec3(0.0, 0.0, -speed), **size, **STIFF)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+@pytest.mark.parametrize("scene", [bullet, blade])
+def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(scene, device):
+    model = scene(20.0, device=device)
     inner = SOLVERS["vbd"](model)
     wanted = record_wanted(inner)
     rollout = Rollout(model, bsc.CollisionMonitor(inner))
     report = rollout.solver.report
-    hits = excluded = crossings = uncertified = 0
+    hits = excluded = crossings = uncertified = equal = 0
     for _ in range(8):
         x0 = rollout.positions.copy()
         rollout.step()
         assert bits(*rollout.states[::-1]) == wanted
-        assert report.hits + report.excluded == len(exact_contacts(rollout, x0, rollout.positions))
+        contacts, unsure = exact_contacts(rollout, x0, rollout.positions)
+        assert 0 <= report.hits + report.excluded - len(contacts) <= unsure
+        equal += unsure == 0 < len(contacts)
         assert report.remaining == report.hits
         assert report.certified == (report.hits == 0) == (len(report.uncertified_vertices) == 0)
         assert report.crossings == len(rollout.detector.find_intersections(x0))
@@ -79,8 +92,8 @@ def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(spee
         hits, excluded, crossings = hits + report.hits, excluded + report.excluded, crossings + report.crossings
         uncertified += not report.certified
     assert hits > 100
-    assert (excluded > 0) == (crossings > 0) == (speed < 50.0)  # the fast patch is through within one step
-    assert 0 < uncertified < 8
+    assert (excluded > 0) == (crossings > 0) == (scene is blade)  # the other is through within one step
+    assert 0 < uncertified < 8 and equal > 0
     assert (report.steps, report.uncertified_steps) == (8, uncertified)
     assert (report.truncated_steps, report.frozen_steps, report.lost_steps, report.undetected_steps) == (0, 0, 0, 0)
 
@@ -102,7 +115,7 @@ def test_the_monitor_reports_the_same_from_a_graph(device):
         pytest.skip("needs conditional nodes")
     rows = []
     for in_graph in (False, True):
-        model = bullet(10.0, device=device)
+        model = blade(20.0, device=device)
         solver = bsc.CollisionMonitor(SOLVERS["vbd"](model))
         states, control = (model.state(), model.state()), model.control()
 
@@ -170,7 +183,9 @@ def test_gradients_of_the_inner_solver_pass_the_monitor_unchanged(device):
     assert hits > 0
     for actual, expected in zip(*gradients, strict=True):
         assert np.abs(expected).max() > 0.0
-        np.testing.assert_allclose(actual, expected, rtol=1e-5 if device.is_cuda else 0.0)  # sums of a GPU have no order
+        np.testing.assert_allclose(
+            actual, expected, rtol=1e-5 if device.is_cuda else 0.0
+        )  # sums of a GPU have no order
 
 
 def particles_of_elements_with(model, particle):
@@ -252,7 +267,8 @@ def test_particles_that_kinematic_ones_squeeze_are_named(device):
     x0 = rollout.positions.copy()
     rollout.step()
     report = rollout.solver.report
-    contacts = exact_contacts(rollout, x0, rollout.positions)
+    contacts, unsure = exact_contacts(rollout, x0, rollout.positions)
+    assert unsure == 0
     movable = ~np.isin(contacts, held).all(axis=1)
     assert 0 < movable.sum() < len(contacts)
     assert not report.certified and report.remaining == movable.sum() and report.excluded == 0
@@ -274,6 +290,6 @@ def test_crossings_at_the_start_are_counted_from_the_first_step(make, device):
     for steps in (1, 2):
         rollout.step()
         assert (report.crossings, report.steps) == (expected, steps)
-        assert report.excluded == rollout.collisions / steps > 0
+        assert (report.hits, report.excluded) == (0, 0)  # nothing moves
         assert report.certified and len(report.uncertified_vertices) == 0
     assert str(report).endswith(f"0 not certified, {expected} crossings at the start")

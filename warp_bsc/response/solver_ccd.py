@@ -393,8 +393,8 @@ class CollisionMonitor(SolverCCD):
 
     The plain name of ``SolverCCD(solver, respond=False)``, and nothing more. Each step costs one detection. The
     certificate is that of :class:`SolverCCD`: a certified step is free of collisions, except for those of elements that
-    crossed or touched at its start. A contact therefore counts among the ``hits`` of the :attr:`report` in the step
-    that passes it; in later steps it counts as ``excluded`` while its elements cross, and in ``crossings``.
+    crossed or touched at its start. The :attr:`report` counts a contact among its ``hits`` in the step that passes it.
+    Elements that cross from then on are counted in ``crossings``, and their contacts as ``excluded``.
     """
 
     def __init__(self, solver: SolverBase):
