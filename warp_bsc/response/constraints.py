@@ -11,6 +11,7 @@ __all__ = [
     "EDGE_EDGE_PROXIMITY",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
+    "MAX_SLOW_ITERATIONS",
     "MAX_TRUNCATIONS",
     "PLANE_CONTACT",
     "TIME_UNITS",
@@ -39,6 +40,9 @@ __all__ = [
 
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which the paths of vertices that still collide are truncated."""
+MAX_SLOW_ITERATIONS = 1
+"""Iterations of detect and project in a step whose contacts are all of slow elements. Vertices that then still collide
+are divided, which hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.dividing_planes`."""
 MAX_TRUNCATIONS = wp.constant(8)

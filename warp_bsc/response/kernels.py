@@ -72,6 +72,8 @@ def begin_step(
         status.truncated[0] = 0
         status.frozen[0] = 0
         status.lost[0] = 0
+        status.fast[0] = 0
+        status.rounds[0] = 0
         constraints.count[0] = 0
         dividing.count[0] = 0
     if i < worlds:
@@ -121,7 +123,9 @@ def _collect_contact(
         normal = contacts.normal[i]
         target = widened(separation, progress)
         slow = is_slow(motion, corners, contacts.edges)
-        if slow == 1:
+        if slow == 0:
+            progress.status.fast[0] = 1
+        else:
             target = feasible_in_contact(motion, corners, weights, normal, target, separation)
         kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
         add_constraint(
@@ -216,12 +220,15 @@ def decide(
     status.crossed_hits[0] = 0
     if status.iteration[0] == 0:
         status.first_hits[0] = status.first_hits[0] + hits
+    if status.fast[0] == 0 and status.iteration[0] >= progress.max_slow_iterations:
+        status.iteration[0] = wp.max(status.iteration[0], progress.max_iterations)
     stuck = status.iteration[0] > progress.max_iterations + progress.max_truncations and status.newly_frozen[0] == 0
     status.newly_frozen[0] = 0
     status.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
     status.undetected[0] = wp.where(overflowed, 1, 0)
     status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
+    status.rounds[0] = status.rounds[0] + status.active[0]
     status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
 
 

@@ -20,6 +20,7 @@ __all__ = [
     "position_multiplier_after",
     "project_positions",
     "project_velocities",
+    "start_sweeps",
     "update_positions",
     "update_velocities",
     "velocity_multiplier_after",
@@ -178,6 +179,14 @@ def _finish_sweep(constraints: Constraints, progress: Progress, record: StepReco
     if is_recording(record):
         end_sweep(record, int(constraints.active_count[0]))
     constraints.active_count[0] = wp.int64(0)
+
+
+@wp.kernel(**_KERNEL)
+def start_sweeps(progress: Progress):
+    """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
+    progress.sweep.number[0] = 0
+    is_projecting = progress.status.active[0] == 0 or progress.status.iteration[0] <= progress.max_iterations
+    progress.sweep.another[0] = wp.where(is_projecting, 1, 0)
 
 
 @wp.func

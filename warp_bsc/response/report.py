@@ -129,8 +129,8 @@ class SolverReport:
 
     @property
     def rounds(self) -> int:
-        """Iterations of detection and projection or truncation in the last step; 0 without a response."""
-        return _read(self._response.status.iteration)
+        """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
+        return _read(self._response.status.rounds)
 
     @property
     def truncated(self) -> int:

@@ -70,7 +70,7 @@ def _finish_inspection(
     vertex = wp.tid()
     if vertex == 0:
         status.first_hits[0] = status.remaining[0]
-        status.iteration[0] = 0
+        status.rounds[0] = 0
     if outcome[vertex] & LOST != 0:
         status.certified[0] = 0
         if vertex < particle_count:
