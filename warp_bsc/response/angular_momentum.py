@@ -3,6 +3,8 @@
 Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
 """
 
+from typing import Any
+
 import warp as wp
 
 from .buffers import DIVIDED, Constraints, Motion, Vertices, has_final_velocity
@@ -31,6 +33,8 @@ SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
 moments, and mass by the squared change of velocity; where they begin, behind the torque; and the column that is not 0
 if a contact is with something that is not free."""
 Moments = wp.types.vector(length=11, dtype=wp.float64)
+_Torque = wp.types.vector(length=3, dtype=wp.int64)
+_Sums = wp.types.vector(length=14, dtype=wp.int64)
 
 _UNITS = wp.constant(wp.float64(2.0**32))
 """Units in one kg, m and s; sums are of integers in these units, so that they are the same in any order."""
@@ -43,8 +47,16 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.func
-def _add(sums: wp.array2d[wp.int64], world: int, place: int, x: wp.float64):
-    wp.atomic_add(sums, world, place, wp.int64(wp.rint(_UNITS * x)))
+def _units(x: wp.float64) -> wp.int64:
+    return wp.int64(wp.rint(_UNITS * x))
+
+
+@wp.func
+def _add(sums: wp.array2d[wp.int64], world: int, added: Any):
+    """Adds what a thread has summed to the sums of a world."""
+    for i in range(len(added)):
+        if added[i] != wp.int64(0):
+            wp.atomic_add(sums, world, i, added[i])
 
 
 @wp.func
@@ -84,23 +96,28 @@ def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int
 
 
 @wp.kernel(**_KERNEL)
-def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, sums: wp.array2d[wp.int64]):
+def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
 
-    For one contact they cancel; for many at once, which share vertices, they need not.
+    For one contact they cancel; for many at once, which share vertices, they need not. Each of ``threads`` threads sums
+    several contacts before it adds to the sums of their world, which all threads share.
     """
-    i = wp.tid()
-    if i >= constraints.count[0]:
-        return
-    world = motion.world[constraints.vertices[i][0]]
-    if sums[world, HELD] != wp.int64(0) or not acts(constraints, i):
-        return
-    if is_held(motion, vertices, constraints, i):
-        sums[world, HELD] = wp.int64(1)
-        return
-    added = torque_of(motion, vertices, constraints, i)
-    for axis in range(3):
-        _add(sums, world, axis, added[axis])
+    world = int(0)
+    added = _Torque()
+    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
+        own = motion.world[constraints.vertices[i][0]]
+        if own != world:
+            _add(sums, world, added)
+            added = _Torque()
+            world = own
+        if sums[world, HELD] == wp.int64(0) and acts(constraints, i):
+            if is_held(motion, vertices, constraints, i):
+                sums[world, HELD] = wp.int64(1)
+            else:
+                torque = torque_of(motion, vertices, constraints, i)
+                for axis in range(3):
+                    added[axis] += _units(torque[axis])
+    _add(sums, world, added)
 
 
 @wp.func
@@ -125,23 +142,30 @@ def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
 
 
 @wp.kernel(**_KERNEL)
-def sum_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Sums the moments of the vertices that collided, and the torques of those that were divided."""
-    vertex = wp.tid()
-    if not turns(motion, vertices, vertex):
-        return
-    world = motion.world[vertex]
-    if sums[world, HELD] != wp.int64(0):
-        return
-    added = moments(motion, vertices, vertex)
-    for i in range(MOMENTS):
-        _add(sums, world, MASS + i, added[i])
-    if vertices.outcome[vertex] & DIVIDED != 0:
-        projected = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
-        moved = to_double(vertices.x1[vertex]) - to_double(projected)
-        torque = added[0] * wp.cross(moved, to_double(motion.velocity[vertex]))
-        for axis in range(3):
-            _add(sums, world, axis, torque[axis])
+def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the vertices that collided, and the torques of those that were divided.
+
+    Threads are as in :func:`sum_torques`.
+    """
+    world = int(0)
+    added = _Sums()
+    for vertex in range(wp.tid(), particles, threads):
+        own = motion.world[vertex]
+        if own != world:
+            _add(sums, world, added)
+            added = _Sums()
+            world = own
+        if turns(motion, vertices, vertex) and sums[world, HELD] == wp.int64(0):
+            moment = moments(motion, vertices, vertex)
+            for i in range(MOMENTS):
+                added[MASS + i] += _units(moment[i])
+            if vertices.outcome[vertex] & DIVIDED != 0:
+                projected = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+                moved = to_double(vertices.x1[vertex]) - to_double(projected)
+                torque = moment[0] * wp.cross(moved, to_double(motion.velocity[vertex]))
+                for axis in range(3):
+                    added[axis] += _units(torque[axis])
+    _add(sums, world, added)
 
 
 @wp.func

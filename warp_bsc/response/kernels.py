@@ -115,7 +115,8 @@ def _collect_contact(
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
         return
-    if crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
+    may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
+    if may_cross and crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
         wp.atomic_add(progress.status.crossed_hits, 0, 1)
         return
     world = motion.world[corners[0]]

@@ -34,7 +34,7 @@ __all__ = [
 MAX_SWEEPS, SWEEPS_PER_BATCH, SWEEPS_PER_ACTIVE_SET = wp.constant(40), wp.constant(4), wp.constant(4)
 """Most sweeps over constraints, in each iteration on positions, and at the end on velocities; the sweeps after each of
 which the device checks whether a constraint is still active; and the sweeps over one active set."""
-SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 24, 16
+SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 16, 12
 """Most sweeps in worlds without fast contacts: dividing planes resolve what they leave."""
 
 _RELAXATION = wp.constant(wp.float64(1.5))

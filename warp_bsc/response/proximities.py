@@ -101,7 +101,7 @@ def _collect_proximity(
     path = longest_path(motion, corners)
     if distance == _ZERO or distance > wp.max(path, _REACH * separation):
         return
-    if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+    if progress.status.crossings[0] > 0 and crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
         return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = feasible(separation, distance, separation, path)

@@ -128,6 +128,7 @@ class Response:
         self._differentiable = differentiable
         self.worlds = max(1, mesh.model.world_count)
         self._most_blocks = _BLOCKS * device.sm_count
+        self._summing_threads = 1 if device.is_cpu else 64 * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
         self._connectivity = connectivity = Connectivity()
@@ -333,9 +334,10 @@ class Response:
         self._update_velocities()
         self._project(self._sweep_velocities, dt=dt)
         self._turn.zero_()
-        self._launch_over_constraints(sum_torques, [*inputs, self.constraints, self._turn])
-        for kernel in (sum_moments, turn_vertices):
-            self._launch_over_particles(kernel, [*inputs, self._turn])
+        threads = self._summing_threads
+        for kernel, arguments in ((sum_torques, [self.constraints]), (sum_moments, [self._movable])):
+            wp.launch(kernel, threads, inputs=[*inputs, *arguments, threads, self._turn], device=self.device)
+        self._launch_over_particles(turn_vertices, [*inputs, self._turn])
 
     def _iterate(self, dt):
         """Projects or truncates once, and detects the new motion."""
