@@ -4,97 +4,11 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
 
-DT = 1.0 / 240.0
-STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
-
-
-def semi_implicit(model):
-    """The explicit solver, without its own contacts between particles, which are far too stiff here."""
-    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
-    return newton.solvers.SolverSemiImplicit(model)
-
-
-SOLVERS = {
-    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
-    "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
-    "semi_implicit": semi_implicit,
-}
 SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
-
-
-def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
-    """A square patch of cloth, centred, in the xy plane."""
-    corner = np.subtract(at, (0.5 * n * cell, 0.5 * n * cell, 0.0))
-    sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], fixed)
-    builder.add_cloth_grid(
-        pos=wp.vec3(*corner),
-        rot=wp.quat_identity(),
-        vel=wp.vec3(*velocity),
-        dim_x=n,
-        dim_y=n,
-        cell_x=cell,
-        cell_y=cell,
-        mass=0.001,
-        **sides,
-        **STIFF,
-        **options,
-    )
-
-
-def bullet(speed, *, device, worlds=1):
-    """A patch shot at a sheet that is held at its border."""
-    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    add_patch(world, 16, 0.05, (0.0, 0.0, 0.0), fixed=True)
-    add_patch(world, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -speed))
-    builder = world
-    if worlds > 1:
-        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        builder.replicate(world, worlds)
-    builder.color()
-    return builder.finalize(device=device)
-
-
-class Rollout:
-    """Steps a solver, and asks exact detection about the motion of each step as it is stored."""
-
-    def __init__(self, model, solver):
-        self.model, self.solver = model, solver
-        self.states = model.state(), model.state()
-        self.control = model.control()
-        world = model.particle_world.numpy()
-        mesh = bsc.CollisionMesh(
-            model.tri_indices.numpy().reshape(-1, 3),
-            model.particle_count,
-            device=model.device,
-            world=world if model.world_count > 1 else None,
-        )
-        self.detector = bsc.CollisionDetector(mesh, method="exact")
-        self.collisions = 0
-
-    def step(self, dt=DT, contacts=None):
-        start, end = self.states
-        before = start.particle_q.numpy().copy()  # the inner solver may overwrite it
-        start.clear_forces()
-        self.solver.step(start, end, self.control, contacts, dt)
-        c = self.detector.detect(before, end.particle_q.numpy())
-        self.collisions += len(c.vertex_face) + len(c.edge_edge)
-        self.states = end, start
-
-    @property
-    def positions(self):
-        return self.states[0].particle_q.numpy()
-
-    @property
-    def velocities(self):
-        return self.states[0].particle_qd.numpy()
-
-    def momenta(self):
-        mass = self.model.particle_mass.numpy()[:, None].astype(float)
-        p = mass * self.velocities
-        return p.sum(axis=0), np.cross(self.positions.astype(float), p).sum(axis=0)
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
