@@ -17,8 +17,10 @@ __all__ = [
     "Rollout",
     "add_crossing_sheets",
     "add_patch",
+    "add_plates",
     "bullet",
     "crossing_sheets",
+    "place_plates",
     "status",
 ]
 
@@ -26,6 +28,7 @@ DT = 1.0 / 240.0
 """Length of a step [s]."""
 STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
 SOFT = {"tri_ke": 2e2, "tri_ka": 2e2, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
+_HALF_PLATE = 0.05
 
 
 def semi_implicit(model):
@@ -105,6 +108,30 @@ def crossing_sheets(pull, *, device):
     add_crossing_sheets(builder, pull)
     builder.color()
     return builder.finalize(device=device)
+
+
+def add_plates(builder, gap):
+    """Two kinematic plates, ``gap`` apart, with a bent patch of cloth between them."""
+    first = builder.particle_count
+    add_patch(builder, 6, 0.04, (0.0, 0.0, 0.0))
+    for particle in range(first, builder.particle_count):
+        x, y, _ = builder.particle_q[particle]
+        builder.particle_q[particle] = wp.vec3(x, y, 0.01 * float(np.sin(20.0 * x) * np.cos(17.0 * y)))
+    for height in plate_heights(gap):
+        body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity()))
+        builder.add_shape_box(body, hx=0.2, hy=0.2, hz=_HALF_PLATE)
+
+
+def place_plates(state, gap):
+    """Sets the heights of the first two bodies so that plates are ``gap`` apart."""
+    body_q = state.body_q.numpy()
+    body_q[:2, 2] = plate_heights(gap)
+    state.body_q.assign(body_q)
+
+
+def plate_heights(gap):
+    """Heights of two plates that are this far apart."""
+    return -_HALF_PLATE - 0.5 * gap, _HALF_PLATE + 0.5 * gap
 
 
 def status(solver, name):
