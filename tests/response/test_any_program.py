@@ -1,0 +1,146 @@
+"""Programs as they come: resting cloth, positions that are not finite, shapes that leave no room, and many worlds."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from newton_scenes import (
+    DT,
+    SOFT,
+    SOLVERS,
+    STIFF,
+    Changed,
+    Rollout,
+    add_patch,
+    add_plates,
+    bullet,
+    place_plates,
+    status,
+)
+
+import warp_bsc as bsc
+
+
+def check_rest(rollout, dt, steps):
+    """Asserts that cloth which comes to rest is projected in each step, and never cut or left standing."""
+    touched = 0
+    for _ in range(steps):
+        rollout.step(dt)
+        touched += rollout.solver.report.hits > 0
+    report = rollout.solver.report
+    assert (report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0)
+    assert rollout.collisions == 0 and touched > 0.1 * steps
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 24), (1.0 / 240.0, 48), (1.0 / 1920.0, 100)])
+def test_a_drape(dt, steps, device):
+    """Cloth comes to rest on a sphere."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.2, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5))
+    options = {"dim_x": 10, "dim_y": 10, "cell_x": 0.08, "cell_y": 0.08, "mass": 0.0005, **SOFT}
+    builder.add_cloth_grid(pos=wp.vec3(-0.4, -0.4, 0.2005), rot=wp.quat_identity(), vel=wp.vec3(), **options)
+    builder.color()
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverVBD(model, iterations=10)
+    check_rest(Rollout(model, bsc.SolverCCD(inner, friction=0.5)), dt, steps)
+
+
+def accordion(columns, rows, cell, gap):
+    """A strip folded into four layers: positions and faces."""
+    side, radius = 0.25 * columns * cell, 0.5 * gap
+    straight = side - np.pi * radius
+    along = cell * np.arange(columns + 1)
+    layer = np.minimum((along / side).astype(int), 3)
+    u = along - layer * side
+    turn = np.maximum(u - straight, 0.0) / radius
+    x = np.minimum(u, straight) + radius * np.sin(turn)
+    x = np.where(layer % 2 == 0, x, straight - x)
+    z = 0.02 + layer * gap + radius * (1.0 - np.cos(turn))
+    y = cell * np.arange(rows + 1)
+    positions = np.stack([np.repeat(x, rows + 1), np.tile(y, columns + 1), np.repeat(z, rows + 1)], axis=1)
+    a = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).ravel()
+    b, c, d = a + rows + 1, a + rows + 2, a + 1
+    return positions, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 12), (1.0 / 240.0, 40)])
+def test_a_fold(dt, steps, device):
+    """Four layers of one strip fall onto each other and the ground, and rest."""
+    positions, faces = accordion(32, 8, 0.01, 0.01)
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    at = {"pos": wp.vec3(), "rot": wp.quat_identity(), "scale": 1.0, "vel": wp.vec3()}
+    cloth = {"vertices": [wp.vec3(*p) for p in positions.tolist()], "indices": faces.ravel().tolist(), "density": 0.2}
+    stiffness = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-2, "edge_ke": 1e-3, "edge_kd": 1e-3}
+    builder.add_cloth_mesh(**at, **cloth, **stiffness, particle_radius=0.002)
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10)))
+    check_rest(rollout, dt, steps)
+    assert rollout.positions[:, 2].min() > 0.0
+
+
+def write_rows(array, rows, value):
+    """Sets rows of an array on a device."""
+    values = array.numpy().copy()
+    values[rows] = value
+    array.assign(values)
+
+
+@pytest.mark.parametrize("what", ["particle_q", "particle_qd"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_wanted_position_that_is_not_finite(value, what, device):
+    """Its particle stands, and the others are stopped and certified as ever."""
+    model = bullet(40.0, device=device)
+    lost = model.particle_count - 41  # in the middle of the patch that flies
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: write_rows(getattr(state, what), lost, value))))
+    hits = 0
+    for _ in range(3):
+        start = rollout.positions
+        rollout.step()
+        assert rollout.solver.report.certified and not rollout.solver.report.undetected
+        assert status(rollout.solver, "lost") == 1
+        hits += rollout.solver.report.hits
+        assert rollout.positions[lost].tobytes() == start[lost].tobytes()
+        assert (rollout.velocities[lost] == 0.0).all()
+        assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
+    moved = rollout.positions[-81:, 2] != model.particle_q.numpy()[-81:, 2]
+    assert moved.sum() == 80
+    assert rollout.collisions == 0 and hits > 50
+    assert rollout.solver.report.frozen_steps == 0
+    rollout.solver.solver.change = None
+    rollout.step()
+    assert status(rollout.solver, "lost") == 0 and rollout.solver.report.certified
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_start_position_that_is_not_finite(value, device):
+    """The step is not certified, but every collision without that particle is found and avoided."""
+    model = bullet(40.0, device=device)
+    broken = model.particle_count - 41
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    write_rows(rollout.states[0].particle_q, broken, value)
+    others = np.arange(model.particle_count) != broken
+    faces = rollout.mesh.faces[(rollout.mesh.faces != broken).all(axis=1)]
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, model.particle_count, device=device), method="exact")
+    found = avoided = 0
+    for step in range(4):
+        start, end = rollout.states
+        before = rollout.positions
+        wanted = before + np.float32(DT) * rollout.velocities
+        rollout.solver.step(start, end, None, None, DT)
+        rollout.states = end, start
+        report = rollout.solver.report
+        assert not report.certified and not report.undetected and report.uncertified_steps == step + 1
+        assert not np.isfinite(rollout.positions[broken]).any()
+        assert np.isfinite(rollout.positions[others]).all() and np.isfinite(rollout.velocities[others]).all()
+        for x1, collides in ((wanted, True), (rollout.positions, False)):
+            c = detector.detect(np.where(others[:, None], before, 0), np.where(others[:, None], x1, 0))
+            number = len(c.vertex_face) + len(c.edge_edge)
+            if collides:
+                avoided += number
+            else:
+                found += number
+    assert (found, report.frozen_steps) == (0, 0) and avoided > 100
