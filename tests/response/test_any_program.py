@@ -1,6 +1,9 @@
 """Programs as they come: resting cloth, positions that are not finite, shapes that leave no room, and many worlds."""
 
+import importlib
+
 import newton
+import newton.examples
 import numpy as np
 import pytest
 import warp as wp
@@ -9,8 +12,6 @@ from hypothesis import strategies as st
 from newton_scenes import (
     DT,
     SOFT,
-    SOLVERS,
-    STIFF,
     Changed,
     Rollout,
     add_patch,
@@ -21,6 +22,7 @@ from newton_scenes import (
 )
 
 import warp_bsc as bsc
+from warp_bsc.response.buffers import DIVIDED, PROJECTED
 
 
 def check_rest(rollout, dt, steps):
@@ -144,3 +146,136 @@ def test_a_start_position_that_is_not_finite(value, device):
             else:
                 found += number
     assert (found, report.frozen_steps) == (0, 0) and avoided > 100
+
+
+@pytest.fixture(scope="module")
+def shot(device):
+    """A rollout that tests put back to its start: a patch that flies at a sheet, and reaches it in the second step."""
+    model = bullet(20.0, device=device)
+    return Rollout(model, bsc.SolverCCD(Changed(model)))
+
+
+@settings(max_examples=12)
+@given(share=st.sampled_from([0.01, 0.2, 0.9, 1.0]), seed=st.integers(0, 10**6))
+def test_any_positions_that_are_not_finite(shot, share, seed):
+    """Each of their particles stands, and no other does for that."""
+    random = np.random.default_rng(seed)
+    lost = np.flatnonzero(random.random(shot.model.particle_count) < share)
+    values = random.choice(np.float32([np.nan, np.inf, -np.inf]), (len(lost), 3))
+    shot.solver.solver.change = lambda state: write_rows(state.particle_q, lost, values)
+    shot.states = shot.model.state(), shot.model.state()
+    shot.collisions, standing = 0, shot.solver.report.frozen_steps
+    for _ in range(3):
+        start = shot.positions
+        shot.step()
+        assert shot.solver.report.certified
+        assert status(shot.solver, "lost") == len(lost)
+        assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
+        still = (shot.positions[lost] == start[lost]).all(axis=1)
+        assert still.all() or shot.solver.report.hits  # another may push it
+    assert shot.collisions == 0 and shot.solver.report.frozen_steps == standing
+
+
+@pytest.mark.parametrize("iterations", [0, 40])
+@pytest.mark.parametrize(
+    "gaps", [(0.008, 0.004, 0.0, 0.004, 0.008, 0.03, 0.03), (0.015, 0.005, -0.005, 0.01, 0.03, 0.03)]
+)
+def test_plates_that_leave_no_room(gaps, iterations, device):
+    """Steps in which they meet are not certified; what is elsewhere does not notice, and it ends with them."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.012)
+    pressed = builder.particle_count
+    add_patch(builder, 3, 0.04, (1.0, 0.0, 0.0), velocity=(0.3, 0.2, 0.1))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
+    rollout.solver._response.max_iterations = iterations
+    certified, uncertified = [], 0
+    for next_gap in gaps:
+        gap = next_gap
+        wanted = rollout.positions + np.float32(DT) * rollout.velocities
+        collisions = rollout.collisions
+        rollout.step()
+        report = rollout.solver.report
+        certified.append(report.certified)
+        uncertified += not report.certified
+        assert report.uncertified_steps == uncertified and not report.undetected
+        assert report.certified == (report.remaining == 0)
+        assert rollout.collisions - collisions <= report.remaining
+        assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
+        assert rollout.positions[pressed:].tobytes() == wanted[pressed:].tobytes()
+    assert certified[:2] == [True, True] and not certified[2]
+    assert certified[-2:] == [True, True]
+
+
+@pytest.mark.parametrize("trouble", ["crossing", "lost", "broken", "divided"])
+def test_worlds_do_not_notice_each_other(trouble, device):
+    """What crosses, is lost or is divided in one world changes no bit of another."""
+    ends = []
+    for calm in (True, False):
+        model = bullet(20.0, device=device, worlds=3)
+        middle = np.arange(model.particle_count // 3, 2 * model.particle_count // 3)
+        patch = middle[-81:]
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+        response = rollout.solver._response
+        response.max_iterations = 2  # as many as the other worlds need
+        state = rollout.states[0]
+        if calm:
+            write_rows(state.particle_qd, patch, 0.0)
+        elif trouble == "crossing":
+            x = state.particle_q.numpy()[patch]
+            write_rows(state.particle_q, patch, x + x[:, :1] * np.float32([0.0, 0.0, 1.0]) - np.float32([0, 0, 0.1007]))
+        elif trouble == "lost":
+            rollout.solver.solver.change = lambda state, rows=patch[::2]: write_rows(state.particle_q, rows, np.nan)
+        elif trouble == "broken":
+            write_rows(state.particle_q, patch[40], np.nan)
+        else:
+            random = np.random.default_rng(0).standard_normal((81, 3))
+            write_rows(state.particle_qd, patch, random * (20.0, 20.0, 60.0) - (0.0, 0.0, 100.0))
+        bits, troubled, hits = [], False, 0
+        for _ in range(6):
+            start, end = rollout.states
+            rollout.solver.step(start, end, None, None, DT)
+            rollout.states = end, start
+            bits.append(np.delete(np.concatenate([rollout.positions, rollout.velocities], axis=1), middle, axis=0))
+            hits += rollout.solver.report.hits
+            outcome = response.vertices.outcome.numpy()
+            assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
+            troubled |= {
+                "crossing": status(rollout.solver, "crossings") > 0 and status(rollout.solver, "excluded") > 0,
+                "lost": status(rollout.solver, "lost") > 0,
+                "broken": not rollout.solver.report.certified,
+                "divided": bool((outcome & int(DIVIDED)).any()),
+            }[trouble]
+        assert troubled == (not calm) and hits > 100
+        ends.append(np.stack(bits).tobytes())
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.slow
+def test_the_rollers_of_newton(device, monkeypatch):
+    """Its example as it is, in its own graph, with fewer iterations: a frame is certified, and the cloth moves."""
+    make, stages = newton.solvers.SolverVBD, []
+
+    def make_staged(*arguments, **options):
+        stages.append(bsc.SolverCCD(make(*arguments, **{**options, "iterations": 2})))
+        return stages[0]
+
+    monkeypatch.setattr(newton.solvers, "SolverVBD", make_staged)
+    module = importlib.import_module("newton.examples.cloth.example_cloth_rollers")
+    options = newton.examples.create_parser().parse_args(["--viewer", "null"])
+    example = module.Example(newton.viewer.ViewerNull(num_frames=1), options)
+    start = example.state_0.particle_q.numpy().copy()
+    example.step()
+    report = stages[0].report
+    assert (report.steps, report.uncertified_steps, report.frozen_steps) == (example.sim_substeps, 0, 0)
+    end = example.state_0.particle_q.numpy()
+    moved = np.linalg.norm(end - start, axis=1)
+    print(
+        moved[: example.num_cloth_verts].max(),
+        (moved[: example.num_cloth_verts] > 1e-3).sum(),
+        report,
+        status(stages[0], "crossings"),
+    )
+    assert (moved[: example.num_cloth_verts] > 1e-3).sum() > 100
+    assert moved[example.num_cloth_verts :].min() > 0.5
