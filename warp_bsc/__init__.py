@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .replay.intervals import replay
     from .response.captured_steps import CapturedSteps
     from .response.report import SolverReport
-    from .response.solver_ccd import SolverCCD
+    from .response.solver_ccd import CollisionMonitor, SolverCCD
     from .usd.scene import Scene
 
 _MODULES = {
@@ -45,6 +45,7 @@ _MODULES = {
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
+    "CollisionMonitor": "response.solver_ccd",
     "Collisions": "detection.collisions",
     "DetectionStats": "detection.collisions",
     "QueryResult": "detection.query",
@@ -63,6 +64,7 @@ __all__ = [
     "CollisionArrays",
     "CollisionDetector",
     "CollisionMesh",
+    "CollisionMonitor",
     "Collisions",
     "DetectionStats",
     "QueryResult",

@@ -5,7 +5,7 @@ Only in worlds in which everything that collided is free: elsewhere angular mome
 
 import warp as wp
 
-from .buffers import PROJECTED, Constraints, Motion, Vertices
+from .buffers import TRUNCATED, Constraints, Motion, Vertices
 from .constraints import relative, to_double, to_single
 
 __all__ = [
@@ -49,7 +49,7 @@ def _add(sums: wp.array2d[wp.int64], world: int, place: int, x: wp.float64):
 @wp.func
 def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
     """Returns whether a vertex collided, and is free to turn."""
-    return motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] == PROJECTED
+    return motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] < TRUNCATED and vertices.outcome[vertex] != 0
 
 
 @wp.func

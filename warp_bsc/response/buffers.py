@@ -86,7 +86,8 @@ class SolveStatus:
 
     active: wp.array[int]  # 1 while another iteration is needed
     unfinished: wp.array[int]  # 1 if the first detection leaves something to do
-    iteration: wp.array[int]  # iterations of detect and project so far
+    iteration: wp.array[int]  # iterations of detect and project so far; from max_iterations on, all worlds divide
+    rounds: wp.array[int]  # iterations of detect and project or divide so far
     certified: wp.array[int]  # 1 if the last detection was complete and found no contact
     hits: wp.array[int]  # contacts found so far by the detection in progress
     crossed_hits: wp.array[int]  # of elements that crossed at the start, found so far by the detection in progress
@@ -97,6 +98,7 @@ class SolveStatus:
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
     crossings: wp.array[int]  # edges that cross faces at the start
+    projecting: wp.array[int]  # 1 if the last detection added constraints
     recount: wp.array[int]  # 1 if crossings may have changed since they were counted
     truncated: wp.array[int]  # 1 if a path was cut
     frozen: wp.array[int]  # 1 if a vertex was frozen
@@ -118,8 +120,10 @@ class Progress:
     status: SolveStatus
     sweep: SweepStatus
     max_iterations: int  # of detect and project; after them vertices are divided, or their paths truncated
+    max_slow_iterations: int  # of these in worlds without fast contacts, see constraints.is_dividing
     max_truncations: int  # iterations of that; after them vertices are frozen
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
+    fast: wp.array[int]  # of each world, 1 if the wanted motion has a contact of fast elements
 
 
 def allocate_vertices(count, device) -> Vertices:

@@ -1,4 +1,4 @@
-"""Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
+"""Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,12 +13,16 @@ __all__ = ["CapturedSteps"]
 
 
 class CapturedSteps:
-    """Runs a function that steps a solver, on a GPU from a CUDA graph.
+    """Runs a function that steps a solver on a tape, on a GPU from a CUDA graph.
 
-    In a graph, the buffers of a :class:`.solver_ccd.SolverCCD` cannot grow. A step that needs larger ones freezes all
-    particles or loses its gradients, and the report counts it. Such a run is taken back: the state and the totals of
-    the report become those before it, the function runs outside the graph, where buffers grow, and is captured anew.
-    So is the first run. Other solvers have nothing to take back, and on the CPU the function runs as it is.
+    The record of a step, from which its gradients come, has buffers that cannot grow in a graph. A step on a tape that
+    needs larger ones freezes all particles or loses its gradients, and the report counts it. Such a run is taken back:
+    the state and the totals of the report become those before it, the function runs outside the graph, where buffers
+    grow, and is captured anew. So is the first run. Other solvers have nothing to take back, and on the CPU the
+    function runs as it is.
+
+    Without a tape no step of a :class:`.solver_ccd.SolverCCD` needs this: it completes detections for which a graph is
+    too small, and any graph will do. Such steps may run here as well, and none is taken back.
 
     Example::
 

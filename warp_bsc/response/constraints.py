@@ -11,9 +11,12 @@ __all__ = [
     "EDGE_EDGE_PROXIMITY",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
+    "MAX_SLOW_ITERATIONS",
     "MAX_TRUNCATIONS",
+    "NO_CONSTRAINT",
     "PLANE_CONTACT",
     "TIME_UNITS",
+    "TOUCH",
     "VERTEX_FACE_CONTACT",
     "VERTEX_FACE_PROXIMITY",
     "Contacts",
@@ -25,6 +28,7 @@ __all__ = [
     "feasible",
     "feasible_in_contact",
     "gap",
+    "is_dividing",
     "is_excluded",
     "is_projecting",
     "is_slow",
@@ -39,6 +43,9 @@ __all__ = [
 
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which the paths of vertices that still collide are truncated."""
+MAX_SLOW_ITERATIONS = 1
+"""Iterations of detect and project in worlds whose contacts are all of slow elements. Vertices that then still collide
+are divided, which hardly moves them, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.dividing_planes`."""
 MAX_TRUNCATIONS = wp.constant(8)
@@ -49,6 +56,10 @@ VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, PLANE_CONTACT, VERTEX_FACE_PROXIMITY, ED
 )
 """Kinds of constraints: contacts of a vertex and a face, of two edges, of a vertex and a plane; proximities of both."""
 
+NO_CONSTRAINT = wp.constant(3)
+"""In place of the kind of a contact that has no constraint, in the key of a vertex's first contact."""
+TOUCH = wp.constant(wp.float64(1e-100))
+"""Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities."""
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
 _SHARE = wp.constant(wp.float64(0.9))
@@ -98,10 +109,18 @@ def to_single(x: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
+def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
+    """Returns whether contacts found after ``iteration`` iterations are divided, or truncated, and not projected."""
+    if iteration >= progress.max_iterations:
+        return True
+    return iteration >= progress.max_slow_iterations and progress.fast[world] == 0
+
+
+@wp.func
 def is_projecting(progress: Progress, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
     iteration = progress.status.iteration[0]
-    return iteration <= progress.max_iterations and progress.contact_iteration[world] == iteration - 1
+    return progress.contact_iteration[world] == iteration - 1 and not is_dividing(progress, world, iteration - 1)
 
 
 @wp.func
@@ -254,8 +273,9 @@ def add_constraint(
     kind: int,
     localized: bool,
     toi: wp.float64,
+    multiplier: wp.vec3d,
 ):
-    """Adds a constraint with multipliers of zero if it fits; counts it in any case."""
+    """Adds a constraint with a position multiplier if it fits; counts it in any case."""
     i = wp.atomic_add(constraints.count, 0, 1)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = corners
@@ -268,7 +288,7 @@ def add_constraint(
         constraints.localized[i] = localized
         constraints.toi[i] = toi
         constraints.approach[i] = approach_of(motion, vertices, corners, weights, normal, separation)
-        constraints.position_multiplier[i] = wp.vec3d()
+        constraints.position_multiplier[i] = multiplier
         constraints.velocity_multiplier[i] = wp.vec3d()
         constraints.previous_multiplier[i] = wp.vec3d()
         constraints.last_sweep[i] = -2

@@ -20,7 +20,7 @@ _PASSES = wp.constant(32)
 """Passes over the planes of a vertex, each projecting onto all of them in turn."""
 _MARGIN = wp.constant(wp.float64(0.25))
 """Least distance of a plane from the elements at the start, as a share of their distance."""
-_ROUNDING = wp.constant(wp.float64(0.05))
+_ROUNDING = wp.constant(wp.float64(0.2))
 """Distance from a plane that vertices are projected to, as a share of the elements' distance: room for rounding."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))

@@ -8,8 +8,10 @@ from ..kernels.signs import FREE
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
+    NO_CONSTRAINT,
     PLANE_CONTACT,
     TIME_UNITS,
+    TOUCH,
     VERTEX_FACE_CONTACT,
     Contacts,
     add_constraint,
@@ -17,6 +19,7 @@ from .constraints import (
     contact_weights,
     count_contact,
     feasible_in_contact,
+    is_dividing,
     is_slow,
     to_double,
     to_single,
@@ -73,10 +76,13 @@ def begin_step(
         status.truncated[0] = 0
         status.frozen[0] = 0
         status.lost[0] = 0
+        status.projecting[0] = 0
+        status.rounds[0] = 0
         constraints.count[0] = 0
         dividing.count[0] = 0
     if i < worlds:
         progress.contact_iteration[i] = -1
+        progress.fast[i] = 0
     if i >= vertices.x1.shape[0]:
         return
     for axis in range(3):
@@ -113,37 +119,46 @@ def _collect_contact(
     if crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
         wp.atomic_add(progress.status.crossed_hits, 0, 1)
         return
-    count_contact(progress, motion.world[corners[0]])
+    world = motion.world[corners[0]]
+    count_contact(progress, world)
     for j in range(4):
         vertices.changed[corners[j]] = 1
-    if progress.status.iteration[0] < progress.max_iterations:
-        friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
-        weights = contact_weights(contacts.edges, contacts.coordinates[i])
-        normal = contacts.normal[i]
-        target = widened(separation, progress)
-        slow = is_slow(motion, corners, contacts.edges)
-        if slow == 1:
-            target = feasible_in_contact(motion, corners, weights, normal, target, separation)
-        kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
-        add_constraint(
-            motion,
-            vertices,
-            constraints,
-            corners,
-            weights,
-            normal,
-            target,
-            friction,
-            slow,
-            kind,
-            contacts.localized[i],
-            contacts.toi[i],
-        )
-    else:
-        if dividing.first:
-            add_dividing_planes(motion, vertices, corners, contacts.edges, dividing)
+    iteration = progress.status.iteration[0]
+    slow = is_slow(motion, corners, contacts.edges)
+    if iteration == 0 and slow == 0:
+        progress.fast[world] = 1
+    multiplier = wp.vec3d()
+    normal = contacts.normal[i]
+    if is_dividing(progress, world, iteration):
         for j in range(4):
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
+        if not dividing.first:
+            return
+        add_dividing_planes(motion, vertices, corners, contacts.edges, dividing)
+        multiplier = TOUCH * normal
+    else:
+        progress.status.projecting[0] = 1
+    friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
+    weights = contact_weights(contacts.edges, contacts.coordinates[i])
+    target = widened(separation, progress)
+    if slow == 1:
+        target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+    kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
+    add_constraint(
+        motion,
+        vertices,
+        constraints,
+        corners,
+        weights,
+        normal,
+        target,
+        friction,
+        slow,
+        kind,
+        contacts.localized[i],
+        contacts.toi[i],
+        multiplier,
+    )
 
 
 @wp.kernel(**_KERNEL)
@@ -222,6 +237,7 @@ def decide(
     status.undetected[0] = wp.where(overflowed, 1, 0)
     status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
+    status.rounds[0] = status.rounds[0] + status.active[0]
     status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
 
 
@@ -281,7 +297,8 @@ def truncate_vertices(
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
     if cuts and dividing.first[vertex] >= 0:
         end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
-        vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
+        if truncated or int(key & wp.int64(3)) == NO_CONSTRAINT:
+            vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, TRUNCATED, DIVIDED)

@@ -3,7 +3,16 @@
 import warp as wp
 
 from .buffers import Constraints, Motion, Progress, Vertices
-from .constraints import PLANE_CONTACT, add_constraint, count_contact, to_double, update_first_contact, widened
+from .constraints import (
+    PLANE_CONTACT,
+    TOUCH,
+    add_constraint,
+    count_contact,
+    is_dividing,
+    to_double,
+    update_first_contact,
+    widened,
+)
 from .dividing_planes import DividingPlanes, add_plane
 
 __all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transformed_plane"]
@@ -98,26 +107,30 @@ def collect_penetrations(
         else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
-        if progress.status.iteration[0] < progress.max_iterations:
-            plane = planes.end[i]
-            add_constraint(
-                motion,
-                vertices,
-                constraints,
-                wp.vec4i(vertex),
-                wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
-                wp.vec3d(plane[0], plane[1], plane[2]),
-                plane[3] + widened(separation, progress),
-                wp.sqrt(motion.friction[vertex] * planes.friction[i]),
-                1,
-                PLANE_CONTACT,
-                True,
-                _ZERO,
-            )
-        else:
-            if dividing.first:
-                plane = planes.end[i]
-                normal = wp.vec3d(plane[0], plane[1], plane[2])
-                margin = _MARGIN * separation
-                add_plane(dividing, vertex, normal, plane[3] + wp.min(wp.float64(2.0) * error_after, margin), margin)
+        plane = planes.end[i]
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        multiplier = wp.vec3d()
+        if is_dividing(progress, world, progress.status.iteration[0]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)
+            if not dividing.first:
+                continue
+            margin = _MARGIN * separation
+            add_plane(dividing, vertex, normal, plane[3] + wp.min(wp.float64(2.0) * error_after, margin), margin)
+            multiplier = TOUCH * normal
+        else:
+            progress.status.projecting[0] = 1
+        add_constraint(
+            motion,
+            vertices,
+            constraints,
+            wp.vec4i(vertex),
+            wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
+            normal,
+            plane[3] + widened(separation, progress),
+            wp.sqrt(motion.friction[vertex] * planes.friction[i]),
+            1,
+            PLANE_CONTACT,
+            True,
+            _ZERO,
+            multiplier,
+        )

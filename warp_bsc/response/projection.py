@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
-from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices
+from .buffers import PROJECTED, TRUNCATED, Constraints, Motion, Progress, Vertices
 from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
@@ -20,6 +20,7 @@ __all__ = [
     "position_multiplier_after",
     "project_positions",
     "project_velocities",
+    "start_sweeps",
     "update_positions",
     "update_velocities",
     "velocity_multiplier_after",
@@ -178,6 +179,15 @@ def _finish_sweep(constraints: Constraints, progress: Progress, record: StepReco
     if is_recording(record):
         end_sweep(record, int(constraints.active_count[0]))
     constraints.active_count[0] = wp.int64(0)
+
+
+@wp.kernel(**_KERNEL)
+def start_sweeps(progress: Progress):
+    """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
+    progress.sweep.number[0] = 0
+    status = progress.status
+    progress.sweep.another[0] = wp.where(status.active[0] == 0 or status.projecting[0] == 1, 1, 0)
+    status.projecting[0] = 0
 
 
 @wp.func
@@ -385,5 +395,5 @@ def update_velocities(
     if vertices.active[vertex] == 0:
         return
     vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] <= PROJECTED:
+    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] < TRUNCATED:
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)

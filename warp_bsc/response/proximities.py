@@ -107,7 +107,21 @@ def _collect_proximity(
     target = feasible(separation, distance, separation, path)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     normal = between / distance
-    add_constraint(motion, vertices, constraints, corners, weights, normal, target, friction, 1, kind, True, _ZERO)
+    add_constraint(
+        motion,
+        vertices,
+        constraints,
+        corners,
+        weights,
+        normal,
+        target,
+        friction,
+        1,
+        kind,
+        True,
+        _ZERO,
+        wp.vec3d(),
+    )
 
 
 @wp.kernel(**_KERNEL)

@@ -20,7 +20,7 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
-from .constraints import count_contact, update_first_contact
+from .constraints import NO_CONSTRAINT, count_contact, update_first_contact
 from .dividing_planes import DividingPlanes, add_dividing_planes
 from .exclusion import Connectivity, crossed_at_start, is_movable
 
@@ -83,7 +83,7 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
     add_dividing_planes(motion, arguments.vertices, corners, edges, arguments.dividing)
     for j in range(4):
         arguments.vertices.changed[corners[j]] = 1
-        update_first_contact(arguments.vertices, corners[j], result.toi, edges, 0)
+        update_first_contact(arguments.vertices, corners[j], result.toi, NO_CONSTRAINT, 0)
 
 
 @wp.func

@@ -28,11 +28,16 @@ class StepTotals:
 
 
 class SolverReport:
-    """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device."""
+    """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
-    def __init__(self, motion: ModelMotion, response: Response):
-        """Reports on the steps in which a response resolves a motion."""
-        self._motion, self._response = motion, response
+    Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver wanted is the motion
+    that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
+    or frozen.
+    """
+
+    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True):
+        """Reports on the steps in which a response resolves a motion, or only inspects it."""
+        self._motion, self._response, self._responds = motion, response, responds
         self._totals_values = wp.zeros(len(StepTotals.vars), dtype=int, device=response.device)
         self._totals = name_elements(StepTotals, self._totals_values)
         self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
@@ -40,36 +45,96 @@ class SolverReport:
 
     @property
     def certified(self) -> bool:
-        """Whether a complete detection found the motion of the last step, as stored, to be free of collisions."""
+        """Whether a complete detection found the motion of the last step, as stored, to be free of collisions.
+
+        Contacts that :attr:`excluded` counts, and contacts of which no vertex can be moved, are not part of this. A
+        step with a start position that is not finite is not certified; without a response, neither is one with such an
+        end. :attr:`uncertified_vertices` lists the particles concerned.
+        """
         return bool(_read(self._response.status.certified))
 
     @property
     def hits(self) -> int:
-        """Contacts of the motion that the inner solver wanted in the last step."""
+        """Contacts of the motion that the inner solver wanted in the last step, without those excluded.
+
+        A lower bound if the stage responds and the queues of a CUDA graph were too small for all of them.
+        """
         return _read(self._response.status.first_hits)
 
     @property
     def remaining(self) -> int:
-        """Contacts of the last step that could not be resolved, because kinematic vertices leave no room."""
+        """Contacts that the motion of the last step has as it is stored.
+
+        With a response, they could not be resolved, because kinematic vertices leave no room.
+        """
         return _read(self._response.status.remaining)
+
+    @property
+    def excluded(self) -> int:
+        """Contacts of the motion of the last step that were left to the inner solver.
+
+        Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
+        """
+        return _read(self._response.status.excluded)
+
+    @property
+    def crossings(self) -> int:
+        """Edges that cross faces at the start of the last step, pair by pair, as far as a vertex of theirs can move.
+
+        Only pairs that floating point certifies to cross count; :attr:`intersections` lists all of them. In a CUDA
+        graph the number is a lower bound if there are more candidates than its queues hold.
+        """
+        return _read(self._response.status.crossings)
+
+    @property
+    def lost(self) -> int:
+        """Particles whose position or velocity was not finite after the inner solver in the last step.
+
+        They stood where they were at the start. Without a response they are left as the inner solver made them.
+        """
+        return _read(self._response.status.lost)
+
+    @property
+    def uncertified_vertices(self) -> np.ndarray:
+        """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
+
+        They are the particles of contacts that remain, and those of elements with a start position that is not finite.
+        Without a response, a position or velocity that is not finite at the end counts as well. If :attr:`undetected`
+        is true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
+        nothing but the position of a body is not finite. Gathered on the host, on each access.
+        """
+        particles = self._mesh.model.particle_count
+        if self.certified:
+            return np.empty(0, dtype=np.int32)
+        if self.undetected:
+            return np.arange(particles, dtype=np.int32)
+        vertices = self._response.vertices
+        listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
+        x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
+        invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
+        if not self._responds:
+            invalid |= self._motion.vertices.is_lost.numpy() != 0
+        faces = self._mesh.faces
+        listed[faces[invalid[faces].any(axis=1)]] = True
+        return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
 
     @property
     def undetected(self) -> bool:
         """Whether the last step froze all vertices because its detection was incomplete.
 
-        Positions were not finite, or the buffers of a CUDA graph were too small, see
-        :class:`.captured_steps.CapturedSteps`.
+        This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
+        :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
         """
         return bool(_read(self._response.status.undetected))
 
     @property
     def rounds(self) -> int:
-        """Iterations of detection and projection or truncation in the last step."""
-        return _read(self._response.status.iteration)
+        """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
+        return _read(self._response.status.rounds)
 
     @property
     def truncated(self) -> int:
-        """Vertices whose paths were truncated before a contact in the last step."""
+        """Vertices whose paths were truncated in the last step, so that they stay on their side of a contact."""
         return self._count_vertices(TRUNCATED)
 
     @property
@@ -79,13 +144,15 @@ class SolverReport:
 
     @property
     def intersections(self) -> np.ndarray:
-        """Edges and faces of the solver's ``mesh`` that cross at the start of the last step, int32, shape [n, 2].
+        """Edges and faces of the solver's ``mesh`` that meet at the start of the last step, int32, shape [n, 2].
 
-        The stage does not separate what crosses already. Shapes that cross each other are excluded. Computed on each
-        access, in exact arithmetic.
+        Pairs of rigid shapes are left out, those of kinematic particles are not. Touching counts. Computed on each
+        access, in exact arithmetic; :attr:`crossings` is a number that costs less.
+
+        Raises:
+            ValueError: If a position at the start is not finite.
         """
-        mesh = self._response.detector.mesh
-        assert isinstance(mesh, ModelMesh)
+        mesh = self._mesh
         particles = mesh.model.particle_count
         pairs = find_intersections(mesh, self._motion.vertices.x0)
         of_particles = [elements.min(axis=1) < particles for elements in (mesh.edges, mesh.faces)]
@@ -117,6 +184,11 @@ class SolverReport:
         return _read(self._totals.undetected_steps)
 
     @property
+    def lost_steps(self) -> int:
+        """Steps so far with positions or velocities of particles that were not finite, see :attr:`lost`."""
+        return _read(self._totals.lost_steps)
+
+    @property
     def truncated_steps(self) -> int:
         """Steps so far in which a path was truncated."""
         return _read(self._totals.truncated_steps)
@@ -144,14 +216,24 @@ class SolverReport:
         return _read(self._totals.lost_gradients)
 
     def __str__(self) -> str:
-        """Returns the steps so far, in one line."""
+        """Returns the steps so far, in one line, and what crosses at the start of the last."""
         line = (
             f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
             f"left standing, {self.uncertified_steps} not certified"
         )
+        if self.crossings:
+            line += f", {self.crossings} crossings at the start"
+        if self.lost_steps:
+            line += f", {self.lost_steps} steps with positions that are not finite"
         if self.grazing or self.lost_gradients:
             line += f"; gradients: {self.grazing} grazing contacts, {self.lost_gradients} steps lost"
         return line
+
+    @property
+    def _mesh(self):
+        mesh = self._response.detector.mesh
+        assert isinstance(mesh, ModelMesh)
+        return mesh
 
     def _count_vertices(self, bit):
         return int(np.count_nonzero(self._response.vertices.outcome.numpy() & int(bit)))

@@ -21,7 +21,7 @@ from .buffers import (
     allocate_constraints,
     allocate_vertices,
 )
-from .constraints import MAX_DIVISIONS, MAX_ITERATIONS, MAX_TRUNCATIONS, Contacts
+from .constraints import MAX_DIVISIONS, MAX_ITERATIONS, MAX_SLOW_ITERATIONS, MAX_TRUNCATIONS, Contacts
 from .dividing_planes import DividingPlanes, allocate_dividing_planes
 from .exclusion import Connectivity, count_crossings
 from .kernels import (
@@ -44,6 +44,7 @@ from .projection import (
     initialize_velocity_multipliers,
     project_positions,
     project_velocities,
+    start_sweeps,
     update_positions,
     update_velocities,
 )
@@ -127,12 +128,13 @@ class Response:
         connectivity.vertex_edges, connectivity.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
         self._status_values = wp.zeros(len(SolveStatus.vars), dtype=int, device=device)
         self.status = name_elements(SolveStatus, self._status_values)
-        self._sweep_values = wp.zeros(len(SweepStatus.vars), dtype=int, device=device)
-        self._sweep = name_elements(SweepStatus, self._sweep_values)
+        sweep_values = wp.zeros(len(SweepStatus.vars), dtype=int, device=device)
+        self._sweep = name_elements(SweepStatus, sweep_values)
         self._progress = progress = Progress()
         progress.status, progress.sweep = self.status, self._sweep
         progress.max_iterations = MAX_ITERATIONS
-        progress.contact_iteration = wp.zeros(self.worlds, dtype=int, device=device)
+        for name in ("contact_iteration", "fast"):
+            setattr(progress, name, wp.zeros(self.worlds, dtype=int, device=device))
         self._motion: ModelMotion  # of the step that is being resolved
         self._recorder: StepRecorder | None = None
         self._turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
@@ -201,6 +203,7 @@ class Response:
         self._motion, self._recorder = motion, recorder
         self._record = StepRecord()  # which records nothing
         self._dividing = self._dividing_planes if recorder is None else DividingPlanes()
+        self._progress.max_slow_iterations = MAX_SLOW_ITERATIONS if recorder is None else MAX_ITERATIONS
         self._progress.max_truncations = MAX_DIVISIONS if recorder is None else int(MAX_TRUNCATIONS)
         if recorder is not None:
             if not self.device.is_capturing:
@@ -293,7 +296,7 @@ class Response:
         self._launch_over_particles(update_velocities, inputs)
 
     def _project(self, sweep, **options):
-        """Sweeps until no constraint is active, or MAX_SWEEPS times."""
+        """Sweeps until no constraint is active, or MAX_SWEEPS times; not at all if vertices are to be divided."""
 
         def batch():
             self._reserve_entries(SWEEPS_PER_BATCH)
@@ -310,8 +313,7 @@ class Response:
             self._record = self._recorder.reserve_entries(entries)
 
     def _start_sweeps(self):
-        self._sweep_values.zero_()
-        self._sweep.another.fill_(1)
+        wp.launch(start_sweeps, 1, inputs=[self._progress], device=self.device)
 
     def _change_velocities(self, dt):
         """Solves the velocity constraints of all contacts that moved a vertex."""

@@ -1,4 +1,4 @@
-"""The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
+"""The collision stage for Newton: a solver that wraps another one, and checks its motion or makes it collision-free."""
 
 import contextlib
 import time
@@ -17,7 +17,7 @@ from .report import SolverReport, StepTotals
 from .response import MAX_SWEEPS_PER_STEP, Response
 from .step_record import RecordCounts, StepRecorder
 
-__all__ = ["SolverCCD"]
+__all__ = ["CollisionMonitor", "SolverCCD"]
 
 _SEPARATION = 5e-3
 """Default distance that contacts are moved apart, as a share of the median edge length."""
@@ -40,6 +40,10 @@ def _write_back(
 ):
     """Writes the particles that the response changed; the others keep every bit of what they are."""
     particle = wp.tid()
+    if particle >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
+        if outcome[particle] & LOST != 0:
+            status.certified[0] = 0
+        return
     if outcome[particle] != 0:
         particle_q[particle] = x1[particle]
         particle_qd[particle] = velocity[particle]
@@ -49,6 +53,28 @@ def _write_back(
         status.frozen[0] = 1
     if outcome[particle] & LOST != 0:
         wp.atomic_add(status.lost, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def _finish_inspection(
+    # in
+    outcome: wp.array[int],
+    particle_count: int,
+    # out
+    status: SolveStatus,
+):
+    """Makes the status of an inspection that of a step in which nothing was changed.
+
+    The inspection took vertices without a finite end to stand. Their motion as it is stored is not certified.
+    """
+    vertex = wp.tid()
+    if vertex == 0:
+        status.first_hits[0] = status.remaining[0]
+        status.rounds[0] = 0
+    if outcome[vertex] & LOST != 0:
+        status.certified[0] = 0
+        if vertex < particle_count:
+            wp.atomic_add(status.lost, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -92,6 +118,14 @@ class SolverCCD(SolverBase):
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
     particles. All other attributes are those of the inner solver.
 
+    Elements that cross or touch at the start of a step, and vertices that begin in the solid of an infinite plane, are
+    left to the inner solver. So are contacts of which no vertex can be moved. Everything else is certified. A particle
+    whose wanted position or velocity is not finite stays where it was. A position at the start that is not finite
+    leaves the step uncertified, without its elements.
+
+    With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
+    tape then records what the inner solver records.
+
     A step on a :class:`warp.Tape` carries gradients, if the model was finalized with ``requires_grad=True`` and the
     inner solver is differentiable: from positions and velocities of particles at its end to those at its start, and to
     those that the inner solver wanted. The set of contacts and the motion of bodies are constants; everything else is
@@ -100,6 +134,7 @@ class SolverCCD(SolverBase):
 
     Attributes:
         solver: The inner solver.
+        respond: Whether the stage responds to collisions, or only reports them.
         mesh: The triangles that collide, :class:`ModelMesh`.
         report: What the stage found and did, :class:`.report.SolverReport`.
     """
@@ -111,6 +146,7 @@ class SolverCCD(SolverBase):
         separation: float | None = None,
         friction: float | None = None,
         restitution: float | None = None,
+        respond: bool = True,
     ):
         """Puts the stage behind a solver.
 
@@ -121,9 +157,12 @@ class SolverCCD(SolverBase):
                 material, contacts the geometric mean.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``.
+            respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
+                velocity; the three numbers then have no meaning, and must not be given.
 
         Raises:
-            ValueError: If a number or the friction of a shape that collides with particles is out of range.
+            ValueError: If a number or the friction of a shape that collides with particles is out of range, or a number
+                is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
         """
         self.solver = solver
@@ -132,28 +171,23 @@ class SolverCCD(SolverBase):
         self.supports_collision_pipeline = solver.supports_collision_pipeline
         self.supports_body_pair_reduced_contacts = solver.supports_body_pair_reduced_contacts
         model = solver.model
+        self.respond = respond
+        if not respond:
+            for name, value in (("separation", separation), ("friction", friction), ("restitution", restitution)):
+                if value is not None:
+                    raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
         friction = model.particle_mu if friction is None else friction
         restitution = model.soft_contact_restitution if restitution is None else restitution
-        if not 0.0 <= friction <= float(np.finfo(np.float32).max):
+        if respond and not 0.0 <= friction <= float(np.finfo(np.float32).max):
             raise ValueError(f"friction must be at least 0, and finite in single precision, not {friction!r}")
-        if not 0.0 <= restitution <= 1.0:
+        if respond and not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
         self.mesh = mesh = ModelMesh(model)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
-        shape_friction = np.zeros(0) if model.shape_material_mu is None else model.shape_material_mu.numpy()
-        for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
-            if not shape_friction[shape] >= 0.0:
-                raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {shape_friction[shape]}")
-        vertex_friction = np.full(mesh.vertex_count, friction, dtype=np.float32)
-        vertex_friction[model.particle_count :] = shape_friction[mesh.shape_vertices.shape]
-        self._motion = ModelMotion(
-            mesh,
-            wp.array(vertex_friction, dtype=float, device=mesh.device),
-            wp.array(shape_friction[mesh.planes.shape], dtype=float, device=mesh.device),
-        )
+        self._motion = ModelMotion(mesh, *self._friction(friction))
         self._response = Response(
             mesh,
             separation=float(separation),
@@ -163,8 +197,27 @@ class SolverCCD(SolverBase):
         self._motion.set_start(model.particle_q, model.body_q)
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
         self._response.prepare(self._motion)
+        self._recount_crossings()
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self.report = SolverReport(self._motion, self._response)
+        self.report = SolverReport(self._motion, self._response, responds=respond)
+
+    def _friction(self, friction):
+        """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
+        model, mesh = self.model, self.mesh
+        shape_friction = np.zeros(model.shape_count)
+        if self.respond and model.shape_material_mu is not None:
+            shape_friction = model.shape_material_mu.numpy()
+        for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
+            if not shape_friction[shape] >= 0.0:
+                raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {shape_friction[shape]}")
+        vertex_friction = np.full(mesh.vertex_count, friction if self.respond else 0.0, dtype=np.float32)
+        vertex_friction[model.particle_count :] = shape_friction[mesh.shape_vertices.shape]
+        coefficients = vertex_friction, shape_friction[mesh.planes.shape]
+        return [wp.array(values, dtype=float, device=mesh.device) for values in coefficients]
+
+    def _recount_crossings(self):
+        """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
+        self._response.status.recount.fill_(1)
 
     def _median_edge(self):
         """Returns the median edge length of cloth and soft bodies at rest [m]; 1 if they have no edges."""
@@ -185,6 +238,8 @@ class SolverCCD(SolverBase):
     ) -> None:
         """Steps the inner solver, and changes positions and velocities of particles whose motion collides.
 
+        Changes nothing after the inner solver if :attr:`respond` is False.
+
         Args:
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same.
@@ -194,16 +249,32 @@ class SolverCCD(SolverBase):
             options: As for the inner solver.
 
         Raises:
-            ValueError: If a tape records gradients, and both states are the same.
+            ValueError: If a tape records gradients of the response, and both states are the same.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
         """
         with _paused_tape() as tape:
-            if tape is not None and state_in is state_out and self.model.requires_grad:
+            if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
             self._motion.set_start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with _paused_tape() as tape:
-            self._respond(state_in, state_out, dt, tape)
+            if self.respond:
+                self._respond(state_in, state_out, dt, tape)
+            else:
+                arrays = state_out.particle_q, state_out.particle_qd, state_out.body_q
+                run_on_host(lambda: self._inspect(*arrays, dt), self.mesh.device)
+
+    def _inspect(self, particle_q, particle_qd, body_q, dt):
+        """Detects the collisions of the motion from the start of the step to these positions, and counts the step."""
+        with self._timed():
+            self._motion.set_end(particle_q, particle_qd, body_q, dt)
+            resolution = self._response.inspect(self._motion)
+            inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
+            self._launch(_finish_inspection, self.mesh.vertex_count, inputs, outputs)
+            self._launch(_count_step, 1, [resolution.status], [self.report._totals])
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def _respond(self, state_in, state_out, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
@@ -222,7 +293,7 @@ class SolverCCD(SolverBase):
             if device.is_capturing or resolution.vertices.outcome.numpy().any():
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
                 inputs, outputs = [self._recorder.record.counts, recorded.complete], [self.report._totals]
-                wp.launch(_count_record, 1, inputs=inputs, outputs=outputs, device=device)
+                self._launch(_count_record, 1, inputs, outputs)
 
         def backward():
             if recorded is not None:
@@ -233,15 +304,14 @@ class SolverCCD(SolverBase):
 
     def _resolve(self, particle_q, particle_qd, body_q, dt, record=None):
         """Resolves the motion from the start of the step to these positions, and changes them."""
-        device, totals = self.mesh.device, self.report._totals
         with self._timed():
             self._motion.set_end(particle_q, particle_qd, body_q, dt)
             resolution = self._response.resolve(self._motion, dt, record)
             vertices = resolution.vertices
             inputs = [vertices.outcome, vertices.x1, vertices.velocity]
             outputs = [particle_q, particle_qd, resolution.status]
-            wp.launch(_write_back, self.model.particle_count, inputs=inputs, outputs=outputs, device=device)
-            wp.launch(_count_step, 1, inputs=[resolution.status], outputs=[totals], device=device)
+            self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
+            self._launch(_count_step, 1, [resolution.status], [self.report._totals])
         return resolution
 
     @contextlib.contextmanager
@@ -265,6 +335,7 @@ class SolverCCD(SolverBase):
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         self.solver.notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+        self._recount_crossings()
 
     @property
     def contacts(self):
@@ -315,3 +386,24 @@ class SolverCCD(SolverBase):
         if name == "solver":
             raise AttributeError(name)
         return getattr(self.solver, name)
+
+
+class CollisionMonitor(SolverCCD):
+    """Lets another solver step, and reports the collisions of its motion; changes no bit of its results.
+
+    The plain name of ``SolverCCD(solver, respond=False)``, and nothing more. Each step costs one detection. The
+    certificate is that of :class:`SolverCCD`: a certified step is free of collisions, except for those of elements that
+    crossed or touched at its start. The :attr:`report` counts a contact among its ``hits`` in the step that passes it.
+    Elements that cross from then on are counted in ``crossings``, and their contacts as ``excluded``.
+    """
+
+    def __init__(self, solver: SolverBase):
+        """Puts the monitor behind a solver.
+
+        Args:
+            solver: Any Newton solver that moves particles.
+
+        Raises:
+            NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
+        """
+        super().__init__(solver, respond=False)
