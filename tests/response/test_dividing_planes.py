@@ -8,9 +8,10 @@ import pytest
 import warp as wp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
+from newton_scenes import SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
 
 import warp_bsc as bsc
+from warp_bsc.response.buffers import DIVIDED
 from warp_bsc.response.dividing_planes import DividingPlanes, add_plane, allocate_dividing_planes, position_on_sides
 
 
@@ -48,11 +49,7 @@ def test_a_bullet(speed, iterations, device):
         assert rollout.solver.report.certified
         assert rollout.solver.report.rounds <= iterations + 33
         paths, wanted_paths = (np.linalg.norm(x.astype(float) - start, axis=1) for x in (rollout.positions, *wanted))
-        if iterations == 0:
-            assert (paths <= wanted_paths + 1e-6).all()
-            moved = rollout.positions != wanted[0]
-            speeds = np.linalg.norm(rollout.velocities[moved.any(axis=1)], axis=1)
-            np.testing.assert_allclose(speeds, paths[moved.any(axis=1)] / DT, rtol=1e-3, atol=1e-3)
+        assert iterations > 0 or (paths <= wanted_paths + 1e-6).all()
     assert rollout.collisions == 0 and hits > 50
     assert rollout.solver.report.frozen_steps == 0
 
@@ -77,6 +74,26 @@ def test_a_tilted_bullet(iterations, device):
     assert rollout.solver.report.frozen_steps == 0
     if iterations == 0:
         assert rollout.velocities[-81:, 0].mean() > 1.0
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_linear_momentum_is_kept(iterations, device):
+    """Free patches that meet off centre change velocities by as much on either side."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.5, 0.0, 3.0))
+    add_patch(builder, 6, 0.05, (0.09, 0.07, 0.05), velocity=(0.0, -0.5, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    rollout.solver._response.max_iterations = iterations
+    before, velocities, divided = rollout.momenta()[0], rollout.velocities, 0
+    for _ in range(6):
+        rollout.step()
+        divided += np.count_nonzero(rollout.solver._response.vertices.outcome.numpy() & int(DIVIDED))
+        assert rollout.solver.report.truncated == rollout.solver.report.frozen == 0
+    assert np.linalg.norm(rollout.momenta()[0] - before) < 1e-5 * np.linalg.norm(before)
+    assert rollout.collisions == 0 and np.abs(rollout.velocities - velocities).max() > 1.0
+    assert divided > 0 or iterations > 0
 
 
 @pytest.mark.parametrize("iterations", [0, 1])

@@ -301,72 +301,54 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
     assert captured.solver.report.uncertified_steps == 0
 
 
-def test_positions_that_are_not_finite_leave_everything_standing(device):
-    model = bullet(10.0, device=device)
-
-    class Diverging(newton.solvers.SolverXPBD):
-        def step(self, state_in, state_out, *arguments, **options):
-            super().step(state_in, state_out, *arguments, **options)
-            q = state_out.particle_q.numpy()
-            q[-1] = np.nan
-            state_out.particle_q.assign(q)
-
-    solver = bsc.SolverCCD(Diverging(model))
-    start, end = model.state(), model.state()
-    solver.step(start, end, model.control(), None, DT)
-    assert not solver.report.certified and solver.report.undetected and solver.report.uncertified_steps == 1
-    np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
-    assert (end.particle_qd.numpy() == 0.0).all()
-
-
 def leave_capacity_for_one_contact(detector):
     """Makes a detection whose buffers cannot grow overflow as soon as two vertex-face contacts are found."""
     detector.vertex_face._allocate_contacts(1)
     detector.capacities = detector._device_capacities()
 
 
-def test_a_graph_without_room_stands_still_and_says_so(device):
+def test_a_graph_without_room_is_certified_too(device):
+    """Captured before anything touches, with room for one contact, it stops the patch all the same."""
     if not device.is_cuda or not wp.is_conditional_graph_supported():
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
-    response = rollout.solver._response
-    leave_capacity_for_one_contact(response.detector)
+    leave_capacity_for_one_contact(rollout.solver._response.detector)
     start, end = rollout.states
     with wp.ScopedCapture(device) as capture:
+        start.clear_forces()
         rollout.solver.step(start, end, rollout.control, None, DT)
+    hits = 0
     for _ in range(8):
+        before = rollout.vertices(start)
         wp.capture_launch(capture.graph)
+        assert rollout.count_collisions(before, rollout.vertices(end)) == 0
+        report = rollout.solver.report
+        assert report.certified and not report.undetected
+        hits += report.hits
         wp.copy(start.particle_q, end.particle_q)
         wp.copy(start.particle_qd, end.particle_qd)
-        if rollout.solver.report.undetected:
-            break
-    report = rollout.solver.report
-    assert report.undetected and not report.certified
-    np.testing.assert_array_equal(end.particle_q.numpy(), rollout.solver._motion.vertices.x0.numpy())
+    assert hits > 100
 
 
-def test_captured_steps_make_the_room_that_a_graph_lacks(device):
+def test_captured_steps_retake_nothing_that_a_graph_completes(device):
+    """Without a tape, a graph without room is certified, and none of its runs is taken back."""
     if not device.is_cuda or not wp.is_conditional_graph_supported():
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
-    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for _ in range(2))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
 
-    def frame(rollout):
+    def frame():
         for start, end in (rollout.states, rollout.states[::-1]):
             start.clear_forces()
             rollout.solver.step(start, end, rollout.control, None, DT)
 
-    steps = bsc.CapturedSteps(lambda: frame(captured), captured.solver, [captured.states[0]])
+    steps = bsc.CapturedSteps(frame, rollout.solver, [rollout.states[0]])
     steps()
-    leave_capacity_for_one_contact(captured.solver._response.detector)
+    leave_capacity_for_one_contact(rollout.solver._response.detector)
     steps._capture()
-    frame(plain)
     for _ in range(5):
-        frame(plain)
         steps()
-        assert plain.positions.tobytes() == captured.positions.tobytes()
-        assert plain.velocities.tobytes() == captured.velocities.tobytes()
-    assert steps.retaken > 0
-    report = captured.solver.report
-    assert (report.steps, report.undetected_steps, report.uncertified_steps) == (12, 0, 0)
+        assert len(rollout.detector.find_intersections(rollout.positions)) == 0
+    report = rollout.solver.report
+    assert (steps.retaken, report.steps, report.undetected_steps, report.uncertified_steps) == (0, 12, 0, 0)
