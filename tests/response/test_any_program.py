@@ -125,7 +125,11 @@ def test_a_start_position_that_is_not_finite(value, device):
     rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
     write_rows(rollout.states[0].particle_q, broken, value)
     others = np.arange(model.particle_count) != broken
-    faces = rollout.mesh.faces[(rollout.mesh.faces != broken).all(axis=1)]
+    faces = rollout.mesh.faces
+    without = [broken]
+    if device.is_cuda:  # whose broad phase drops what the faces of the particle represent as well
+        without = faces[(faces == broken).any(axis=1)]
+    faces = faces[~np.isin(faces, without).any(axis=1)]
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, model.particle_count, device=device), method="exact")
     found = avoided = 0
     for step in range(4):
