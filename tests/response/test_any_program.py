@@ -212,6 +212,45 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
     assert certified[-2:] == [True, True]
 
 
+def test_shapes_may_pass_through_each_other(device):
+    """What nothing can resolve is no part of the certificate."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.01)
+    cloth = [wp.vec3(1.0 + x, y, z) for x, y, z in builder.particle_q]
+    builder.particle_q = cloth
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
+    for next_gap in (0.002, -0.01, -0.02, 0.01):
+        gap = next_gap
+        rollout.step()
+        report = rollout.solver.report
+        assert (report.certified, report.hits, report.remaining) == (True, 0, 0)
+        assert status(rollout.solver, "crossings") == 0
+    np.testing.assert_array_equal(rollout.positions, np.float32(cloth))
+
+
+def test_vertices_that_start_in_the_solid_of_a_plane(device):
+    """They rise as they want to, and those above do not enter."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    for height, speed in ((-0.02, 2.0), (0.02, -2.0)):
+        add_patch(builder, 4, 0.05, (height * 30.0, 0.0, height), velocity=(0.0, 0.0, speed))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    below, excluded = rollout.positions[:, 2] < 0.0, 0
+    for _ in range(5):
+        wanted = rollout.positions + np.float32(DT) * rollout.velocities
+        rollout.step()
+        assert rollout.solver.report.certified and rollout.solver.report.frozen == 0
+        assert rollout.positions[below].tobytes() == wanted[below].tobytes()
+        assert rollout.positions[~below, 2].min() > 0.0
+        excluded += status(rollout.solver, "excluded")
+    assert excluded == 2 * below.sum()  # in two steps they also end there
+    assert rollout.positions[below, 2].min() > 0.0
+
+
 @pytest.mark.parametrize("trouble", ["crossing", "lost", "broken", "divided"])
 def test_worlds_do_not_notice_each_other(trouble, device):
     """What crosses, is lost or is divided in one world changes no bit of another."""
