@@ -163,7 +163,6 @@ class Response:
         """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
         self.resolve(motion, 1.0)
         self._status_values.zero_()
-        self.status.recount.fill_(1)
         self.vertices.outcome.zero_()
 
     def resolve(self, motion: ModelMotion, dt: float, record: StepRecorder | None = None) -> Resolution:
