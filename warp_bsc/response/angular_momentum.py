@@ -5,8 +5,9 @@ Only in worlds in which everything that collided is free: elsewhere angular mome
 
 import warp as wp
 
-from .buffers import TRUNCATED, Constraints, Motion, Vertices
+from .buffers import DIVIDED, Constraints, Motion, Vertices, has_final_velocity
 from .constraints import relative, to_double, to_single
+from .projection import with_delta
 
 __all__ = [
     "HELD",
@@ -49,7 +50,8 @@ def _add(sums: wp.array2d[wp.int64], world: int, place: int, x: wp.float64):
 @wp.func
 def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
     """Returns whether a vertex collided, and is free to turn."""
-    return motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] < TRUNCATED and vertices.outcome[vertex] != 0
+    outcome = vertices.outcome[vertex]
+    return motion.inverse_mass[vertex] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
 
 
 @wp.func
@@ -124,7 +126,7 @@ def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
 
 @wp.kernel(**_KERNEL)
 def sum_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Sums the moments of the vertices that collided."""
+    """Sums the moments of the vertices that collided, and the torques of those that were divided."""
     vertex = wp.tid()
     if not turns(motion, vertices, vertex):
         return
@@ -134,6 +136,12 @@ def sum_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
     added = moments(motion, vertices, vertex)
     for i in range(MOMENTS):
         _add(sums, world, MASS + i, added[i])
+    if vertices.outcome[vertex] & DIVIDED != 0:
+        projected = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+        moved = to_double(vertices.x1[vertex]) - to_double(projected)
+        torque = added[0] * wp.cross(moved, to_double(motion.velocity[vertex]))
+        for axis in range(3):
+            _add(sums, world, axis, torque[axis])
 
 
 @wp.func

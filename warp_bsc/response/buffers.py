@@ -9,6 +9,7 @@ __all__ = [
     "NEVER",
     "PROJECTED",
     "TRUNCATED",
+    "UNCONSTRAINED",
     "Constraints",
     "Motion",
     "Progress",
@@ -17,11 +18,12 @@ __all__ = [
     "Vertices",
     "allocate_constraints",
     "allocate_vertices",
+    "has_final_velocity",
 ]
 
-PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST = (wp.constant(bit) for bit in (1, 2, 4, 8, 16))
-"""Bits of the outcome of a vertex: constraints moved it, a dividing plane did, its path was cut, it was left where it
-was, it was left there because its wanted position was not finite."""
+PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
+"""Bits of the outcome of a vertex: constraints moved it, dividing planes did, its path was cut, it was left where it
+was, it was left there because its wanted position was not finite, it was divided from contacts without constraints."""
 
 NEVER = wp.constant(wp.int64(2**62))
 """The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
@@ -121,9 +123,18 @@ class Progress:
     sweep: SweepStatus
     max_iterations: int  # of detect and project; after them vertices are divided, or their paths truncated
     max_slow_iterations: int  # of these in worlds without fast contacts, see constraints.is_dividing
+    slow_position_sweeps: int  # most sweeps on positions in these worlds
+    slow_velocity_sweeps: int  # most sweeps on velocities in these worlds
     max_truncations: int  # iterations of that; after them vertices are frozen
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     fast: wp.array[int]  # of each world, 1 if the wanted motion has a contact of fast elements
+
+
+@wp.func
+def has_final_velocity(outcome: int) -> bool:
+    """Returns whether the velocity of a vertex follows from its path, and constraints do not change it."""
+    cut = outcome & (DIVIDED | TRUNCATED) == TRUNCATED
+    return cut or outcome & (FROZEN | LOST | UNCONSTRAINED) != 0
 
 
 def allocate_vertices(count, device) -> Vertices:

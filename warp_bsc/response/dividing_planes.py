@@ -16,7 +16,7 @@ from .proximities import closest_vector
 __all__ = ["DividingPlanes", "add_dividing_planes", "add_plane", "allocate_dividing_planes", "position_on_sides"]
 
 _NONE = wp.constant(-1)
-_PASSES = wp.constant(32)
+_PASSES = wp.constant(256)
 """Passes over the planes of a vertex, each projecting onto all of them in turn."""
 _MARGIN = wp.constant(wp.float64(0.25))
 """Least distance of a plane from the elements at the start, as a share of their distance."""

@@ -5,7 +5,7 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
-from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, Constraints, Motion, Progress, Vertices
+from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
     NO_CONSTRAINT,
@@ -295,13 +295,18 @@ def truncate_vertices(
             _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
         else:
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
-    if cuts and dividing.first[vertex] >= 0:
+    divides = bool(False)
+    if dividing.first:
+        divides = cuts and dividing.first[vertex] >= 0
+    if divides:
         end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
-        if truncated or int(key & wp.int64(3)) == NO_CONSTRAINT:
+        outcome = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+        if int(key & wp.int64(3)) == NO_CONSTRAINT:
             vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
+            outcome = outcome | UNCONSTRAINED
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
-        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, TRUNCATED, DIVIDED)
+        vertices.outcome[vertex] = outcome
     elif cuts:
         x0 = to_double(motion.x0[vertex])
         path = truncated_path(x0, to_double(vertices.x1[vertex]), time)

@@ -3,12 +3,15 @@
 import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
-from .buffers import PROJECTED, TRUNCATED, Constraints, Motion, Progress, Vertices
+from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_final_velocity
 from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
     "MAX_SWEEPS",
+    "SLOW_POSITION_SWEEPS",
+    "SLOW_VELOCITY_SWEEPS",
+    "SWEEPS_PER_ACTIVE_SET",
     "SWEEPS_PER_BATCH",
     "activate_position_constraints",
     "activate_velocity_constraints",
@@ -28,9 +31,11 @@ __all__ = [
     "with_momentum",
 ]
 
-MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(8)
-"""Most sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps after each
-of which the device checks whether a constraint is still active."""
+MAX_SWEEPS, SWEEPS_PER_BATCH, SWEEPS_PER_ACTIVE_SET = wp.constant(40), wp.constant(4), wp.constant(4)
+"""Most sweeps over constraints, in each iteration on positions, and at the end on velocities; the sweeps after each of
+which the device checks whether a constraint is still active; and the sweeps over one active set."""
+SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 24, 16
+"""Most sweeps in worlds without fast contacts: dividing planes resolve what they leave."""
 
 _RELAXATION = wp.constant(wp.float64(1.5))
 """Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
@@ -153,12 +158,18 @@ def _activate(vertices: Vertices, constraints: Constraints, i: int):
 
 
 @wp.func
-def _momentum(constraints: Constraints, progress: Progress, i: int) -> wp.float64:
+def _max_sweeps(progress: Progress, world: int, slow: int) -> int:
+    """Returns the most sweeps in a world, which are ``slow`` where it has no fast contacts."""
+    return wp.where(progress.fast[world] == 1, MAX_SWEEPS, slow)
+
+
+@wp.func
+def _momentum(constraints: Constraints, progress: Progress, i: int, max_sweeps: int) -> wp.float64:
     """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
     sweep = progress.sweep.number[0]
     last = constraints.last_sweep[i]
     constraints.last_sweep[i] = sweep
-    if last != sweep - 1 or sweep == MAX_SWEEPS - 1:
+    if last != sweep - 1 or sweep == max_sweeps - 1:
         return _ZERO
     return wp.float64(sweep) / wp.float64(sweep + 3)
 
@@ -170,15 +181,16 @@ def with_momentum(multiplier: wp.vec3d, previous: wp.vec3d, momentum: wp.float64
 
 
 @wp.func
-def _finish_sweep(constraints: Constraints, progress: Progress, record: StepRecord):
-    """Empties the active set, and decides whether another batch of sweeps is needed."""
+def _finish_sweep(constraints: Constraints, progress: Progress, record: StepRecord, last: bool):
+    """Counts a sweep; after the last over an active set, empties it, and decides whether another batch is needed."""
     sweep = progress.sweep.number[0] + 1
     active = constraints.active_count[0] > wp.int64(0)
     progress.sweep.number[0] = sweep
     progress.sweep.another[0] = wp.where(active and sweep < MAX_SWEEPS, 1, 0)
     if is_recording(record):
         end_sweep(record, int(constraints.active_count[0]))
-    constraints.active_count[0] = wp.int64(0)
+    if last:
+        constraints.active_count[0] = wp.int64(0)
 
 
 @wp.kernel(**_KERNEL)
@@ -206,7 +218,11 @@ def activate_position_constraints(
     Constraints met within the tolerance cost nothing, and move nothing.
     """
     i = wp.tid()
-    if i >= constraints.count[0] or not is_projecting(progress, motion.world[constraints.vertices[i][0]]):
+    if i >= constraints.count[0]:
+        return
+    world = motion.world[constraints.vertices[i][0]]
+    past = progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_position_sweeps)
+    if past or not is_projecting(progress, world):
         return
     distance = gap(vertices, constraints, i)
     if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
@@ -233,6 +249,8 @@ def position_multiplier_after(
     if inverse_mass <= _ZERO:
         return old
     excess = gap(vertices, constraints, i)
+    if pushes_only and excess >= _ZERO:
+        return old
     path = _path(motion, vertices, constraints, i)
     friction = wp.float64(constraints.friction[i])
     return _multiplier_after(old, constraints.normal[i], excess, path, inverse_mass, friction)
@@ -268,9 +286,12 @@ def project_positions(
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(constraints, progress, i)
-    momentum = _momentum(constraints, progress, i)
+    world = motion.world[constraints.vertices[i][0]]
+    max_sweeps = _max_sweeps(progress, world, progress.slow_position_sweeps)
+    momentum = _momentum(constraints, progress, i, max_sweeps)
     if pushes_only:
-        momentum = wp.min(momentum, _PUSHING_MOMENTUM)
+        violated = gap(vertices, constraints, i) < _ZERO
+        momentum = wp.where(violated, wp.min(momentum, _PUSHING_MOMENTUM), _ZERO)
     old = constraints.position_multiplier[i]
     if is_recording(record):
         record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
@@ -283,15 +304,16 @@ def project_positions(
 
 @wp.kernel(**_KERNEL)
 def update_positions(
-    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord, last: bool
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_sweep(constraints, progress, record)
+        _finish_sweep(constraints, progress, record, last)
     if vertices.active[vertex] == 0:
         return
-    vertices.active[vertex] = 0
+    if last:
+        vertices.active[vertex] = 0
     if motion.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
@@ -333,6 +355,7 @@ def activate_velocity_constraints(
     motion: Motion,
     vertices: Vertices,
     constraints: Constraints,
+    progress: Progress,
     restitution: wp.float64,
     tolerance: wp.float64,
     dt: wp.float64,
@@ -340,6 +363,9 @@ def activate_velocity_constraints(
     """Fills the active set for velocities: constraints that pushed, whose contact points are still near each other."""
     i = wp.tid()
     if i >= constraints.count[0]:
+        return
+    world = motion.world[constraints.vertices[i][0]]
+    if progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == _ZERO:
@@ -373,7 +399,9 @@ def project_velocities(
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    momentum = _momentum(constraints, progress, i)
+    world = motion.world[constraints.vertices[i][0]]
+    max_sweeps = _max_sweeps(progress, world, progress.slow_velocity_sweeps)
+    momentum = _momentum(constraints, progress, i, max_sweeps)
     old = constraints.velocity_multiplier[i]
     if is_recording(record):
         record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
@@ -386,14 +414,15 @@ def project_velocities(
 
 @wp.kernel(**_KERNEL)
 def update_velocities(
-    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord
+    motion: Motion, vertices: Vertices, constraints: Constraints, progress: Progress, record: StepRecord, last: bool
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
     if vertex == 0:
-        _finish_sweep(constraints, progress, record)
+        _finish_sweep(constraints, progress, record, last)
     if vertices.active[vertex] == 0:
         return
-    vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] < TRUNCATED:
+    if last:
+        vertices.active[vertex] = 0
+    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)

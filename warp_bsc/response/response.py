@@ -38,6 +38,9 @@ from .model_motion import ModelMotion
 from .planes import collect_penetrations
 from .projection import (
     MAX_SWEEPS,
+    SLOW_POSITION_SWEEPS,
+    SLOW_VELOCITY_SWEEPS,
+    SWEEPS_PER_ACTIVE_SET,
     SWEEPS_PER_BATCH,
     activate_position_constraints,
     activate_velocity_constraints,
@@ -61,9 +64,11 @@ _MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
 _PAIRS_PER_FACE = 32
 """Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow."""
+_TOLERANCE = 0.1
+"""Tolerance of constraints as a share of the separation."""
 _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
-_DIVIDING_PLANES = 16
+_DIVIDING_PLANES = 32
 """Capacity for dividing planes, for each particle."""
 _ITERATIONS_RESERVED = 2
 """Iterations for whose contacts constraints are reserved."""
@@ -106,19 +111,21 @@ class Response:
         device: The device.
     """
 
-    def __init__(self, mesh: ModelMesh, *, separation: float, restitution: float, tolerance: float):
+    def __init__(self, mesh: ModelMesh, *, separation: float, restitution: float, differentiable: bool):
         """Allocates buffers.
 
         Args:
             mesh: The mesh.
             separation: Distance that projection moves contacts apart [m].
             restitution: Share of the approaching velocity that comes back, in [0, 1].
-            tolerance: Tolerance of constraints, as a share of the separation.
+            differentiable: Whether all sweeps are made and paths are truncated, not divided, as the adjoint has it:
+                whether a constraint is active would otherwise depend on tiny changes, and results would jump.
         """
         self.device = device = mesh.device
         self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
         self.separation, self.restitution = separation, restitution
-        self._tolerance = tolerance * separation
+        self._tolerance = 0.0 if differentiable else _TOLERANCE * separation
+        self._differentiable = differentiable
         self.worlds = max(1, mesh.model.world_count)
         self._most_blocks = _BLOCKS * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
@@ -144,9 +151,13 @@ class Response:
         self._kept = wp.zeros(1, dtype=int, device=device)
         self._crossing_candidates = CrossingCandidates(mesh)
         self._dividing_planes = allocate_dividing_planes(
-            mesh.vertex_count, _DIVIDING_PLANES * self._movable + 1024, device
+            mesh.vertex_count, _DIVIDING_PLANES * self._movable + 8192, device
         )
-        self._dividing: DividingPlanes  # none in a step that is recorded, as the adjoint has no such planes
+        self._dividing = DividingPlanes() if differentiable else self._dividing_planes
+        progress.max_slow_iterations = MAX_ITERATIONS if differentiable else MAX_SLOW_ITERATIONS
+        progress.slow_position_sweeps = int(MAX_SWEEPS) if differentiable else SLOW_POSITION_SWEEPS
+        progress.slow_velocity_sweeps = int(MAX_SWEEPS) if differentiable else SLOW_VELOCITY_SWEEPS
+        progress.max_truncations = int(MAX_TRUNCATIONS) if differentiable else MAX_DIVISIONS
         self.constraints = allocate_constraints(0, device)
         self._retired = []
 
@@ -201,9 +212,6 @@ class Response:
         """Initializes everything for a step, and counts crossings at its start."""
         self._motion, self._recorder = motion, recorder
         self._record = StepRecord()  # which records nothing
-        self._dividing = self._dividing_planes if recorder is None else DividingPlanes()
-        self._progress.max_slow_iterations = MAX_SLOW_ITERATIONS if recorder is None else MAX_ITERATIONS
-        self._progress.max_truncations = MAX_DIVISIONS if recorder is None else int(MAX_TRUNCATIONS)
         if recorder is not None:
             if not self.device.is_capturing:
                 recorder.reserve_entries(_MIN_ENTRIES)
@@ -272,26 +280,29 @@ class Response:
                 record_offsets, 1, inputs=[self.constraints, self._progress, self._record, after], device=self.device
             )
 
-    def _sweep_positions(self):
-        """Sweeps over the constraints on positions once."""
+    def _sweep_positions(self, first=True, last=True):
+        """Sweeps over the constraints on positions once; the first sweep fills the active set, the last empties it."""
         constraints = self.constraints
         inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
-        self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
+        if first:
+            self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
-        self._launch_over_particles(update_positions, inputs)
+        self._launch_over_particles(update_positions, [*inputs, last])
 
-    def _sweep_velocities(self, dt):
-        """Sweeps over the constraints on velocities once."""
+    def _sweep_velocities(self, dt, first=True, last=True):
+        """Sweeps over the constraints on velocities once, like :meth:`_sweep_positions`."""
         constraints = self.constraints
-        inputs = [self._motion.vertices, self.vertices, constraints]
-        self._launch_over_constraints(activate_velocity_constraints, [*inputs, self.restitution, self._tolerance, dt])
-        inputs = [*inputs, self._progress, self._record, self.restitution]
+        inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
+        if first:
+            options = [self.restitution, self._tolerance, dt]
+            self._launch_over_constraints(activate_velocity_constraints, [*inputs, *options])
+        inputs = [*inputs, self._record, self.restitution]
         self._launch_over(project_velocities, [(constraints.active_set, constraints.active_count, 0)], inputs)
-        self._update_velocities()
+        self._update_velocities(last)
 
-    def _update_velocities(self):
-        inputs = [self._motion.vertices, self.vertices, self.constraints, self._progress, self._record]
+    def _update_velocities(self, last=True):
+        inputs = [self._motion.vertices, self.vertices, self.constraints, self._progress, self._record, last]
         self._launch_over_particles(update_velocities, inputs)
 
     def _project(self, sweep, **options):
@@ -299,8 +310,9 @@ class Response:
 
         def batch():
             self._reserve_entries(SWEEPS_PER_BATCH)
-            for _ in range(SWEEPS_PER_BATCH):
-                sweep(**options)
+            for i in range(SWEEPS_PER_BATCH):
+                place = i % int(SWEEPS_PER_ACTIVE_SET)
+                sweep(first=place == 0, last=place == int(SWEEPS_PER_ACTIVE_SET) - 1, **options)
 
         self._start_sweeps()
         wp.capture_while(self._sweep.another, batch)
@@ -366,7 +378,7 @@ class Response:
     @property
     def _can_search(self):
         """Whether detections can do without queues; on the CPU these grow, and the adjoint needs what is in them."""
-        return self._recorder is None and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
+        return not self._differentiable and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
 
     def _decide(self):
         counts, capacities = self.detector.counters.array, self.detector.capacities
@@ -376,6 +388,7 @@ class Response:
     def _search(self):
         """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
         broad_phase, motion = self.detector.broad_phase, self._motion.vertices
+        assert isinstance(broad_phase, BroadPhaseHierarchy)
         broad_phase.fit(motion.x0, self.vertices.x1)
         find_contacts_without_queues(
             broad_phase, self._connectivity, motion, self.vertices, self._dividing, self._progress

@@ -22,10 +22,6 @@ __all__ = ["CollisionMonitor", "SolverCCD"]
 _SEPARATION = 5e-3
 """Default distance that contacts are moved apart, as a share of the median edge length."""
 
-_TOLERANCE = 0.1
-"""Tolerance of constraints as a share of the separation. With gradients it is 0, so that all sweeps are made: whether a
-constraint is active would otherwise depend on tiny changes, and results would jump."""
-
 
 @wp.kernel(enable_backward=False)
 def _write_back(
@@ -192,7 +188,7 @@ class SolverCCD(SolverBase):
             mesh,
             separation=float(separation),
             restitution=float(restitution),
-            tolerance=0.0 if model.requires_grad else _TOLERANCE,
+            differentiable=model.requires_grad,
         )
         self._motion.set_start(model.particle_q, model.body_q)
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
