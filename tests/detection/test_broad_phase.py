@@ -211,3 +211,32 @@ def test_positions_that_are_not_finite_are_counted(dtype):
         finder = BroadPhaseHierarchy(mesh, counts[0], not_finite=counts[1], checked=checked)
         finder.fit(*(wp.array(x, dtype=dtype, device=device) for x in (x0, x1)))
         assert counts[1].numpy()[0] == expected
+
+
+_MISSING = pytest.mark.xfail(
+    strict=True, reason="vertices and edges have no pairs either if the face that represents them has none"
+)
+
+
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, pytest.param(BroadPhaseHierarchy, marks=_MISSING)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("at_end", [False, True])
+def test_elements_without_finite_positions_have_no_pairs(broad_phase, dtype, at_end):
+    """All pairs of other elements are found."""
+    random = np.random.default_rng(1)
+    x0, x1, faces = crumpled(1, 12)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    x0, x1 = x0.astype(dtype), x1.astype(dtype)
+    _, everything = all_pairs(mesh, x0, x1)
+    broken = random.random(len(x0)) < 0.05
+    values = random.choice(np.array([np.nan, np.inf, -np.inf], dtype=dtype), (len(x0), 3))
+    some = broken[:, None] & (random.random((len(x0), 3)) < 0.5)
+    some[broken, 0] |= ~some[broken].any(axis=1)
+    wrong = [np.where(some & (at_end == bool(i)), values, x) for i, x in enumerate((x0, x1))]
+    _, found = find_pairs(broad_phase, mesh, *wrong)
+    of_faces, of_edges, of_vertices = broken[faces].any(axis=1), broken[mesh.edges].any(axis=1), broken
+    kinds = [(of_vertices, of_faces, True), (of_edges, of_edges, True), (of_edges, of_faces, not at_end)]
+    for pairs, expected, (first, second, moves) in zip(found, everything, kinds, strict=True):
+        left = [(a, b) for a, b in expected if not (moves and (first[a] or second[b]))]
+        assert pairs == left
+        assert left and (len(left) < len(expected) or not moves)

@@ -179,13 +179,13 @@ class DetectionPipeline:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.
 
         Returns:
-            Whether the run is to be repeated. Where a position was not finite no run can be right, and nothing grows.
+            Whether the run is to be repeated. Where a position was not finite, its elements have no pairs.
 
         Raises:
             ValueError: If a buffer cannot be large enough.
         """
         counts = self.counts = self.counters.read()
-        if counts.not_finite or not self.overflows(counts):
+        if not self.overflows(counts):
             return False
         self.generation += 1
         if self._captured:

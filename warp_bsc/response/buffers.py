@@ -94,6 +94,7 @@ class SolveStatus:
     hits: wp.array[int]  # contacts found so far by the detection in progress
     crossed_hits: wp.array[int]  # of elements that crossed at the start, found so far by the detection in progress
     first_hits: wp.array[int]  # contacts of the wanted motion
+    counted: wp.array[int]  # 1 once they are all counted
     remaining: wp.array[int]  # contacts that the last detection found
     excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze

@@ -139,20 +139,32 @@ def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
 
 
 @wp.func
+def _precedes(a: wp.vec3d, b: wp.vec3d) -> bool:
+    """Returns whether a vector comes before another by their first coordinates that differ."""
+    if a[0] != b[0]:
+        return a[0] < b[0]
+    if a[1] != b[1]:
+        return a[1] < b[1]
+    return a[2] < b[2]
+
+
+@wp.func
 def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
     """Returns a position projected a few times onto the plane that it is farthest below, whatever their order."""
     passes = int(0)
     while passes < _PASSES:
         most = _ZERO
-        step = wp.vec3d()
+        farthest = wp.vec3d()
         plane = planes.first[vertex]
         while plane >= 0:
-            missing = planes.offset[plane] - wp.dot(planes.normal[plane], x) + planes.margin[plane]
-            if missing > planes.margin[plane] and missing > most:
-                most = missing
-                step = missing * planes.normal[plane]
+            normal = planes.normal[plane]
+            missing = planes.offset[plane] - wp.dot(normal, x) + planes.margin[plane]
+            if missing > planes.margin[plane] and missing >= most:
+                if missing > most or _precedes(normal, farthest):
+                    most = missing
+                    farthest = normal
             plane = planes.next[plane]
-        x += step
+        x += most * farthest
         passes = wp.where(most == _ZERO, _PASSES, passes + 1)
     return x
 

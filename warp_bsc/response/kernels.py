@@ -68,6 +68,7 @@ def begin_step(
         status.hits[0] = 0
         status.crossed_hits[0] = 0
         status.first_hits[0] = 0
+        status.counted[0] = 0
         status.remaining[0] = 0
         status.excluded[0] = 0
         status.newly_frozen[0] = 0
@@ -218,8 +219,6 @@ def decide(
         overflowed = overflowed or counts[i] > capacities[i]
     if can_search and overflowed and status.undetected[0] == 0:
         status.undetected[0] = 1
-        if status.iteration[0] == 0:
-            status.first_hits[0] = status.first_hits[0] + status.hits[0]
         status.hits[0] = 0
         status.crossed_hits[0] = 0
         status.iteration[0] = wp.max(status.iteration[0], progress.max_iterations)
@@ -230,8 +229,9 @@ def decide(
     status.remaining[0] = hits
     status.excluded[0] = status.crossed_hits[0]
     status.crossed_hits[0] = 0
-    if status.iteration[0] == 0:
+    if status.counted[0] == 0:
         status.first_hits[0] = status.first_hits[0] + hits
+        status.counted[0] = 1
     stuck = status.iteration[0] > progress.max_iterations + progress.max_truncations and status.newly_frozen[0] == 0
     status.newly_frozen[0] = 0
     status.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)

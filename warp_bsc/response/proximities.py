@@ -158,7 +158,7 @@ def drop_proximities(
     They only save iterations; but which of them fit would depend on the order of threads.
     """
     missing = constraints.count[0] > constraints.vertices.shape[0] - needed
-    for i in range(counts.shape[0]):
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
         missing = missing or counts[i] > capacities[i]
     if missing:
         constraints.count[0] = kept[0]

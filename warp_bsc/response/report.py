@@ -55,10 +55,7 @@ class SolverReport:
 
     @property
     def hits(self) -> int:
-        """Contacts of the motion that the inner solver wanted in the last step, without those excluded.
-
-        A lower bound if the stage responds and the queues of a CUDA graph were too small for all of them.
-        """
+        """Contacts of the motion that the inner solver wanted in the last step, without those excluded."""
         return _read(self._response.status.first_hits)
 
     @property

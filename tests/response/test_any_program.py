@@ -1,0 +1,326 @@
+"""Programs as they come: resting cloth, positions that are not finite, shapes that leave no room, and many worlds."""
+
+import importlib
+
+import newton
+import newton.examples
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from newton_scenes import (
+    DT,
+    SOFT,
+    Changed,
+    Rollout,
+    add_patch,
+    add_plates,
+    bullet,
+    place_plates,
+    status,
+)
+
+import warp_bsc as bsc
+from warp_bsc.response.buffers import DIVIDED, PROJECTED
+
+
+def check_rest(rollout, dt, steps):
+    """Asserts that cloth which comes to rest is projected in each step, and never cut or left standing."""
+    touched = 0
+    for _ in range(steps):
+        rollout.step(dt)
+        touched += rollout.solver.report.hits > 0
+    report = rollout.solver.report
+    assert (report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0)
+    assert rollout.collisions == 0 and touched > 0.1 * steps
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 24), (1.0 / 240.0, 48), (1.0 / 1920.0, 100)])
+def test_a_drape(dt, steps, device):
+    """Cloth comes to rest on a sphere."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.2, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5))
+    options = {"dim_x": 10, "dim_y": 10, "cell_x": 0.08, "cell_y": 0.08, "mass": 0.0005, **SOFT}
+    builder.add_cloth_grid(pos=wp.vec3(-0.4, -0.4, 0.2005), rot=wp.quat_identity(), vel=wp.vec3(), **options)
+    builder.color()
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverVBD(model, iterations=10)
+    check_rest(Rollout(model, bsc.SolverCCD(inner, friction=0.5)), dt, steps)
+
+
+def accordion(columns, rows, cell, gap):
+    """A strip folded into four layers: positions and faces."""
+    side, radius = 0.25 * columns * cell, 0.5 * gap
+    straight = side - np.pi * radius
+    along = cell * np.arange(columns + 1)
+    layer = np.minimum((along / side).astype(int), 3)
+    u = along - layer * side
+    turn = np.maximum(u - straight, 0.0) / radius
+    x = np.minimum(u, straight) + radius * np.sin(turn)
+    x = np.where(layer % 2 == 0, x, straight - x)
+    z = 0.02 + layer * gap + radius * (1.0 - np.cos(turn))
+    y = cell * np.arange(rows + 1)
+    positions = np.stack([np.repeat(x, rows + 1), np.tile(y, columns + 1), np.repeat(z, rows + 1)], axis=1)
+    a = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).ravel()
+    b, c, d = a + rows + 1, a + rows + 2, a + 1
+    return positions, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+@pytest.mark.parametrize(("dt", "steps"), [(1.0 / 60.0, 12), (1.0 / 240.0, 40)])
+def test_a_fold(dt, steps, device):
+    """Four layers of one strip fall onto each other and the ground, and rest."""
+    positions, faces = accordion(32, 8, 0.01, 0.01)
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    at = {"pos": wp.vec3(), "rot": wp.quat_identity(), "scale": 1.0, "vel": wp.vec3()}
+    cloth = {"vertices": [wp.vec3(*p) for p in positions.tolist()], "indices": faces.ravel().tolist(), "density": 0.2}
+    stiffness = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-2, "edge_ke": 1e-3, "edge_kd": 1e-3}
+    builder.add_cloth_mesh(**at, **cloth, **stiffness, particle_radius=0.002)
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10)))
+    check_rest(rollout, dt, steps)
+    assert rollout.positions[:, 2].min() > 0.0
+
+
+def write_rows(array, rows, value):
+    """Sets rows of an array on a device."""
+    values = array.numpy().copy()
+    values[rows] = value
+    array.assign(values)
+
+
+@pytest.mark.parametrize("what", ["particle_q", "particle_qd"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_wanted_position_that_is_not_finite(value, what, device):
+    """Its particle stands, and the others are stopped and certified as ever."""
+    model = bullet(40.0, device=device)
+    lost = model.particle_count - 41  # in the middle of the patch that flies
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: write_rows(getattr(state, what), lost, value))))
+    hits = 0
+    for _ in range(3):
+        start = rollout.positions
+        rollout.step()
+        assert rollout.solver.report.certified and not rollout.solver.report.undetected
+        assert status(rollout.solver, "lost") == 1
+        hits += rollout.solver.report.hits
+        assert rollout.positions[lost].tobytes() == start[lost].tobytes()
+        assert (rollout.velocities[lost] == 0.0).all()
+        assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
+    moved = rollout.positions[-81:, 2] != model.particle_q.numpy()[-81:, 2]
+    assert moved.sum() == 80
+    assert rollout.collisions == 0 and hits > 50
+    assert rollout.solver.report.frozen_steps == 0
+    rollout.solver.solver.change = None
+    rollout.step()
+    assert status(rollout.solver, "lost") == 0 and rollout.solver.report.certified
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_start_position_that_is_not_finite(value, device):
+    """The step is not certified, but every collision without that particle is found and avoided."""
+    model = bullet(40.0, device=device)
+    broken = model.particle_count - 41
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    write_rows(rollout.states[0].particle_q, broken, value)
+    others = np.arange(model.particle_count) != broken
+    faces = rollout.mesh.faces
+    without = [broken]
+    if device.is_cuda:  # whose broad phase drops what the faces of the particle represent as well
+        without = faces[(faces == broken).any(axis=1)]
+    faces = faces[~np.isin(faces, without).any(axis=1)]
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, model.particle_count, device=device), method="exact")
+    found = avoided = 0
+    for step in range(4):
+        start, end = rollout.states
+        before = rollout.positions
+        wanted = before + np.float32(DT) * rollout.velocities
+        rollout.solver.step(start, end, None, None, DT)
+        rollout.states = end, start
+        report = rollout.solver.report
+        assert not report.certified and not report.undetected and report.uncertified_steps == step + 1
+        assert not np.isfinite(rollout.positions[broken]).any()
+        assert np.isfinite(rollout.positions[others]).all() and np.isfinite(rollout.velocities[others]).all()
+        for x1, collides in ((wanted, True), (rollout.positions, False)):
+            c = detector.detect(np.where(others[:, None], before, 0), np.where(others[:, None], x1, 0))
+            number = len(c.vertex_face) + len(c.edge_edge)
+            if collides:
+                avoided += number
+            else:
+                found += number
+    assert (found, report.frozen_steps) == (0, 0) and avoided > 100
+
+
+@pytest.fixture(scope="module")
+def shot(device):
+    """A rollout that tests put back to its start: a patch that flies at a sheet, and reaches it in the second step."""
+    model = bullet(20.0, device=device)
+    return Rollout(model, bsc.SolverCCD(Changed(model)))
+
+
+@settings(max_examples=12)
+@given(share=st.sampled_from([0.01, 0.2, 0.9, 1.0]), seed=st.integers(0, 10**6))
+def test_any_positions_that_are_not_finite(shot, share, seed):
+    """Each of their particles stands, and no other does for that."""
+    random = np.random.default_rng(seed)
+    lost = np.flatnonzero(random.random(shot.model.particle_count) < share)
+    values = random.choice(np.float32([np.nan, np.inf, -np.inf]), (len(lost), 3))
+    shot.solver.solver.change = lambda state: write_rows(state.particle_q, lost, values)
+    shot.states = shot.model.state(), shot.model.state()
+    shot.collisions, standing = 0, shot.solver.report.frozen_steps
+    for _ in range(3):
+        start = shot.positions
+        shot.step()
+        assert shot.solver.report.certified
+        assert status(shot.solver, "lost") == len(lost)
+        assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
+        still = (shot.positions[lost] == start[lost]).all(axis=1)
+        assert still.all() or shot.solver.report.hits  # another may push it
+    assert shot.collisions == 0 and shot.solver.report.frozen_steps == standing
+
+
+@pytest.mark.parametrize("iterations", [0, 40])
+@pytest.mark.parametrize(
+    "gaps", [(0.008, 0.004, 0.0, 0.004, 0.008, 0.03, 0.03), (0.015, 0.005, -0.005, 0.01, 0.03, 0.03)]
+)
+def test_plates_that_leave_no_room(gaps, iterations, device):
+    """Steps in which they meet are not certified; what is elsewhere does not notice, and it ends with them."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.012)
+    pressed = builder.particle_count
+    add_patch(builder, 3, 0.04, (1.0, 0.0, 0.0), velocity=(0.3, 0.2, 0.1))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
+    rollout.solver._response.max_iterations = iterations
+    certified, uncertified = [], 0
+    for next_gap in gaps:
+        gap = next_gap
+        wanted = rollout.positions + np.float32(DT) * rollout.velocities
+        collisions = rollout.collisions
+        rollout.step()
+        report = rollout.solver.report
+        certified.append(report.certified)
+        uncertified += not report.certified
+        assert report.uncertified_steps == uncertified and not report.undetected
+        assert report.certified == (report.remaining == 0)
+        assert rollout.collisions - collisions <= report.remaining
+        assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
+        assert rollout.positions[pressed:].tobytes() == wanted[pressed:].tobytes()
+    assert certified[:2] == [True, True] and not certified[2]
+    assert certified[-2:] == [True, True]
+
+
+def test_shapes_may_pass_through_each_other(device):
+    """What nothing can resolve is no part of the certificate."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.01)
+    cloth = [wp.vec3(1.0 + x, y, z) for x, y, z in builder.particle_q]
+    builder.particle_q = cloth
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
+    for next_gap in (0.002, -0.01, -0.02, 0.01):
+        gap = next_gap
+        rollout.step()
+        report = rollout.solver.report
+        assert (report.certified, report.hits, report.remaining) == (True, 0, 0)
+        assert status(rollout.solver, "crossings") == 0
+    np.testing.assert_array_equal(rollout.positions, np.float32(cloth))
+
+
+def test_vertices_that_start_in_the_solid_of_a_plane(device):
+    """They rise as they want to, and those above do not enter."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    for height, speed in ((-0.02, 2.0), (0.02, -2.0)):
+        add_patch(builder, 4, 0.05, (height * 30.0, 0.0, height), velocity=(0.0, 0.0, speed))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    below, excluded = rollout.positions[:, 2] < 0.0, 0
+    for _ in range(5):
+        wanted = rollout.positions + np.float32(DT) * rollout.velocities
+        rollout.step()
+        assert rollout.solver.report.certified and rollout.solver.report.frozen == 0
+        assert rollout.positions[below].tobytes() == wanted[below].tobytes()
+        assert rollout.positions[~below, 2].min() > 0.0
+        excluded += status(rollout.solver, "excluded")
+    assert excluded == 2 * below.sum()  # in two steps they also end there
+    assert rollout.positions[below, 2].min() > 0.0
+
+
+@pytest.mark.parametrize("trouble", ["crossing", "lost", "broken", "divided", "jammed"])
+def test_worlds_do_not_notice_each_other(trouble, device):
+    """What crosses, is lost or is divided in one world changes no bit of another."""
+    ends = []
+    for calm in (True, False):
+        model = bullet(20.0, device=device, worlds=3)
+        middle = np.arange(model.particle_count // 3, 2 * model.particle_count // 3)
+        patch = middle[-81:]
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+        response = rollout.solver._response
+        if trouble != "jammed":
+            response.max_iterations = 2  # as many as the other worlds need
+        state = rollout.states[0]
+        if calm:
+            write_rows(state.particle_qd, patch, 0.0)
+        elif trouble == "crossing":
+            x = state.particle_q.numpy()[patch]
+            write_rows(state.particle_q, patch, x + x[:, :1] * np.float32([0.0, 0.0, 1.0]) - np.float32([0, 0, 0.1007]))
+        elif trouble == "lost":
+            rollout.solver.solver.change = lambda state, rows=patch[::2]: write_rows(state.particle_q, rows, np.nan)
+        elif trouble == "broken":
+            write_rows(state.particle_q, patch[40], np.nan)
+        else:
+            random = np.random.default_rng(0).standard_normal((81, 3))
+            write_rows(state.particle_qd, patch, random * (20.0, 20.0, 60.0) - (0.0, 0.0, 100.0))
+        bits, troubled, hits = [], False, 0
+        for _ in range(6):
+            start, end = rollout.states
+            rollout.solver.step(start, end, None, None, DT)
+            rollout.states = end, start
+            bits.append(np.delete(np.concatenate([rollout.positions, rollout.velocities], axis=1), middle, axis=0))
+            hits += rollout.solver.report.hits
+            outcome = response.vertices.outcome.numpy()
+            assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
+            troubled |= {
+                "crossing": status(rollout.solver, "crossings") > 0 and status(rollout.solver, "excluded") > 0,
+                "lost": status(rollout.solver, "lost") > 0,
+                "broken": not rollout.solver.report.certified,
+                "divided": bool((outcome & int(DIVIDED)).any()),
+                "jammed": rollout.solver.report.rounds > 3,
+            }[trouble]
+        assert troubled == (not calm) and hits > 100
+        ends.append(np.stack(bits).tobytes())
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.slow
+def test_the_rollers_of_newton(device, monkeypatch):
+    """Its example as it is, in its own graph, with fewer iterations: a frame is certified, and the cloth moves."""
+    make, stages = newton.solvers.SolverVBD, []
+
+    def make_staged(*arguments, **options):
+        stages.append(bsc.SolverCCD(make(*arguments, **{**options, "iterations": 2})))
+        return stages[0]
+
+    monkeypatch.setattr(newton.solvers, "SolverVBD", make_staged)
+    module = importlib.import_module("newton.examples.cloth.example_cloth_rollers")
+    options = newton.examples.create_parser().parse_args(["--viewer", "null"])
+    example = module.Example(newton.viewer.ViewerNull(num_frames=1), options)
+    start = example.state_0.particle_q.numpy().copy()
+    example.step()
+    report = stages[0].report
+    assert (report.steps, report.uncertified_steps, report.frozen_steps) == (example.sim_substeps, 0, 0)
+    end = example.state_0.particle_q.numpy()
+    moved = np.linalg.norm(end - start, axis=1)
+    print(
+        moved[: example.num_cloth_verts].max(),
+        (moved[: example.num_cloth_verts] > 1e-3).sum(),
+        report,
+        status(stages[0], "crossings"),
+    )
+    assert (moved[: example.num_cloth_verts] > 1e-3).sum() > 100
+    assert moved[example.num_cloth_verts :].min() > 0.5

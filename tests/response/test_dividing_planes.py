@@ -1,0 +1,218 @@
+"""Dividing planes: with little or no projection, contacts are kept apart without standing still."""
+
+import itertools
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from newton_scenes import SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
+
+import warp_bsc as bsc
+from warp_bsc.response.buffers import DIVIDED
+from warp_bsc.response.dividing_planes import DividingPlanes, add_plane, allocate_dividing_planes, position_on_sides
+
+
+def staged(model, iterations, inner="vbd"):
+    """A rollout with at most this many iterations of projection."""
+    solver = bsc.SolverCCD(SOLVERS[inner](model))
+    solver._response.max_iterations = iterations
+    return Rollout(model, solver)
+
+
+def record_wanted(rollout):
+    """Returns a list that holds the positions that the inner solver wanted in the last step."""
+    inner, wanted = rollout.solver.solver, []
+    step = inner.step
+
+    def recorded(state_in, state_out, *arguments, **options):
+        step(state_in, state_out, *arguments, **options)
+        wanted[:] = [state_out.particle_q.numpy().copy()]
+
+    inner.step = recorded
+    return wanted
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+@pytest.mark.parametrize("speed", [10.0, 60.0])
+def test_a_bullet(speed, iterations, device):
+    """It is stopped, and without projection no vertex moves farther than it wanted to."""
+    rollout = staged(bullet(speed, device=device), iterations)
+    wanted = record_wanted(rollout)
+    hits = 0
+    for _ in range(12 if speed < 50.0 else 8):
+        start = rollout.positions
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+        assert rollout.solver.report.rounds <= iterations + 33
+        paths, wanted_paths = (np.linalg.norm(x.astype(float) - start, axis=1) for x in (rollout.positions, *wanted))
+        assert iterations > 0 or (paths <= wanted_paths + 1e-6).all()
+    assert rollout.collisions == 0 and hits > 50
+    assert rollout.solver.report.frozen_steps == 0
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_a_tilted_bullet(iterations, device):
+    """Edges meet edges, and what slides along a plane goes on sliding."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 12, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    tilt = wp.quat_from_axis_angle(wp.vec3(1.0, 0.3, 0.0), 0.4)
+    sides = {"dim_x": 8, "dim_y": 8, "cell_x": 0.03, "cell_y": 0.03, "mass": 0.001}
+    at, velocity = wp.vec3(-0.12, -0.12, 0.15), wp.vec3(3.0, 0.0, -30.0)
+    builder.add_cloth_grid(pos=at, rot=tilt, vel=velocity, **sides, **STIFF)
+    builder.color()
+    rollout = staged(builder.finalize(device=device), iterations)
+    wanted = record_wanted(rollout)
+    hits = 0
+    for _ in range(8):
+        start = rollout.positions
+        rollout.step()
+        if hits == 0 and iterations == 0:
+            slid, wanted_slide = ((x - start)[-81:, 0].mean() for x in (rollout.positions, *wanted))
+            assert slid > 0.8 * wanted_slide > 0.0
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+    assert rollout.collisions == 0 and hits > 50
+    assert rollout.solver.report.frozen_steps == 0
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_linear_momentum_is_kept(iterations, device):
+    """Free patches that meet off centre change velocities by as much on either side."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.5, 0.0, 3.0))
+    add_patch(builder, 6, 0.05, (0.09, 0.07, 0.05), velocity=(0.0, -0.5, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    rollout.solver._response.max_iterations = iterations
+    before, velocities, divided = rollout.momenta()[0], rollout.velocities, 0
+    for _ in range(6):
+        rollout.step()
+        divided += np.count_nonzero(rollout.solver._response.vertices.outcome.numpy() & int(DIVIDED))
+        assert rollout.solver.report.truncated == rollout.solver.report.frozen == 0
+    assert np.linalg.norm(rollout.momenta()[0] - before) < 1e-5 * np.linalg.norm(before)
+    assert rollout.collisions == 0 and np.abs(rollout.velocities - velocities).max() > 1.0
+    assert divided > 0 or iterations > 0
+
+
+@pytest.mark.parametrize("iterations", [0, 1])
+def test_plates_that_close_on_cloth(iterations, device):
+    """They push it flat until they stop."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.03)
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
+    rollout.solver._response.max_iterations = iterations
+    hits = 0
+    for step in range(8):
+        gap = max(0.004, 0.026 - 0.004 * step)
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+        assert np.abs(rollout.positions[:, 2]).max() < 0.5 * gap
+    assert rollout.collisions == 0 and hits > 50
+    assert rollout.solver.report.frozen_steps == rollout.solver.report.truncated_steps == 0
+
+
+@wp.kernel(enable_backward=False)
+def _divide(
+    # in
+    normals: wp.array[wp.vec3d],
+    offsets: wp.array[wp.float64],
+    margins: wp.array[wp.float64],
+    x0: wp.vec3,
+    x1: wp.vec3,
+    # out
+    planes: DividingPlanes,
+    end: wp.array[wp.vec3],
+    cut: wp.array[bool],
+):
+    for i in range(normals.shape[0]):
+        add_plane(planes, 0, normals[i], offsets[i], margins[i])
+    position, was_cut = position_on_sides(planes, 0, x0, x1)
+    end[0] = position
+    cut[0] = was_cut
+
+
+def divide(planes, x0, x1, device):
+    """The end of a vertex's path and whether it was cut; planes are normals, least coordinates, margins."""
+    normals, offsets, margins = (np.array(values, dtype=float) for values in zip(*planes, strict=True))
+    inputs = [wp.array(normals, dtype=wp.vec3d, device=device)]
+    inputs += [wp.array(values, dtype=wp.float64, device=device) for values in (offsets, margins)]
+    end, cut = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=bool, device=device)
+    outputs = [allocate_dividing_planes(1, len(planes), device), end, cut]
+    wp.launch(_divide, 1, inputs=[*inputs, wp.vec3(*x0), wp.vec3(*x1)], outputs=outputs, device=device)
+    return end.numpy()[0], bool(cut.numpy()[0])
+
+
+def unit(*vector):
+    return np.array(vector, dtype=float) / np.linalg.norm(vector)
+
+
+START = (0.0, 0.0, 1.0)
+
+
+def test_one_plane(device):
+    """A position below it goes straight up to the margin; one above it stays."""
+    n = unit(0.2, -0.1, 1.0)
+    x1 = np.float32([0.3, 0.2, -0.7])
+    end, cut = divide([(n, 0.1, 0.01)], START, x1, device)
+    np.testing.assert_allclose(end, x1 + (0.11 - n @ x1) * n, atol=1e-7)
+    assert not cut
+    above = np.float32([0.3, 0.2, 0.2])
+    end, cut = divide([(n, 0.1, 0.01)], START, above, device)
+    assert end.tobytes() == above.tobytes() and not cut
+
+
+def test_two_planes(device):
+    """Where they are at right angles, a position goes up to both margins."""
+    a, b = unit(1.0, 0.0, 1.0), unit(-1.0, 0.0, 1.0)
+    x1 = np.float32([0.1, 0.4, -0.5])
+    end, cut = divide([(a, 0.2, 0.01), (b, 0.3, 0.02)], START, x1, device)
+    np.testing.assert_allclose([a @ end, b @ end, end[1]], [0.21, 0.32, 0.4], atol=1e-6)
+    assert not cut
+
+
+def test_an_acute_wedge(device):
+    """Projection would take long where planes nearly face each other: the path is cut, but above both."""
+    planes = [(unit(1.0, 0.0, 0.01), 0.0, 1e-4), (unit(-1.0, 0.0, 0.01), 0.0, 1e-4)]
+    x1 = np.float32([0.3, 0.2, -1.0])
+    end, cut = divide(planes, START, x1, device)
+    assert cut
+    assert all(normal @ end > offset for normal, offset, _ in planes)
+    assert np.linalg.norm(end - START) > 0.1
+
+
+def test_no_room(device):
+    """Where nothing is above all planes, a path ends where it began."""
+    planes = [(unit(0.0, 0.0, 1.0), 1.5, 0.01), (unit(0.0, 0.0, -1.0), -0.5, 0.01)]
+    for x1 in ((0.3, 0.2, -1.0), (0.3, 0.2, 1.0), (0.3, 0.2, 2.0)):
+        end, cut = divide(planes, START, x1, device)
+        assert end.tolist() == list(START) and cut
+
+
+_NUMBER = st.integers(-8, 8).map(lambda i: i / 8.0)  # of few bits, so that planes are symmetric and equally far
+
+
+@settings(max_examples=40)
+@given(
+    normals=st.lists(st.tuples(_NUMBER, _NUMBER, st.integers(1, 8).map(lambda i: i / 8.0)), min_size=2, max_size=4),
+    x1=st.tuples(_NUMBER, _NUMBER, st.integers(-8, 4).map(lambda i: i / 8.0)),
+    share=st.floats(0.1, 0.9),
+)
+@example(normals=[(0.5, 0.0, 1.0), (-0.5, 0.0, 1.0)], x1=(0.0, 0.0, -1.0), share=0.5)  # both equally far above
+@example(normals=[(0.0, 1.0, 0.5), (0.0, -1.0, 0.5), (1.0, 0.0, 0.5)], x1=(0.0, 0.0, -0.5), share=0.5)
+def test_the_order_of_planes_does_not_matter(normals, x1, share, device):
+    """Planes between the start of a path and points below them: the end is above all, not farther, always the same."""
+    planes = [(unit(*normal), share * (unit(*normal) @ START), 0.01 * unit(*normal)[2]) for normal in normals]
+    found = (divide(order, START, x1, device) for order in itertools.permutations(planes))
+    ends = {(end.tobytes(), cut) for end, cut in found}
+    assert len(ends) == 1
+    end = np.frombuffer(ends.pop()[0], dtype=np.float32).astype(float)
+    assert all(normal @ end > offset for normal, offset, _ in planes)
+    assert np.linalg.norm(end - START) <= np.linalg.norm(np.subtract(x1, START)) + 1e-6

@@ -1,0 +1,238 @@
+"""Scenes of cloth for the collision stage, and rollouts whose every step exact detection looks at again."""
+
+from fractions import Fraction
+
+import newton
+import numpy as np
+import warp as wp
+
+import warp_bsc as bsc
+from warp_bsc.response.model_mesh import ModelMesh
+
+__all__ = [
+    "DT",
+    "SOLVERS",
+    "STIFF",
+    "Changed",
+    "Rollout",
+    "add_crossing_sheets",
+    "add_patch",
+    "add_plates",
+    "bullet",
+    "crossing_sheets",
+    "place_plates",
+    "status",
+]
+
+DT = 1.0 / 240.0
+"""Length of a step [s]."""
+STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
+SOFT = {"tri_ke": 2e2, "tri_ka": 2e2, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
+_HALF_PLATE = 0.05
+
+
+def semi_implicit(model):
+    """The explicit solver, without its own contacts between particles, which are far too stiff here."""
+    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
+    return newton.solvers.SolverSemiImplicit(model)
+
+
+SOLVERS = {
+    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
+    "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
+    "semi_implicit": semi_implicit,
+}
+
+
+class Changed(newton.solvers.SolverXPBD):
+    """Lets particles fly on without forces, and then changes the state at the end as a function says."""
+
+    def __init__(self, model, change=None):
+        super().__init__(model, iterations=0)
+        self.change = change
+
+    def step(self, state_in, state_out, *arguments, **options):
+        bodies = None if state_in.body_q is None else wp.clone(state_in.body_q)
+        super().step(state_in, state_out, *arguments, **options)
+        if bodies is not None:
+            wp.copy(state_out.body_q, bodies)
+        if self.change is not None:
+            self.change(state_out)
+
+
+def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
+    """A square patch of cloth, centred, in the xy plane."""
+    corner = np.subtract(at, (0.5 * n * cell, 0.5 * n * cell, 0.0))
+    sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], fixed)
+    builder.add_cloth_grid(
+        pos=wp.vec3(*corner),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(*velocity),
+        dim_x=n,
+        dim_y=n,
+        cell_x=cell,
+        cell_y=cell,
+        mass=0.001,
+        **sides,
+        **STIFF,
+        **options,
+    )
+
+
+def bullet(speed, *, device, worlds=1):
+    """A patch shot at a sheet that is held at its border."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(world, 16, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    add_patch(world, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -speed))
+    builder = world
+    if worlds > 1:
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def add_crossing_sheets(builder, pull, n=8, cell=0.05):
+    """Two sheets that cross each other, the lower one with velocity ``-pull``, the upper one with ``pull``."""
+    side = n * cell
+    tilt = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.3, 1.0, 0.1)), 0.3)
+    options = {"dim_x": n, "dim_y": n, "cell_x": cell, "cell_y": cell, "mass": 0.001, **SOFT}
+    at, tilted_at = wp.vec3(-0.5 * side, -0.5 * side, 0.0), wp.vec3(-0.5 * side, 0.01 - 0.5 * side, 0.16 * side)
+    builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(0.0, 0.0, -pull), **options)
+    builder.add_cloth_grid(pos=tilted_at, rot=tilt, vel=wp.vec3(0.0, 0.0, pull), **options)
+
+
+def crossing_sheets(pull, *, device):
+    """A model of nothing but two sheets that cross each other."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_crossing_sheets(builder, pull)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def add_plates(builder, gap):
+    """Two kinematic plates, ``gap`` apart, with a bent patch of cloth between them."""
+    first = builder.particle_count
+    add_patch(builder, 6, 0.04, (0.0, 0.0, 0.0))
+    for particle in range(first, builder.particle_count):
+        x, y, _ = builder.particle_q[particle]
+        builder.particle_q[particle] = wp.vec3(x, y, 0.01 * float(np.sin(20.0 * x) * np.cos(17.0 * y)))
+    for height in plate_heights(gap):
+        body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity()))
+        builder.add_shape_box(body, hx=0.2, hy=0.2, hz=_HALF_PLATE)
+
+
+def place_plates(state, gap):
+    """Sets the heights of the first two bodies so that plates are ``gap`` apart."""
+    body_q = state.body_q.numpy()
+    body_q[:2, 2] = plate_heights(gap)
+    state.body_q.assign(body_q)
+
+
+def plate_heights(gap):
+    """Heights of two plates that are this far apart."""
+    return -_HALF_PLATE - 0.5 * gap, _HALF_PLATE + 0.5 * gap
+
+
+def status(solver, name):
+    """A number of the stage's last step: ``crossings``, ``excluded`` contacts, or ``lost`` vertices."""
+    return int(getattr(solver._response.status, name).numpy()[0])
+
+
+class Rollout:
+    """Steps a solver, and asks exact detection about the motion of each step as it is stored.
+
+    Attributes:
+        collisions: Collisions so far, except for those of two shapes, and of elements that crossed at the start of
+            their step.
+        start: Positions of all vertices at the start of the last step.
+    """
+
+    def __init__(self, model, solver):
+        self.model, self.solver = model, solver
+        self.states = model.state(), model.state()
+        self.control = model.control()
+        self.mesh = ModelMesh(model)
+        self.detector = bsc.CollisionDetector(self.mesh, method="exact")
+        self.collisions = 0
+        self.start = self.vertices(self.states[0])
+
+    def step(self, dt=DT, contacts=None):
+        start, end = self.states
+        self.start = self.vertices(start)  # the inner solver may overwrite it
+        start.clear_forces()
+        self.solver.step(start, end, self.control, contacts, dt)
+        self.states = end, start
+        self.collisions += self.count_collisions(self.start, self.vertices(end))
+
+    def count_collisions(self, before, after):
+        """The number of collisions of a motion, except for those of shapes, and of elements that crossed before."""
+        movable = self.mesh.inverse_masses.numpy() > 0.0
+        edges, faces = self.mesh.edges, self.mesh.faces
+        c = self.detector.detect(before, after)
+        own = movable[c.vertex_face[:, 0]] | movable[faces[c.vertex_face[:, 1]]].any(axis=1)
+        vertex_face = list(zip(c.vertex_face[own].tolist(), c.vertex_face_toi[own], strict=True))
+        own = movable[edges[c.edge_edge]].any(axis=(1, 2))
+        edge_edge = list(zip(c.edge_edge[own].tolist(), c.edge_edge_toi[own], strict=True))
+        if not vertex_face and not edge_edge:
+            return 0
+        touching = self.find_crossings(before)
+        crossing = self.find_crossings(before, inside=True)
+        crossed = [self.vertex_crosses(*pair, crossing if toi > 0.0 else touching) for pair, toi in vertex_face]
+        crossed += [self.edges_cross(*pair, crossing if toi > 0.0 else touching) for pair, toi in edge_edge]
+        return crossed.count(False)
+
+    def find_crossings(self, x, inside=False):
+        """The edges and faces that meet in one configuration and can be moved; if asked, only those that do inside."""
+        movable = self.mesh.inverse_masses.numpy() > 0.0
+        pairs = self.detector.find_intersections(x)
+        own = movable[self.mesh.edges[pairs[:, 0]]].any(axis=1) | movable[self.mesh.faces[pairs[:, 1]]].any(axis=1)
+        found = map(tuple, pairs[own].tolist())
+        edges, faces = self.mesh.edges, self.mesh.faces
+        return {(edge, face) for edge, face in found if not inside or crosses_inside(x, edges[edge], faces[face])}
+
+    def vertex_crosses(self, vertex, face, crossings):
+        """Whether an edge of a vertex is among those that cross a face."""
+        return any((edge, face) in crossings for edge in np.flatnonzero((self.mesh.edges == vertex).any(axis=1)))
+
+    def edges_cross(self, edge, other, crossings):
+        """Whether one of two edges is among those that cross a face of the other."""
+        for a, b in ((edge, other), (other, edge)):
+            faces = np.flatnonzero(np.isin(self.mesh.faces, self.mesh.edges[b]).sum(axis=1) == 2)
+            if any((a, face) in crossings for face in faces):
+                return True
+        return False
+
+    def vertices(self, state):
+        """The positions of all vertices in a state, those of shapes too."""
+        x = wp.empty(self.mesh.vertex_count, dtype=wp.vec3, device=self.mesh.device)
+        self.mesh.positions(state.particle_q, state.body_q if self.model.body_count else None, x)
+        return x.numpy()
+
+    @property
+    def positions(self):
+        return self.states[0].particle_q.numpy().copy()
+
+    @property
+    def velocities(self):
+        return self.states[0].particle_qd.numpy().copy()
+
+    def momenta(self):
+        mass = self.model.particle_mass.numpy()[:, None].astype(float)
+        p = mass * self.velocities
+        return p.sum(axis=0), np.cross(self.positions.astype(float), p).sum(axis=0)
+
+
+def crosses_inside(x, edge, face):
+    """Whether the inside of an edge crosses the inside of a face, in rational arithmetic."""
+
+    def orientation(i, j, k, origin):
+        o, *others = ([Fraction(float(value)) for value in x[n]] for n in (origin, i, j, k))
+        a, b, c = ([u - v for u, v in zip(other, o, strict=True)] for other in others)
+        cross = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+        value = sum(u * v for u, v in zip(a, cross, strict=True))
+        return (value > 0) - (value < 0)
+
+    (p, q), (a, b, c) = edge, face
+    passes = {orientation(q, i, j, p) for i, j in ((a, b), (b, c), (c, a))}
+    return orientation(b, c, p, a) * orientation(b, c, q, a) < 0 and len(passes) == 1 and 0 not in passes
