@@ -213,12 +213,7 @@ def test_positions_that_are_not_finite_are_counted(dtype):
         assert counts[1].numpy()[0] == expected
 
 
-_MISSING = pytest.mark.xfail(
-    strict=True, reason="vertices and edges have no pairs either if the face that represents them has none"
-)
-
-
-@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, pytest.param(BroadPhaseHierarchy, marks=_MISSING)])
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("at_end", [False, True])
 def test_elements_without_finite_positions_have_no_pairs(broad_phase, dtype, at_end):

@@ -100,9 +100,25 @@ def _box_elements(dtype: type) -> wp.Kernel:
     """
 
     @wp.func
-    def _is_finite(x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, c: int) -> bool:
-        start = wp.isfinite(x0[a]) and wp.isfinite(x0[b]) and wp.isfinite(x0[c])
-        return start and wp.isfinite(x1[a]) and wp.isfinite(x1[b]) and wp.isfinite(x1[c])
+    def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
+        return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
+
+    @wp.func
+    def write_box(
+        x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, boxes: wp.array2d[wp.vec3], row: int, finite: bool
+    ):
+        """Writes the box of two vertices, an empty one if that is not finite."""
+        low = wp.vec3(wp.inf, wp.inf, wp.inf)
+        if finite:
+            boxes[row, 0] = rounded(wp.min(x0[a], x0[b]))
+            boxes[row, 1] = rounded(wp.max(x0[a], x0[b]))
+            boxes[row, 2] = rounded(wp.min(x1[a], x1[b]))
+            boxes[row, 3] = rounded(wp.max(x1[a], x1[b]))
+        else:
+            boxes[row, 0] = low
+            boxes[row, 1] = -low
+            boxes[row, 2] = low
+            boxes[row, 3] = -low
 
     @wp.kernel(**NO_GRADIENTS)
     def box_elements(
@@ -122,7 +138,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
             low = wp.vec3(wp.inf, wp.inf, wp.inf)
             high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
             has_changed = int(0)
-            if mesh.order[i] >= 0 and _is_finite(x0, x1, mesh.faces[i, 0], mesh.faces[i, 1], mesh.faces[i, 2]):
+            if mesh.order[i] >= 0:
                 a = mesh.faces[i, 0]
                 b = mesh.faces[i, 1]
                 c = mesh.faces[i, 2]
@@ -130,12 +146,27 @@ def _box_elements(dtype: type) -> wp.Kernel:
                 high0 = rounded(wp.max(wp.max(x0[a], x0[b]), x0[c]))
                 low1 = rounded(wp.min(wp.min(x1[a], x1[b]), x1[c]))
                 high1 = rounded(wp.max(wp.max(x1[a], x1[b]), x1[c]))
-                mesh.face_boxes[i, 0] = low0
-                mesh.face_boxes[i, 1] = high0
-                mesh.face_boxes[i, 2] = low1
-                mesh.face_boxes[i, 3] = high1
+                finite = is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c)
+                if not finite:  # the place covers the other elements that it represents
+                    low0 = low
+                    high0 = high
+                    low1 = low
+                    high1 = high
+                    for corner in range(3):
+                        vertex = mesh.faces[i, corner]
+                        if is_finite(x0, x1, vertex):
+                            start = rounded(x0[vertex])
+                            end = rounded(x1[vertex])
+                            low0 = wp.min(low0, start)
+                            high0 = wp.max(high0, start)
+                            low1 = wp.min(low1, end)
+                            high1 = wp.max(high1, end)
                 low = wp.min(low0, low1)
                 high = wp.max(high0, high1)
+                mesh.face_boxes[i, 0] = wp.where(finite, low0, wp.vec3(wp.inf, wp.inf, wp.inf))
+                mesh.face_boxes[i, 1] = wp.where(finite, high0, wp.vec3(-wp.inf, -wp.inf, -wp.inf))
+                mesh.face_boxes[i, 2] = wp.where(finite, low1, wp.vec3(wp.inf, wp.inf, wp.inf))
+                mesh.face_boxes[i, 3] = wp.where(finite, high1, wp.vec3(-wp.inf, -wp.inf, -wp.inf))
                 has_changed = 1
                 if changed:
                     has_changed = changed[a] | changed[b] | changed[c]
@@ -148,15 +179,13 @@ def _box_elements(dtype: type) -> wp.Kernel:
         if edge < mesh.edges.shape[0]:
             a = mesh.edges[edge, 0]
             b = mesh.edges[edge, 1]
-            row = mesh.edge_rows[edge]
-            mesh.edge_boxes[row, 0] = rounded(wp.min(x0[a], x0[b]))
-            mesh.edge_boxes[row, 1] = rounded(wp.max(x0[a], x0[b]))
-            mesh.edge_boxes[row, 2] = rounded(wp.min(x1[a], x1[b]))
-            mesh.edge_boxes[row, 3] = rounded(wp.max(x1[a], x1[b]))
+            finite = is_finite(x0, x1, a) and is_finite(x0, x1, b)
+            write_box(x0, x1, a, b, mesh.edge_boxes, mesh.edge_rows[edge], finite)
             return
         vertex = edge - mesh.edges.shape[0]
+        finite = is_finite(x0, x1, vertex)
         if not_finite:
-            if not (wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])):
+            if not finite:
                 counted = int(1)
                 if checked:
                     counted = checked[vertex]
@@ -164,12 +193,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     raise_count(not_finite, 0, 1)
         row = mesh.vertex_rows[vertex]
         if row >= 0:
-            start = rounded(x0[vertex])
-            end = rounded(x1[vertex])
-            mesh.vertex_boxes[row, 0] = start
-            mesh.vertex_boxes[row, 1] = start
-            mesh.vertex_boxes[row, 2] = end
-            mesh.vertex_boxes[row, 3] = end
+            write_box(x0, x1, vertex, vertex, mesh.vertex_boxes, row, finite)
 
     return box_elements
 
@@ -293,6 +317,12 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
+def _has_box(mesh: FaceHierarchy, face: int):
+    """Whether all positions of a face are finite."""
+    return mesh.face_boxes[face, 0][0] < wp.inf
+
+
+@wp.func
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
@@ -307,7 +337,7 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
         if owns_vertex(owned, corner):
             row = 3 * face + corner
             if boxes_overlap(_low(mesh.vertex_boxes, row), _high(mesh.vertex_boxes, row), low, high):
-                if not _has_vertex(mesh.faces, other, mesh.faces[face, corner]):
+                if not _has_vertex(mesh.faces, other, mesh.faces[face, corner]) and _has_box(mesh, other):
                     found = found | (1 << corner)
                     if keep_separated or not _apart(mesh.vertex_boxes, row, mesh.face_boxes, other):
                         found = found | (8 << corner)
@@ -425,7 +455,8 @@ def _pair_edges_with_face(
                 mesh.places.lowers[other],
                 mesh.places.uppers[other],
             ):
-                if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
+                apart = not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b)
+                if apart and _has_box(mesh, other):
                     append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
 
 

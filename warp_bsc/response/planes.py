@@ -95,7 +95,7 @@ def collect_penetrations(
         if planes.world[i] >= 0 and planes.world[i] != world:
             continue
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
-        if after > error_after:
+        if not (after <= error_after):  # nor where the plane is not finite
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
         if before < -error_before:
