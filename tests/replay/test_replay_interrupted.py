@@ -149,7 +149,8 @@ def test_signal(tmp_path, monkeypatch, capsys, scene, number):
     said = "interrupted" if number == signal.SIGINT else f"interrupted by {number.name}"
     status = replay_with(monkeypatch, scene, tmp_path, lambda: os.kill(os.getpid(), number))
     assert status == 128 + number
-    assert capsys.readouterr().err == f"warp-bsc: {said}\n"
+    # the line before is there where this process is the first to compile kernels
+    assert capsys.readouterr().err.splitlines()[-1] == f"warp-bsc: {said}"
     assert read_left(tmp_path, said) == [3] * 4
     assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)] == handlers
 

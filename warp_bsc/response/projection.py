@@ -11,7 +11,6 @@ __all__ = [
     "MAX_SWEEPS",
     "SLOW_POSITION_SWEEPS",
     "SLOW_VELOCITY_SWEEPS",
-    "SWEEPS_PER_ACTIVE_SET",
     "SWEEPS_PER_BATCH",
     "activate_position_constraints",
     "activate_velocity_constraints",
@@ -31,9 +30,9 @@ __all__ = [
     "with_momentum",
 ]
 
-MAX_SWEEPS, SWEEPS_PER_BATCH, SWEEPS_PER_ACTIVE_SET = wp.constant(40), wp.constant(4), wp.constant(4)
-"""Most sweeps over constraints, in each iteration on positions, and at the end on velocities; the sweeps after each of
-which the device checks whether a constraint is still active; and the sweeps over one active set."""
+MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
+"""Most sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one
+active set, after which the device checks whether a constraint is still active."""
 SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 16, 12
 """Most sweeps in worlds without fast contacts: dividing planes resolve what they leave."""
 

@@ -40,7 +40,6 @@ from .projection import (
     MAX_SWEEPS,
     SLOW_POSITION_SWEEPS,
     SLOW_VELOCITY_SWEEPS,
-    SWEEPS_PER_ACTIVE_SET,
     SWEEPS_PER_BATCH,
     activate_position_constraints,
     activate_velocity_constraints,
@@ -95,10 +94,13 @@ class Response:
     """Moves the vertices of a motion until it is certified to be free of collisions, on the device.
 
     Iterations of detection and projection come first: each contact is moved apart at the end of the step, and the new
-    motion is detected again, as far as it changed. The paths of vertices that still collide after
-    ``max_iterations`` are truncated before their first contact, a few times, and then vertices are frozen. This
-    ends, because vertices that stood apart and stand still do not collide. If a detection is incomplete, all vertices
-    are frozen, and the motion is not certified.
+    motion is detected again, as far as it changed. Vertices that still collide after ``max_iterations``, or after one
+    iteration in worlds whose contacts are all of slow elements, are divided, see :mod:`.dividing_planes`, and if that
+    is not enough, frozen. This ends, because vertices that stood apart and stand still do not collide. A detection
+    whose queues are too small in a CUDA graph is completed without queues, see :mod:`.queueless`.
+
+    If the response is differentiable, paths are truncated before their first contact instead of divided, and a
+    detection whose queues are too small freezes all vertices, uncertified.
 
     Attributes:
         detector: The detector.
@@ -164,7 +166,7 @@ class Response:
 
     @property
     def max_iterations(self) -> int:
-        """Most iterations of detect and project; paths that still collide are truncated."""
+        """Most iterations of detect and project; vertices that still collide are divided."""
         return self._progress.max_iterations
 
     @max_iterations.setter
@@ -312,8 +314,7 @@ class Response:
         def batch():
             self._reserve_entries(SWEEPS_PER_BATCH)
             for i in range(SWEEPS_PER_BATCH):
-                place = i % int(SWEEPS_PER_ACTIVE_SET)
-                sweep(first=place == 0, last=place == int(SWEEPS_PER_ACTIVE_SET) - 1, **options)
+                sweep(first=i == 0, last=i == SWEEPS_PER_BATCH - 1, **options)
 
         self._start_sweeps()
         wp.capture_while(self._sweep.another, batch)
