@@ -63,7 +63,7 @@ def all_pairs(mesh, x0, x1):
 @pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @given(
-    faces=st.integers(1, 90),
+    faces=st.integers(1, 60),
     size=st.floats(0.05, 3.0),
     worlds=st.integers(1, 9),
     flat=st.booleans(),
