@@ -133,6 +133,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
         not_finite: wp.array[wp.int64],
     ):
         i = wp.tid()
+        finite = bool(True)  # here, as Warp selects between the values before and after a branch
         places = mesh.order.shape[0]
         if i < places:  # the same for all threads of a warp
             low = wp.vec3(wp.inf, wp.inf, wp.inf)
