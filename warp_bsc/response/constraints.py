@@ -28,6 +28,7 @@ __all__ = [
     "feasible",
     "feasible_in_contact",
     "gap",
+    "has_overflowed",
     "is_dividing",
     "is_excluded",
     "is_projecting",
@@ -121,6 +122,15 @@ def is_projecting(progress: Progress, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
     iteration = progress.status.iteration[0]
     return progress.contact_iteration[world] == iteration - 1 and not is_dividing(progress, world, iteration - 1)
+
+
+@wp.func
+def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
+    """Returns whether a queue of the detector was too small for a detection."""
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
+        if counts[i] > capacities[i]:
+            return True
+    return False
 
 
 @wp.func

@@ -19,6 +19,7 @@ from .constraints import (
     contact_weights,
     count_contact,
     feasible_in_contact,
+    has_overflowed,
     is_dividing,
     is_slow,
     to_double,
@@ -172,12 +173,18 @@ def collect_contacts(
     dividing: DividingPlanes,
     progress: Progress,
     separation: wp.float64,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    can_search: bool,
 ):
     """Counts the contacts of both kinds, and adds constraints for them; after the last projection, dividing planes.
 
-    Then it finds the first contact of each vertex as well.
+    Then it finds the first contact of each vertex as well. Does nothing if :mod:`.queueless` is to find all contacts,
+    because a queue overflowed: which contacts are among those that fit depends on the order of threads.
     """
     i = wp.tid()
+    if can_search and has_overflowed(counts, capacities):
+        return
     _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, progress, separation)
     _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, progress, separation)
 
@@ -214,9 +221,7 @@ def decide(
     :mod:`.queueless`, and decided upon by another launch.
     """
     status = progress.status
-    overflowed = bool(False)
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        overflowed = overflowed or counts[i] > capacities[i]
+    overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and status.undetected[0] == 0:
         status.undetected[0] = 1
         status.hits[0] = 0

@@ -13,6 +13,7 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     add_constraint,
     feasible,
+    has_overflowed,
     is_projecting,
     is_slow,
     longest_path,
@@ -157,8 +158,5 @@ def drop_proximities(
 
     They only save iterations; but which of them fit would depend on the order of threads.
     """
-    missing = constraints.count[0] > constraints.vertices.shape[0] - needed
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        missing = missing or counts[i] > capacities[i]
-    if missing:
+    if has_overflowed(counts, capacities) or constraints.count[0] > constraints.vertices.shape[0] - needed:
         constraints.count[0] = kept[0]

@@ -369,7 +369,7 @@ class Response:
         contacts = list(self._contacts())
         queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
         inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
-        self._launch_over(collect_contacts, queues, inputs)
+        self._launch_over(collect_contacts, queues, [*inputs, *self._fill_of_queues()])
         if self._recorder is not None:
             self._launch_over(count_grazing, queues, [motion, vertices, *contacts, self._record])
         if self._most_penetrations:
@@ -384,9 +384,12 @@ class Response:
         return not self._differentiable and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
 
     def _decide(self):
-        counts, capacities = self.detector.counters.array, self.detector.capacities
-        inputs = [self.constraints, self._progress, counts, capacities, self._can_search]
+        inputs = [self.constraints, self._progress, *self._fill_of_queues()]
         wp.launch(decide, 1, inputs=inputs, device=self.device)
+
+    def _fill_of_queues(self):
+        """Returns what says whether a queue of the detector overflowed, and whether contacts can be searched then."""
+        return self.detector.counters.array, self.detector.capacities, self._can_search
 
     def _search(self):
         """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
