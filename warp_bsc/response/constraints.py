@@ -9,6 +9,7 @@ from .exclusion import Connectivity, crossed_at_start, is_movable
 __all__ = [
     "EDGE_EDGE_CONTACT",
     "EDGE_EDGE_PROXIMITY",
+    "LEAST_DISTANCE",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
@@ -74,7 +75,7 @@ _SLOW = wp.constant(wp.float64(0.5))
 _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
-_LEAST = wp.constant(wp.float64(0.1))
+LEAST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -212,7 +213,7 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 @wp.func
 def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    recovered = wp.max(start + _RECOVERY * path, _LEAST * separation)
+    recovered = wp.max(start + _RECOVERY * path, LEAST_DISTANCE * separation)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
