@@ -33,7 +33,6 @@ from .settings import NO_GRADIENTS, Count, capacity_for
 __all__ = [
     "BroadPhaseHierarchy",
     "FaceHierarchy",
-    "lowest_bit",
     "overlapping_edges",
     "overlapping_vertices",
     "traversal_kernel",
@@ -358,21 +357,6 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
     return found
 
 
-@wp.func
-def _bit_count(bits: int):
-    count = int(0)
-    while bits != 0:
-        bits = bits & (bits - 1)
-        count += 1
-    return count
-
-
-@wp.func
-def lowest_bit(bits: int):
-    """The place of the lowest bit that is set."""
-    return _bit_count((bits & -bits) - 1)
-
-
 @wp.kernel(**NO_GRADIENTS)
 def _pair_elements(
     mesh: FaceHierarchy,
@@ -393,23 +377,23 @@ def _pair_elements(
     vertices = overlapping_vertices(mesh, face, other, keep_separated)
     vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
     edges = overlapping_edges(mesh, face, other, keep_separated)
-    raise_count(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
-    raise_count(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
+    raise_count(vertex_face_counts, _CANDIDATES, count_places(wp.uint32(vertices & 455)))
+    raise_count(edge_edge_counts, _CANDIDATES, count_places(wp.uint32(edges & 511)))
     # of the rest only what no axis separates
     vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
     edges = edges >> 9
-    slot = take_slots(vertex_face_counts, _QUEUED, _bit_count(vertices))
+    slot = take_slots(vertex_face_counts, _QUEUED, count_places(wp.uint32(vertices)))
     while vertices != 0:
-        corner = lowest_bit(vertices)
+        corner = lowest_place(wp.uint32(vertices))
         vertices = vertices & (vertices - 1)
         if corner < 3:
             write(wp.vec2i(mesh.faces[face, corner], mesh.order[other]), vertex_face, slot)
         else:
             write(wp.vec2i(mesh.faces[other, corner - 3], mesh.order[face]), vertex_face, slot)
         slot += wp.int64(1)
-    slot = take_slots(edge_edge_counts, _QUEUED, _bit_count(edges))
+    slot = take_slots(edge_edge_counts, _QUEUED, count_places(wp.uint32(edges)))
     while edges != 0:
-        bit = lowest_bit(edges)
+        bit = lowest_place(wp.uint32(edges))
         edges = edges & (edges - 1)
         edge = mesh.face_edges[face, bit / 3]
         other_edge = mesh.face_edges[other, bit % 3]

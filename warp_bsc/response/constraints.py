@@ -92,7 +92,7 @@ class Contacts:
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
     status: wp.array[wp.int8]
-    localized: wp.array[wp.bool]
+    within_tolerance: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
@@ -282,7 +282,7 @@ def add_constraint(
     friction: float,
     slow: int,
     kind: int,
-    localized: bool,
+    within_tolerance: bool,
     toi: wp.float64,
     multiplier: wp.vec3d,
 ):
@@ -296,7 +296,7 @@ def add_constraint(
         constraints.friction[i] = friction
         constraints.slow[i] = slow
         constraints.kind[i] = kind
-        constraints.localized[i] = localized
+        constraints.within_tolerance[i] = within_tolerance
         constraints.toi[i] = toi
         constraints.approach[i] = approach_of(motion, vertices, corners, weights, normal, separation)
         constraints.position_multiplier[i] = multiplier

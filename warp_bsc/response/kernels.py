@@ -157,7 +157,7 @@ def _collect_contact(
         friction,
         slow,
         kind,
-        contacts.localized[i],
+        contacts.within_tolerance[i],
         contacts.toi[i],
         multiplier,
     )
@@ -264,7 +264,7 @@ def _record_truncation(
     record.toi[entry] = time
     if kind != PLANE_CONTACT and kind != NO_CONTACT:
         record.contact[entry] = contact_vertices(contacts, i)
-        record.localized[entry] = contacts.localized[i]
+        record.within_tolerance[entry] = contacts.within_tolerance[i]
         record.toi[entry] = contacts.toi[i]
         record.coordinates[entry] = contacts.coordinates[i]
         record.normal[entry] = contacts.normal[i]

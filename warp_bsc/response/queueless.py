@@ -7,7 +7,6 @@ import warp as wp
 from ..detection.broad_phase_hierarchy import (
     BroadPhaseHierarchy,
     FaceHierarchy,
-    lowest_bit,
     overlapping_edges,
     overlapping_vertices,
     traversal_kernel,
@@ -95,7 +94,7 @@ def _decide_faces(arguments: _Arguments, place: int, other: int):
     left = left | ((overlapping_vertices(mesh, other, place, False) >> 3) << 3)
     left = left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
     while left != 0:  # one body for all, which is large
-        bit = lowest_bit(left)
+        bit = lowest_place(wp.uint32(left))
         left = left & (left - 1)
         kind = VERTEX_FACE
         pair = wp.vec2i()

@@ -409,7 +409,11 @@ class Response:
             contacts.mesh = self._connectivity
             contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
             contacts.elements, contacts.counts = elements, narrow_phase.counts
-            contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.within_tolerance
+            contacts.pairs, contacts.status, contacts.within_tolerance = (
+                found.pairs,
+                found.status,
+                found.within_tolerance,
+            )
             contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
             yield contacts
 
