@@ -1,55 +1,91 @@
 """Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
 
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import errno
 import os
+import re
+import secrets
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .._atomic_file import OutputFile
-from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
+from ..usd.layer import just_before, layer_metadata, unused_path
 from ..usd.scene import Scene
 from .intervals import IntervalResult
 from .outputs import without_last_eighth
-from .scene_contacts import KINDS
+from .scene_contacts import SceneContacts
 from .summary import Summary
 
-__all__ = ["Overlay"]
+__all__ = ["COLORS", "LIFT", "Overlay"]
 
-COLORS = {"vertex-face": (0.9, 0.1, 0.1), "edge-edge": (1.0, 0.55, 0.0)}
-"""Colours of the contact points by kind."""
-
-LIT = (0.95, 0.25, 0.2)
-"""Colour of the polygons that collide."""
-
-_UNLIT = (0.6, 0.6, 0.6)  # colour of a mesh that has none
-_DISPLAY_COLOR = "primvars:displayColor"
-_POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
-
-_COPIED = 1 << 20  # bytes that are copied at once
-
-_CONTACTS = {
-    "extent": ("float3[]", None),
-    "points": ("point3f[]", None),
-    "primvars:displayColor": ("color3f[]", "vertex"),
-    "primvars:toi": ("float[]", "vertex"),
-    "primvars:elementA": ("string[]", "vertex"),
-    "primvars:elementB": ("string[]", "vertex"),
+COLORS = {
+    "Polygons": (0.85, 0.08, 0.06),
+    "VertexFace": (1.0, 0.9, 0.2),
+    "EdgeEdge": (1.0, 0.5, 0.0),
 }
-"""Attributes of the contact points that have time samples: their types and interpolations."""
+"""Emitted colours by prim: polygons that collide, contact points by kind."""
+
+LIFT = 2e-4
+"""Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
+
+_POINT_SIZE = 0.006  # diameter of a contact point, as a share of that size
+_SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
+_TEXT_ROWS = 4096  # rows of an array that are text at once
+
+_EXTENT = {"extent": "float3[]"}
+_CONTACTS = _EXTENT | {
+    "points": "point3f[]",
+    "primvars:toi": "float[]",
+    "primvars:primA": "int[]",
+    "primvars:primB": "int[]",
+    "primvars:elementA": "int2[]",
+    "primvars:elementB": "int2[]",
+}
+_PARTS: dict[str, tuple[str, dict[str, str]]] = {
+    "Polygons": (
+        "Mesh",
+        _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},
+    ),
+    "VertexFace": ("Points", _CONTACTS),
+    "EdgeEdge": ("Points", _CONTACTS),
+}
+"""Prims of the layer: their types, and the types of their attributes that have time samples."""
+
+_SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
+"""Type and number of the components of a row, by the type of an attribute."""
 
 
 class Overlay:
-    """A layer in USD's text format whose sublayer is the scene, so that opening the layer shows both.
+    """A layer whose sublayer is the scene, so that opening the layer shows both. The scene's own prims stay untouched.
 
-    The contact points are one ``UsdGeom.Points`` with the primvars ``toi``, ``elementA`` and ``elementB``. It has a
-    sample at the start of each interval, with the contacts of that interval. Polygons that collide are coloured from
-    the start of the interval to the start of the next. USD interpolates between samples, so every sample is repeated
-    just before the next.
+    Below ``/Collisions`` are
+
+    - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
+      are lifted by :data:`LIFT` to both sides, move with the interval, and are there from its start to its end;
+    - ``VertexFace`` and ``EdgeEdge``, the contact points of both kinds, from the start of their interval to its end.
+      Their primvars are ``toi``; ``primA`` and ``primB``, indices in the constant primvar ``prims``, which has the
+      names of all meshes that collide; ``elementA`` and ``elementB``, the elements in the prims' own numbers: the point
+      and -1 for a vertex, the polygon and -1 for a face, the points at both ends of an edge.
+
+    All of them emit light of their own colour by a material of their own, which no material of the scene hides.
+
+    Their purpose is guide, so that no render of the layer contains them by accident, and a replay of the layer does not
+    take them for a part of the scene. Programs hide guides at first. usdview shows them by Display, Display Purposes,
+    Guide; Blender by Guide among the options of its import, Object Types; ``usdrecord`` by ``--purposes guide``.
+
+    A name that ends in ``.usda`` gives a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
+    smaller. USD interpolates between samples, so all that shall not move gets an empty sample just before the next.
 
     USD's own layers hold their whole content in memory. This one keeps its samples in a temporary file, the spool, and
-    sorts them by attribute at the end. It does not read the scene then, whose file may have become unreadable.
+    sorts them by attribute at the end, a few megabytes at a time. It does not read the scene then, whose file may have
+    become unreadable.
 
     Attributes:
         file: The file.
@@ -59,60 +95,43 @@ class Overlay:
         """Opens the file.
 
         Args:
-            path: The file's place, a ``.usda`` or ``.usd`` file.
+            path: The file's place, a ``.usda``, ``.usdc`` or ``.usd`` file.
             scene: The scene.
 
         Raises:
             OSError: If the file cannot be written.
             ValueError: If its name has another suffix.
         """
-        if Path(path).suffix not in (".usda", ".usd"):
-            raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
+        suffix = Path(path).suffix
+        if suffix not in (".usda", ".usdc", ".usd"):
+            raise ValueError(f"{path}: the overlay is a layer of USD, its name must end in .usda, .usdc or .usd")
+        self._is_text = suffix == ".usda"
         self._scene = scene
-        self._samples: dict[tuple[str, str], list[_Sample]] = {}  # by prim and attribute
+        self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
         self._ends = []  # where each complete interval ends in the spool
-        self._last_start: float | None = None  # of the last interval added
-        self._colored = {}  # by path of the prim: the number of polygons in the last sample, and the lit ones
-        self._unlit = {}  # by path of the prim: the colours in the scene
-        self._polygon_counts = {}  # by path: the number of polygons in the last interval added
-        self._uncolored = False
-        self._opened = set()  # native instances that must get prims of their own to be coloured
+        self._prims: dict[str, int] = {}  # number of each mesh that collides, by its name
         self._root_path = unused_path(scene, "/Collisions")
-        self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
-        self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
+        self._size = float(np.linalg.norm(high - low)) or 1.0
         self._metadata = layer_metadata(scene)
         self.file = OutputFile(path)
         self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
     def add(self, result: IntervalResult) -> None:
         """Adds the contacts of an interval."""
-        interval, contacts = result.summary, result.contacts
-        prim = self._contacts_path
-        size = self._width / 2
-        points = contacts.position.astype(np.float32)
-        corners = [points.min(axis=0) - size, points.max(axis=0) + size] if len(points) else np.zeros((2, 3))
-        colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind]
-        toi = contacts.toi.astype(np.float32)
-        chunks = contacts.chunks()
-        for name, texts in {
-            "extent": [_tuples(corners)],
-            "points": (_tuples(points[rows]) for rows in chunks),
-            "primvars:displayColor": (_tuples(colors[rows]) for rows in chunks),
-            "primvars:toi": (", ".join(f"{value:.9g}" for value in toi[rows].tolist()) for rows in chunks),
-            "primvars:elementA": (_element_texts(contacts, rows, 0) for rows in chunks),
-            "primvars:elementB": (_element_texts(contacts, rows, 1) for rows in chunks),
-        }.items():
-            self._sample(prim, name, interval.start, texts)
-        self._color(interval, contacts)
-        self._last_start = interval.start
+        contacts = result.contacts
+        interval = contacts.interval
+        self._sample("Polygons", interval.start, *self._find_polygons(contacts))
+        for kind, name in enumerate(("VertexFace", "EdgeEdge")):
+            self._sample(name, interval.start, self._find_points(contacts, np.flatnonzero(contacts.kind == kind)))
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
         """Writes the layer and puts it in its place."""
         del self._ends[len(summary.intervals) :]
-        self.file.truncate(0)
-        self._write(summary.first(len(self._ends)))
+        summary = summary.first(len(self._ends))
+        write = self._write_text if self._is_text else self._write_binary
+        write(summary, summary.intervals[-1].end if summary.intervals else self._scene.times[0])
         self.file.commit()
 
     def shrink(self) -> bool:
@@ -128,210 +147,265 @@ class Overlay:
         self._spool.close()
         self.file.discard()
 
-    def _sample(self, prim, name, time, texts, lit_count=0):
-        """Adds a sample of an attribute to the spool."""
-        place = self._spool.seek(0, os.SEEK_END)
-        separator = ""
-        for text in texts:
-            rest = memoryview((separator + text).encode())
-            while rest:
-                rest = rest[self._spool.write(rest) :]
-            separator = ", "
-        sample = _Sample(time, place, self._spool.tell() - place, lit_count)
-        self._samples.setdefault((prim, name), []).append(sample)
-
-    def _color(self, interval, contacts):
-        """Adds the colours of all meshes whose colours change at the start of an interval."""
-        meshes = {mesh.path: mesh for mesh in contacts.interval.segment.meshes if mesh.path == mesh.name}
-        lit = {}
+    def _find_polygons(self, contacts: SceneContacts):
+        """Returns the mesh of the polygons that collide in an interval, and its points just before the end."""
+        segment, faces = contacts.interval.segment, []
         for number, polygons in contacts.colliding_polygons().items():
-            mesh = contacts.interval.segment.meshes[number]
-            if mesh.path in meshes:
-                lit[mesh.path] = polygons
-            else:
-                self._uncolored = True
-        for path in sorted({*self._colored, *lit} & meshes.keys()):
-            count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
-            if path not in self._colored:
-                self._opened.update(find_instances_above(self._scene, path))
-                if self._last_start is not None:
-                    self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
-            old_count, old_polygons = self._colored.get(path, (None, None))
-            if old_count != count or not np.array_equal(old_polygons, polygons):
-                self._sample_colors(path, interval.start, count, polygons)
-                self._colored[path] = count, polygons
-        self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
+            mesh = segment.meshes[number]
+            first = np.searchsorted(mesh.polygons, polygons)
+            last = np.searchsorted(mesh.polygons, polygons, side="right")
+            faces += [mesh.faces.start + np.arange(start, stop) for start, stop in zip(first, last, strict=True)]
+        if not faces:
+            return None, None
+        vertices, corners = np.unique(segment.faces[np.concatenate(faces)], return_inverse=True)
+        corners = corners.reshape(-1, 3)
+        start, stop = (self._lift(x[vertices], corners) for x in (contacts.interval.x0, contacts.interval.x1))
+        arrays = {
+            "extent": _box(np.concatenate([start, stop])),
+            "faceVertexCounts": np.full(2 * len(corners), 3),
+            "faceVertexIndices": np.concatenate([corners, corners[:, ::-1] + len(vertices)]).reshape(-1),
+            "points": start,
+        }
+        return arrays, (just_before(contacts.interval.end), stop)
 
-    def _sample_colors(self, path, time, count, lit):
-        colors = display_colors(self._scene, path, time)
-        self._unlit[path] = np.array([_UNLIT]) if colors is None else colors
-        text = _color_text(self._unlit[path], count, lit)
-        self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
+    def _lift(self, x, corners) -> np.ndarray:
+        """Returns the points of triangles moved along their normals, all to the one side and then all to the other."""
+        x = x.astype(np.float64)
+        a, b, c = np.moveaxis(x[corners], 1, 0)
+        across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        normal = np.stack([np.bincount(corners.reshape(-1), across[:, axis], len(x)) for axis in range(3)], axis=1)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        step = LIFT * self._size * np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+        return np.concatenate([x + step, x - step])
 
-    def _write(self, summary):
-        """Writes the whole layer for the intervals of a summary."""
-        spool_end = self._ends[-1] if self._ends else 0
-        parts = {path: [] for path in sorted(self._opened)}
-        for (path, name), samples in self._samples.items():
-            kept = [sample for sample in samples if sample.place < spool_end]
-            if kept:
-                parts.setdefault(path, []).append((name, kept))
-        writer = _Writer(self.file)
-        writer.write(self._head(summary))
-        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
-        self._write_prims(writer, "", _tree(parts), parts, end)
-        writer.flush()
+    def _find_points(self, contacts: SceneContacts, rows: np.ndarray):
+        """Returns some contacts as points, None if there are none."""
+        if not len(rows):
+            return None
+        names = (mesh.name for mesh in contacts.interval.segment.meshes)
+        numbers = np.full(len(contacts.interval.segment.meshes), -1)
+        used = np.unique(contacts.meshes[rows])
+        for mesh, name in enumerate(names):
+            if mesh in used:
+                numbers[mesh] = self._prims.setdefault(name, len(self._prims))
+        prims, indices = numbers[contacts.meshes[rows]], contacts.indices[rows]
+        points, size = contacts.position[rows], _POINT_SIZE * self._size / 2
+        return {
+            "extent": _box(points) + np.array([[-size], [size]]),
+            "points": points,
+            "primvars:toi": contacts.toi[rows],
+            "primvars:primA": prims[:, 0],
+            "primvars:primB": prims[:, 1],
+            "primvars:elementA": indices[:, 0],
+            "primvars:elementB": indices[:, 1],
+        }
 
-    def _head(self, summary) -> str:
-        """Returns the layer's metadata as text."""
-        doc = f"Collisions found by warp-bsc replay. {summary.motion}"
-        if self._uncolored:
-            doc += " Polygons of point instancers are not coloured: their instances are one prim."
-        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
-        asset = source if source.startswith("../") else f"./{source}"
-        complete = "true" if summary.is_complete else "false"
-        stopped = f"\n            string stopped = {_quote(summary.stopped)}" if summary.stopped else ""
-        metadata = "\n    ".join(f"{name} = {_literal(value)}" for name, value in self._metadata.items())
-        return f"""#usda 1.0
-(
-    customLayerData = {{
-        dictionary collisions = {{
-            bool complete = {complete}
-            int hits = {summary.hits}
-            int intervals = {len(summary.intervals)}{stopped}
-        }}
-    }}
-    doc = {_quote(doc)}
-    {metadata}
-    subLayers = [
-        @@@{asset}@@@
-    ]
-)
-"""
+    def _sample(self, name, time, arrays, moved=None):
+        """Adds a sample of a prim's attributes to the spool, unless it would repeat an empty one.
 
-    def _write_prims(self, writer, path, tree, parts, end):
-        """Writes the prims below a path, from a tree of their names."""
-        indent = "    " * path.count("/")
-        for name, children in tree.items():
-            below = f"{path}/{name}"
-            kind = {self._root_path: "def Scope", self._contacts_path: "def Points"}.get(below, "over")
-            opened = " (\n" + indent + "    instanceable = false\n" + indent + ")" if below in self._opened else ""
-            writer.write(f'\n{indent}{kind} "{name}"{opened}\n{indent}{{\n')
-            if below == self._contacts_path:
-                writer.write(f"{indent}    float[] widths = [{self._width:.9g}] (\n")
-                writer.write(f'{indent}        interpolation = "constant"\n{indent}    )\n')
-            for attribute, samples in parts.get(below, ()):
-                self._write_attribute(writer, indent + "    ", below, attribute, samples, end)
-            self._write_prims(writer, below, children, parts, end)
-            writer.write(f"{indent}}}\n")
+        Args:
+            name: The prim.
+            time: Time code.
+            arrays: Values by attribute, None if there is nothing at that time.
+            moved: A time just before the next sample, and the points at that time.
+        """
+        samples = self._samples[name]
+        if arrays is None and samples and samples[-1].is_empty:
+            return
+        types = _PARTS[name][1]
+        self._spool.seek(0, os.SEEK_END)
+        places = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
+        after = (moved[0], self._store(types["points"], moved[1])) if moved else None
+        samples.append(_Sample(time, places, after))
 
-    def _write_attribute(self, writer, indent, path, name, samples, end):
-        """Writes an attribute's samples, and its value after the last interval."""
-        if path == self._contacts_path:
-            value_type, interpolation = _CONTACTS[name]
-            after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
-        else:
-            value_type, interpolation = "color3f[]", "uniform"
-            lit_count = samples[-1].lit_count
-            after = _color_text(self._unlit[path], lit_count, []) if lit_count else None
-            writer.write(f"{indent}int[] {name}:indices = None\n")  # the scene's own
-        writer.write(f"{indent}{value_type} {name}")
-        if interpolation:
-            writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
-        writer.write(".timeSamples = {\n")
-        following = [*((sample.time, sample.length) for sample in samples[1:]), (end, len(after or ""))]
-        for sample, (time, length) in zip(samples, following, strict=True):
-            self._write_sample(writer, indent, sample.time, sample)
+    def _store(self, value_type, array) -> "_Place":
+        data = np.ascontiguousarray(array, dtype=_SHAPES[value_type][0])
+        place = _Place(self._spool.tell(), data.nbytes)
+        rest = memoryview(data).cast("B")
+        while rest:
+            rest = rest[self._spool.write(rest) :]
+        return place
+
+    def _load(self, value_type, place) -> np.ndarray:
+        dtype, width = _SHAPES[value_type]
+        data = np.empty(place.size, np.uint8)
+        self._spool.seek(place.offset)
+        if self._spool.readinto(data) != place.size:
+            raise RuntimeError("the spool of the overlay is cut off")
+        return data.view(dtype).reshape((-1, width) if width > 1 else -1)
+
+    def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
+        """Yields the time samples of an attribute up to the end of the last interval, in order."""
+        value_type = _PARTS[name][1][attribute]
+        empty = self._load(value_type, _Place(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
+        samples = [sample for sample in self._samples[name] if sample.time < end]  # of complete intervals
+        for index, sample in enumerate(samples):
+            if sample.is_empty:
+                yield sample.time, empty
+                continue
+            value = self._load(value_type, sample.places[attribute])
+            yield sample.time, value
+            is_last = index + 1 == len(samples)
+            following = end if is_last else samples[index + 1].time
+            if attribute == "points" and sample.moved:
+                yield sample.moved[0], self._load(value_type, sample.moved[1])
             # USD interpolates if both have values, and would show points on the way from one contact to another.
-            if sample.length and length and (before := just_before(time)) > sample.time:
-                if interpolation == "vertex":
-                    writer.write(f"{indent}    {before!r}: [],\n")
+            elif value_type.startswith(("float", "point")) and (before := just_before(following)) > sample.time:
+                yield before, value if attribute == "extent" else empty
+            if is_last:
+                yield end, empty
+
+    def _write_binary(self, summary, end):
+        """Writes the layer in USD's binary format, which can save samples and drop them from memory."""
+        from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
+
+        path = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+        try:
+            layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(path))
+            self._define_prims(layer)
+            self._describe(layer, summary)
+            waiting = 0
+            for prim, attribute in _attributes():
+                place = f"{self._root_path}/{prim}.{attribute}"
+                for time, value in self._time_samples(prim, attribute, end):
+                    layer.SetTimeSample(place, time, _to_vt(_PARTS[prim][1][attribute], value))
+                    waiting += value.nbytes
+                    if waiting > _SAVED:
+                        layer.Save()
+                        waiting = 0
+            layer.Save()
+            del layer  # closes the file
+            self.file.adopt(path)
+        except BaseException as error:
+            path.unlink(missing_ok=True)
+            if isinstance(error, Tf.ErrorException):
+                raise _as_os_error(error) from error
+            raise
+
+    def _write_text(self, summary, end):
+        """Writes the layer in USD's text format, sample by sample into the text of a layer without samples."""
+        from pxr import Sdf  # noqa: PLC0415 (slow)
+
+        head, body = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
+        self._describe(head, summary)
+        self._define_prims(body)
+        attributes = list(_attributes())
+        for number, (prim, attribute) in enumerate(attributes):  # whose sample is at the time of its number
+            empty = _to_vt(_PARTS[prim][1][attribute], self._load(_PARTS[prim][1][attribute], _Place(0, 0)))
+            body.SetTimeSample(f"{self._root_path}/{prim}.{attribute}", number, empty)
+        self.file.truncate(0)
+        self.file.write(head.ExportToString().rstrip("\n"))
+        # Text, number of the attribute, text, number, ...: no name of a prim has a line break in it.
+        parts = re.split(r"\n *(\d+): \[\],\n", body.ExportToString().removeprefix("#usda 1.0"))
+        for part, number in zip(parts[::2], [*parts[1::2], None], strict=True):
+            self.file.write(part + "\n")
+            if number is not None:
+                prim, attribute = attributes[int(number)]
+                for time, value in self._time_samples(prim, attribute, end):
+                    self.file.write(f"{time!r}: [")
+                    for start in range(0, len(value), _TEXT_ROWS):
+                        self.file.write(", " * bool(start) + _to_text(value[start : start + _TEXT_ROWS]))
+                    self.file.write("],\n")
+
+    def _describe(self, layer, summary):
+        """Sets the metadata of the layer. It does not open the sublayer, the scene."""
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
+        found = {"complete": summary.is_complete, "hits": summary.hits, "intervals": len(summary.intervals)}
+        layer.customLayerData = {"collisions": found | ({"stopped": summary.stopped} if summary.stopped else {})}
+        layer.documentation = f"Collisions found by warp-bsc replay, of purpose guide. {summary.motion}"
+        for name, value in self._metadata.items():
+            layer.pseudoRoot.SetInfo(name, value)
+        layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
+
+    def _define_prims(self, layer):
+        """Defines the prims of the layer, without time samples."""
+        from pxr import Sdf, Usd, UsdGeom, UsdShade  # noqa: PLC0415 (slow)
+
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.Scope.Define(stage, self._root_path).CreatePurposeAttr(UsdGeom.Tokens.guide)
+        UsdGeom.Scope.Define(stage, f"{self._root_path}/Materials")
+        for name, (kind, attributes) in _PARTS.items():
+            prim = stage.DefinePrim(f"{self._root_path}/{name}", kind)
+            for attribute, type_name in attributes.items():
+                value_type = Sdf.ValueTypeNames.Find(type_name)
+                if attribute.startswith("primvars:"):
+                    UsdGeom.PrimvarsAPI(prim).CreatePrimvar(attribute, value_type, UsdGeom.Tokens.vertex)
                 else:
-                    self._write_sample(writer, indent, before, sample)
-        if after is not None:
-            writer.write(f"{indent}    {end!r}: [{after}],\n")
-        writer.write(f"{indent}}}\n")
+                    prim.CreateAttribute(attribute, value_type, False)
+            gprim = UsdGeom.Gprim(prim)
+            gprim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(
+                [COLORS[name]]
+            )  # where materials are not shown
+            material = UsdShade.Material.Define(stage, f"{self._root_path}/Materials/{name}")
+            shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
+            shader.CreateIdAttr("UsdPreviewSurface")
+            shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
+            shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(COLORS[name])
+            shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+            material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+            UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+            if kind == "Mesh":
+                UsdGeom.Mesh(prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+            if kind == "Points":
+                UsdGeom.Points(prim).CreateWidthsAttr([_POINT_SIZE * self._size])
+                UsdGeom.Points(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
+                names = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("prims", Sdf.ValueTypeNames.StringArray)
+                names.Set(list(self._prims))
 
-    def _write_sample(self, writer, indent, time, sample):
-        writer.write(f"{indent}    {time!r}: [")
-        self._spool.seek(sample.place)
-        for size in [_COPIED] * (sample.length // _COPIED) + [sample.length % _COPIED]:
-            writer.write_bytes(self._spool.read(size))
-        writer.write("],\n")
 
+@dataclass(frozen=True)
+class _Place:
+    """The place of an array in the spool: offset and size in bytes."""
 
-class _Writer:
-    """Writes many short texts as a few long ones."""
-
-    def __init__(self, output):
-        self.file = output
-        self._waiting, self._length = [], 0
-
-    def write(self, text):
-        self.write_bytes(text.encode())
-
-    def write_bytes(self, data):
-        self._waiting.append(data)
-        self._length += len(data)
-        if self._length >= _COPIED:
-            self.flush()
-
-    def flush(self):
-        self.file.write(b"".join(self._waiting))
-        self._waiting, self._length = [], 0
+    offset: int
+    size: int
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """A sample in the spool: its time, its place and length there, and the number of polygons if any is lit."""
+    """A sample of a prim in the spool: its time, the places of its arrays by attribute, and its points at its end."""
 
     time: float
-    place: int
-    length: int
-    lit_count: int
+    places: dict[str, _Place]
+    moved: tuple[float, _Place] | None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing at that time."""
+        return not self.places
 
 
-def _color_text(colors, count, lit) -> str:
-    """Returns the colours of a mesh's polygons as text, :data:`LIT` for the lit ones."""
-    if len(colors) != count:
-        colors = colors.mean(axis=0, keepdims=True)
-    table, numbers = np.unique(colors, axis=0, return_inverse=True)
-    texts = np.array([_tuples([color]) for color in [*table, LIT]], dtype=object)
-    numbers = np.broadcast_to(numbers.reshape(-1), count).copy()
-    numbers[lit] = len(table)
-    return ", ".join(texts[numbers])
+def _attributes() -> Iterator[tuple[str, str]]:
+    """Yields all attributes with time samples: the names of their prims and their own."""
+    return ((prim, attribute) for prim, (_, attributes) in _PARTS.items() for attribute in attributes)
 
 
-def _element_texts(contacts, rows, side) -> str:
-    """Returns the first or the second elements of some contacts as text, with the names of their meshes."""
-    both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
-    return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
+def _to_vt(value_type, array) -> Any:
+    from pxr import Vt  # noqa: PLC0415 (slow)
+
+    types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
+    types |= {"int[]": Vt.IntArray, "int2[]": Vt.Vec2iArray}
+    return types[value_type].FromNumpy(array)
 
 
-def _tree(paths) -> dict:
-    """Returns the names of prims as a tree of dictionaries."""
-    tree = {}
-    for path in paths:
-        place = tree
-        for name in path.strip("/").split("/"):
-            place = place.setdefault(name, {})
-    return tree
+def _to_text(rows) -> str:
+    """Returns rows of an array in the syntax of USD's text format."""
+    number = "{:.9g}" if rows.dtype.kind == "f" else "{}"
+    row = number if rows.ndim == 1 else "(" + ", ".join([number] * rows.shape[1]) + ")"
+    return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
 
 
-def _tuples(rows) -> str:
-    return ", ".join(f"({x:.9g}, {y:.9g}, {z:.9g})" for x, y, z in np.asarray(rows, dtype=np.float32).tolist())
+def _as_os_error(error) -> Exception:
+    """Returns the system's error in an error of OpenUSD, such as a full disk, or the error itself if there is none."""
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if os.strerror(number) in str(error):
+            return OSError(number, os.strerror(number))
+    return error
 
 
-def _literal(value: str | float) -> str:
-    """Returns a string or a number in the syntax of USD's text format."""
-    return _quote(value) if isinstance(value, str) else repr(value)
-
-
-def _quote(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    if escaped.isprintable():
-        return f'"{escaped}"'
-    return '"' + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else "?" for c in escaped) + '"'
+def _box(points) -> np.ndarray:
+    """Returns the smallest and the largest coordinates of points, shape [2, 3]."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
