@@ -51,7 +51,7 @@ from numpy.typing import ArrayLike
 
 from ._arrays import checked_coordinates
 
-__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "vertex_face", "vertex_face_toi"]
+__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "edges_pass_faces", "vertex_face", "vertex_face_toi"]
 
 # The triangles of a query, each corner a difference of two of its four points (first minus second).
 _VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
@@ -136,12 +136,45 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
     Raises:
         ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
+    edges, faces = _checked_pairs(edges, faces)
+    points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
+    return _collides(points, _VERTEX_FACE)
+
+
+def edges_pass_faces(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
+    """Returns which edges pass through which faces, pair by pair, at one moment.
+
+    The ends of such an edge are strictly on different sides of the face's plane, and it meets the inside of the face.
+    An edge that touches a face, or passes its boundary, does not.
+
+    Args:
+        edges: End points, float32 or float64 array of shape (n, 2, 3).
+        faces: Corners, float32 or float64 array of shape (n, 3, 3).
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
+    """
+    edges, faces = _checked_pairs(edges, faces)
+    p, q, a, b, c = _integers(np.concatenate([edges, faces], axis=1)).transpose(1, 2, 0)
+
+    def side(x, y, z):
+        return np.sign((x * np.cross(y, z, axis=0)).sum(axis=0)).astype(int)
+
+    sides = side(p - a, b - a, c - a), side(q - a, b - a, c - a)
+    passed = np.stack([side(q - p, x - p, y - p) for x, y in ((a, b), (b, c), (c, a))])
+    return (sides[0] * sides[1] < 0) & (np.abs(passed.sum(axis=0)) == 3)
+
+
+def _checked_pairs(edges, faces):
+    """Returns edges and faces as arrays; raises ValueError if they are none, or no pairs."""
     edges = checked_coordinates(edges, (2, 3), "edges")
     faces = checked_coordinates(faces, (3, 3), "faces")
     if len(edges) != len(faces):
         raise ValueError(f"edges and faces must have the same length, got {len(edges)} edges and {len(faces)} faces")
-    points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
-    return _collides(points, _VERTEX_FACE)
+    return edges, faces
 
 
 def _collides(points, pairs):

@@ -68,13 +68,14 @@ class BroadPhase(Protocol):
         """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
         ...
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
 
         Args:
             x: Positions, array of vec3 or vec3d.
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
+            refit: As of :meth:`pair_elements`.
         """
         ...
 

@@ -313,9 +313,9 @@ class BroadPhaseSimd:
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=True)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=True)
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
-        self._build([self._edges, self._faces], x, x, False)
+        self._build([self._edges, self._faces], x, x, refit)
         self._edges.pair(self._faces, counts, pairs)
 
     def _build(

@@ -129,7 +129,7 @@ class HitsCsv(RecordFile):
 
 def _rows(contacts, rows):
     """Yields the values of :data:`_FIELDS` for some contacts."""
-    paths = [mesh.path for mesh in contacts.interval.segment.meshes]
+    paths = [mesh.path for mesh in contacts.segment.meshes]
     columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
     columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]
     for names, elements, kind, pair, indices, *measures in zip(

@@ -8,12 +8,15 @@ import numpy as np
 
 from ..detection.collisions import Collisions, DetectionStats
 from ..detection.detector import CollisionDetector
+from ..detection.intersections import IntersectionFinder
 from ..detection.mesh import CollisionMesh
+from ..usd.interval import Interval
 from ..usd.scene import Scene
-from .scene_contacts import SceneContacts, find_contacts
+from .scene_contacts import PHASES, SceneContacts, find_contacts
+from .scene_intersections import SceneIntersections, name_intersections
 from .validation import Validation, validate
 
-__all__ = ["TOI_BINS", "Contact", "IntervalResult", "IntervalSummary", "replay"]
+__all__ = ["TOI_BINS", "Contact", "IntersectionSummary", "IntervalResult", "IntervalSummary", "replay"]
 
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
@@ -37,6 +40,24 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class IntersectionSummary:
+    """The edges that meet faces at one time of a scene, in numbers.
+
+    Attributes:
+        time: Time code.
+        crossings: Number of edges that pass through faces: pairs of an edge and a face.
+        touches: Number of edges that only touch faces.
+        mesh_pairs: Both numbers for each two meshes that intersect, by their names, in order; a mesh that intersects
+            itself is there twice.
+    """
+
+    time: float
+    crossings: int
+    touches: int
+    mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+
+
+@dataclass(frozen=True)
 class IntervalSummary:
     """The collisions between two consecutive times of a scene, in numbers.
 
@@ -54,6 +75,10 @@ class IntervalSummary:
             move straight from the start to the end.
         stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None if none was asked for.
+        intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
+            moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
+        separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
+        phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
     """
 
     index: int
@@ -67,6 +92,9 @@ class IntervalSummary:
     certified: bool
     stats: DetectionStats
     validation: Validation | None
+    intersections: tuple[IntersectionSummary, IntersectionSummary] | None
+    separate_hits: int | None
+    phases: tuple[int, ...] | None
 
     @property
     def hits(self) -> int:
@@ -91,29 +119,41 @@ class IntervalResult:
     Attributes:
         summary: The numbers, which are small and can be kept for all intervals.
         contacts: Every pair that collides, and the positions of all vertices.
+        intersections: Every edge that meets a face, at the start of the interval and at its end; None if they were not
+            looked for. Where nothing jumps, those at the end are the next interval's at its start, the same object.
     """
 
     summary: IntervalSummary
     contacts: SceneContacts
+    intersections: tuple[SceneIntersections, SceneIntersections] | None
 
 
 def replay(
-    scene: Scene, *, method: str = "exact", device: Any = None, validate_most: int | None = 0
+    scene: Scene,
+    *,
+    method: str = "exact",
+    device: Any = None,
+    intersections: bool = True,
+    validate_most: int | None = 0,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
     Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
-    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end::
+    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end. The
+    edges that pass through faces at the times themselves are found as well, between obstacles too::
 
         import warp_bsc as bsc
 
         for interval in bsc.replay(bsc.Scene("scene.usd")):
             print(interval.summary.start, interval.summary.hits, interval.contacts.position)
+            start, end = interval.intersections
+            print(start.crossings, start.mesh_names(slice(0, 5)), start.position)
 
     Args:
         scene: The scene; its selection says which pairs count.
-        method: ``"float"``, ``"conservative"`` or ``"exact"``.
+        method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default.
+        intersections: Whether to find the intersections at each time.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
@@ -123,16 +163,35 @@ def replay(
     Raises:
         ValueError: If the positions at some time are broken, or there is no such method.
     """
-    detector = segment = None
+    segment_replay = None
     for interval in scene:
-        if detector is None or interval.segment is not segment:
-            detector = None  # before the next is made, to free its memory
-            segment = interval.segment
-            mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
-            detector = CollisionDetector(mesh, method=method)
+        if segment_replay is None or interval.segment is not segment_replay.segment:
+            segment_replay = None  # before the next is made, to free its memory
+            segment_replay = _SegmentReplay(scene, interval, method, device, intersections)
+        yield segment_replay.check(interval, validate_most)
+
+
+class _SegmentReplay:
+    """Checks the intervals of one segment."""
+
+    def __init__(self, scene: Scene, interval: Interval, method: str, device: Any, intersections: bool):
+        self._scene = scene
+        self.segment = segment = interval.segment
+        self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
+        self._detector = CollisionDetector(self._mesh, method=method)
+        self._finder = IntersectionFinder(self._mesh) if intersections else None
+        self._last: SceneIntersections | None = None  # those found last
+
+    def check(self, interval: Interval, validate_most: int | None) -> IntervalResult:
+        """Returns the collisions of an interval."""
+        detector = self._detector
+        intersections = None
+        if self._finder:
+            start = self._find(interval.x0, interval.start)
+            intersections = start, self._find(interval.x1, interval.end)
         collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        contacts = find_contacts(interval, detector.mesh, collisions, scene.selection)
+        contacts = find_contacts(interval, self._mesh, collisions, self._scene.selection, intersections)
         validation = None
         if validate_most != 0:
             validation = validate(
@@ -144,10 +203,20 @@ def replay(
                 seed=interval.index,
                 counted=contacts.counted,
             )
-        yield IntervalResult(_summarize(contacts, collisions, validation), contacts)
+        summary = _summarize(contacts, collisions, intersections, validation)
+        return IntervalResult(summary, contacts, intersections)
+
+    def _find(self, x: np.ndarray, time: float) -> SceneIntersections:
+        """Returns the intersections at a time, those found last if these are the ones."""
+        last = self._last
+        if last is None or last.time != time or not np.array_equal(last.x, x):
+            assert self._finder
+            found = self._finder.find(x)
+            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, self._scene.selection)
+        return last
 
 
-def _summarize(contacts, collisions, validation) -> IntervalSummary:
+def _summarize(contacts, collisions, intersections, validation) -> IntervalSummary:
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
@@ -158,8 +227,7 @@ def _summarize(contacts, collisions, validation) -> IntervalSummary:
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )
-    pairs, counts = np.unique(np.sort(contacts.meshes, axis=1), axis=0, return_counts=True)
-    names = [mesh.name for mesh in interval.segment.meshes]
+    hits_by_meshes = contacts.count_by_meshes(np.ones((len(contacts), 1), dtype=int))
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
         index=interval.index,
@@ -168,9 +236,19 @@ def _summarize(contacts, collisions, validation) -> IntervalSummary:
         vertex_face_hits=len(contacts) - edge_edge,
         edge_edge_hits=edge_edge,
         toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
-        mesh_pairs={(names[a], names[b]): count for (a, b), count in zip(pairs, counts.tolist(), strict=True)},
+        mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
         certified=collisions.certified,
         stats=collisions.stats,
         validation=validation,
+        intersections=tuple(map(_summarize_intersections, intersections)) if intersections else None,
+        separate_hits=int(contacts.separate.sum()) if intersections else None,
+        phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
+    )
+
+
+def _summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
+    by_meshes = found.count_by_meshes(np.stack([found.crosses, ~found.crosses], axis=1))
+    return IntersectionSummary(
+        found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
     )

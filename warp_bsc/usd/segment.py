@@ -145,10 +145,8 @@ class Segment:
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all meshes that have each edge, shape [n, 2], smaller vertex first: rows, and the meshes."""
-        keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
-        return rows, np.searchsorted(self._face_ends, sides[places] // 3, side="right")
+        rows, faces = self.faces_of_edges(ends)
+        return rows, np.searchsorted(self._face_ends, faces, side="right")
 
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
@@ -190,6 +188,32 @@ class Segment:
         marked = np.zeros(self.vertex_count, dtype=bool)
         marked[vertices] = True
         return np.flatnonzero(marked[self.faces].any(axis=1))
+
+    def faces_of_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all faces that have each edge, shape [n, 2], smaller vertex first, as a side: rows, and the faces."""
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
+        return rows, sides[places] // 3
+
+    def are_stiff(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+        """Returns which elements are paired with their own mesh, and that mesh moves and does not deform.
+
+        Vertices and edges may be welded to those of other meshes: they belong to all of these.
+
+        Args:
+            elements: Vertices, shape [n], or edges, shape [n, 2], smaller vertex first.
+            meshes: The other element's mesh, shape [n].
+
+        Returns:
+            Whether the other mesh is one of the element's, and stiff, bool, shape [n].
+        """
+        stiff = np.array([mesh.moves and not mesh.deforms for mesh in self.meshes], dtype=bool)
+        are_stiff = np.zeros(len(elements), dtype=bool)
+        if stiff.any():
+            rows, own = self.meshes_at_vertices(elements) if elements.ndim == 1 else self.meshes_at_edges(elements)
+            are_stiff[rows[stiff[own] & (own == meshes[rows])]] = True
+        return are_stiff
 
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
