@@ -21,14 +21,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import CHROMIUM
-from pxr import Sdf, Usd, UsdGeom, UsdUtils
-from stages import FALLING, FLOOR, add_falling, add_floor, add_mesh, falling, moved, new_stage, save
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
 
+import warp_bsc as bsc
 from warp_bsc import _atomic_file
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
-from warp_bsc.replay.usd_overlay import COLORS, LIT
+from warp_bsc.replay import usd_overlay
+from warp_bsc.replay.usd_overlay import COLORS, LIFT
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>"
@@ -63,85 +65,139 @@ def errors_of(stage):
     return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
 
 
-def read_contacts(overlay, time, path="/Collisions/Contacts"):
-    points = UsdGeom.Points(overlay.GetPrimAtPath(path))
-    api = UsdGeom.PrimvarsAPI(points)
-    primvars = {name: list(api.GetPrimvar(name).Get(time)) for name in ("toi", "elementA", "elementB", "displayColor")}
-    return np.array(points.GetPointsAttr().Get(time)).reshape(-1, 3), primvars
+def read_contacts(overlay, time, kinds=("VertexFace", "EdgeEdge"), root="/Collisions"):
+    """Points of contact, and the values of each primvar, meshes by their names."""
+    prims, points, primvars = overlay.GetPrimAtPath(root).GetAttribute("prims").Get(), [], {}
+    for kind in kinds:
+        instancer = UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"{root}/{kind}"))
+        api = UsdGeom.PrimvarsAPI(instancer)
+        points.extend(instancer.GetPositionsAttr().Get(time))
+        assert len(instancer.GetProtoIndicesAttr().Get(time)) == len(instancer.GetPositionsAttr().Get(time))
+        for name in ("toi", "elementA", "elementB", "primA", "primB"):
+            primvar = api.GetPrimvar(name)
+            assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+            values = [tuple(value) if name.startswith("element") else value for value in primvar.Get(time)]
+            primvars.setdefault(name, []).extend(
+                [prims[value] for value in values] if name.startswith("prim") else values
+            )
+    return np.array(points).reshape(-1, 3), primvars
 
 
-def floor_colors(overlay, time, path="/World/Floor"):
-    primvar = UsdGeom.Gprim(overlay.GetPrimAtPath(path)).GetDisplayColorPrimvar()
-    assert primvar.GetInterpolation() == UsdGeom.Tokens.uniform
-    return [tuple(color) for color in primvar.Get(time)]
+def read_polygons(overlay, time, root="/Collisions"):
+    """The triangles of the polygons that collide, as points: of one side, then of the other."""
+    mesh = UsdGeom.Mesh(overlay.GetPrimAtPath(f"{root}/Polygons"))
+    points = np.array(mesh.GetPointsAttr().Get(time)).reshape(-1, 3)
+    counts, corners = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
+    assert list(counts) == [3] * (len(corners) // 3)
+    return points[np.array(corners, dtype=int)].reshape(-1, 3, 3)
+
+
+def read_curves(overlay, time, root="/Collisions"):
+    """The ends of the segments in which triangles meet."""
+    curves = UsdGeom.BasisCurves(overlay.GetPrimAtPath(f"{root}/Intersections"))
+    counts = curves.GetCurveVertexCountsAttr().Get(time)
+    assert set(counts) <= {2} and curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear
+    return np.array(curves.GetPointsAttr().Get(time)).reshape(-1, 2, 3)
 
 
 # --- The overlay ---
 
 
-def test_overlay(stage, tmp_path):
-    before = Path(save(stage)).read_bytes()
-    replay(stage)
-    assert (tmp_path / "scene.usda").read_bytes() == before
-    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+@pytest.mark.parametrize("suffix", ["usda", "usdc", "usd"])
+def test_overlay(stage, tmp_path, suffix):
+    scene = Path(save(stage))
+    before = scene.read_bytes()
+    path = tmp_path / f"overlay.{suffix}"
+    assert main(["replay", str(scene), "--device", "cpu", "--overlay", str(path)]) == 0
+    assert scene.read_bytes() == before
+    assert path.read_bytes().startswith(b"#usda" if suffix == "usda" else b"PXR-USDC")
+    overlay = Usd.Stage.Open(str(path))
     assert errors_of(overlay) == []
     assert overlay.GetRootLayer().subLayerPaths == ["./scene.usda"]
+    assert [spec.name for spec in overlay.GetRootLayer().rootPrims] == ["Collisions"]  # the scene's stay untouched
     assert overlay.GetPrimAtPath("/World/Falling").IsA(UsdGeom.Mesh)
-    contacts = overlay.GetPrimAtPath("/Collisions/Contacts")
-    assert UsdGeom.Points(contacts).GetPointsAttr().GetTimeSamples() == [0, 1, 2, 3, 4]
     points, primvars = read_contacts(overlay, 2)
     np.testing.assert_allclose(points, [(0.5, -0.5, 0)], atol=1e-6)
     assert primvars["toi"] == pytest.approx([0.5], abs=1e-5)
-    assert (primvars["elementA"], primvars["elementB"]) == (["/World/Falling vertex 0"], ["/World/Floor face 1"])
-    assert primvars["displayColor"] == [pytest.approx(COLORS["vertex-face"])]
+    assert (primvars["primA"], primvars["elementA"]) == (["/World/Falling"], [(0, -1)])
+    assert (primvars["primB"], primvars["elementB"]) == (["/World/Floor"], [(1, -1)])
+    contacts = overlay.GetPrimAtPath("/Collisions/VertexFace")
     for time in (0, 1, 3, 4):
-        assert len(read_contacts(overlay, time)[0]) == 0
-    low, high = UsdGeom.Points(contacts).GetExtentAttr().Get(2)
+        assert len(read_contacts(overlay, time)[0]) == len(read_polygons(overlay, time)) == 0
+    low, high = contacts.GetAttribute("extent").Get(2)
     assert np.all(np.array(low) < points[0]) and np.all(points[0] < np.array(high))
+    assert left_behind(tmp_path) == []
 
 
-def test_overlay_colours_the_polygons_that_collide(stage, tmp_path):
-    UsdGeom.Gprim(stage.GetPrimAtPath("/World/Floor")).CreateDisplayColorPrimvar("uniform").Set([(0, 0, 1), (0, 1, 0)])
+def test_overlay_emits_light_and_is_a_guide(stage, tmp_path):
     replay(stage)
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    plain = [(0, 0, 1), (0, 1, 0)]
-    lit = [(0, 0, 1), pytest.approx(LIT)]
-    assert [floor_colors(overlay, time) for time in (0, 1, 2, 3, 4)] == [plain, plain, lit, plain, plain]
-    assert floor_colors(overlay, 2, "/World/Falling") == [pytest.approx(LIT)]
+    shown = {"Polygons": "Polygons", "VertexFace/Marker": "VertexFace", "EdgeEdge/Marker": "EdgeEdge"}
+    for path, name in (shown | {"Intersections": "Intersections"}).items():
+        prim = overlay.GetPrimAtPath(f"/Collisions/{path}")
+        assert UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        shader, _, _ = material.ComputeSurfaceSource()
+        assert shader.GetShaderId() == "UsdPreviewSurface"
+        assert tuple(shader.GetInput("emissiveColor").Get()) == pytest.approx(COLORS[name])
+    assert len(set(COLORS.values())) == 4
 
 
-def test_overlay_names_prims_in_the_same_order_every_time(tmp_path):
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_overlay_lifts_the_polygons_that_collide_and_moves_them(stage, tmp_path, suffix):
+    path = tmp_path / f"overlay.{suffix}"
+    assert main(["replay", save(stage), "--device", "cpu", "--overlay", str(path)]) == 0
+    overlay = Usd.Stage.Open(str(path))
+    lift = LIFT * np.linalg.norm(np.ptp(FALLING, axis=0))  # of what moves
+    floor = np.array([(-2, -2, lift), (2, -2, lift), (2, 2, lift), (-2, 2, lift)])
+    for time, height in ((2, 0.25), (2.5, 0), (2.9999, -0.24995)):
+        triangles = read_polygons(overlay, time)
+        assert len(triangles) == 2 * (1 + 2)  # one, and the quad's two, on both sides
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        above = triangles[
+            (triangles.max(axis=(1, 2)) < 3) & (np.abs(triangles[:, :, 2] - lift) < lift / 10).all(axis=1)
+        ]
+        assert {tuple(point) for point in np.round(above.reshape(-1, 3), 6)} == {tuple(np.round(p, 6)) for p in floor}
+        own = [t for t in triangles if np.ptp(t[:, 2]) > 0.1]
+        assert len(own) == 2
+        np.testing.assert_allclose(
+            np.mean(own, axis=(0, 1)), np.mean(moved(FALLING, (0, 0, height)), axis=0), atol=2e-6
+        )
+        normal = np.cross(np.subtract(FALLING[1], FALLING[0]), np.subtract(FALLING[2], FALLING[0]))
+        across = (own[0].mean(axis=0) - own[1].mean(axis=0)) @ normal / np.linalg.norm(normal)
+        assert abs(across) == pytest.approx(2 * lift, rel=1e-2)
+        # Both sides face outwards.
+        for triangle, way in zip(triangles, normals, strict=True):
+            surface = moved(FALLING, (0, 0, height)) if np.ptp(triangle[:, 2]) > 0.1 else FLOOR
+            assert (triangle.mean(axis=0) - surface[0]) @ way > 0
+
+
+def test_overlay_has_the_curves_along_which_surfaces_cut(tmp_path):
+    """A triangle stands still in the floor from time 1 on: they meet along a segment known beforehand."""
     stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)
-    names = [f"Falling{number}" for number in range(8)]
-    for name in names:
-        add_falling(stage, f"/World/{name}")
-    replay(stage)
-    lines = (tmp_path / "overlay.usda").read_text().splitlines()
-    assert [line.split('"')[1] for line in lines if 'over "Falling' in line] == names
-
-
-def test_overlay_blocks_the_indices_of_the_scenes_colours(stage, tmp_path):
-    primvar = UsdGeom.Gprim(stage.GetPrimAtPath("/World/Floor")).CreateDisplayColorPrimvar("uniform")
-    primvar.Set([(0, 1, 0)])
-    primvar.SetIndices([0, 0])
-    replay(stage)
-    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    primvar = UsdGeom.Gprim(overlay.GetPrimAtPath("/World/Floor")).GetDisplayColorPrimvar()
-    assert not primvar.IsIndexed()
-    assert floor_colors(overlay, 2) == [(0, 1, 0), pytest.approx(LIT)]
-    assert errors_of(overlay) == []
-
-
-def test_overlay_stays_lit_while_the_collisions_last(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    heights = [0.25, -0.25, 0.25, -0.25, -0.3, -0.35, -0.4, 0.2]
-    add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, z)) for time, z in enumerate(heights)})
-    replay(stage)
-    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    lit = [floor_colors(overlay, time) == [pytest.approx(LIT)] for time in range(8)]
-    assert lit == [True, True, True, False, False, False, True, False]
+    upright = [(0.5, -1.0, -0.5), (1.5, -1.0, -0.5), (1.0, -1.0, 0.5)]  # meets z = 0 from x = 0.75 to 1.25
+    places = {0: (0, 0, 3), 1: (0, 0, 0), 2: (0, 0, 0), 3: (0, 0.25, 0), 4: (0, 0, 3)}
+    add_mesh(stage, "/World/Falling", {time: moved(upright, by) for time, by in places.items()})
+    segments = {1: [(0.75, -1, 0), (1.25, -1, 0)], 3: [(0.75, -0.75, 0), (1.25, -0.75, 0)], None: []}
+    samples = {0: None, 0.999: None, 1: 1, 1.5: 1, 2: 1, 2.75: 1, 3: 3, 3.5: 3, 4: None, 5: None}
+    for options, last in (((), 6), (("--frames", "0:3"), 3)):
+        replay(stage, *options)
+        overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+        assert errors_of(overlay) == []
+        for time, sample in samples.items():
+            ends = read_curves(overlay, time).reshape(-1, 3)
+            expected = segments[sample if time < last else 3]  # from the last time on, those of the last time
+            assert (len(ends) > 0) == (len(expected) > 0)
+            if expected:
+                a, b = np.array(expected)
+                along = (ends - a) @ (b - a) / ((b - a) @ (b - a))  # 0 at a, 1 at b
+                np.testing.assert_allclose(ends, a + along[:, None] * (b - a), atol=1e-6)
+                assert (along.min(), along.max()) == pytest.approx((0, 1), abs=1e-6)
+        prims = overlay.GetPrimAtPath("/Collisions").GetAttribute("prims").Get()
+        api = UsdGeom.PrimvarsAPI(overlay.GetPrimAtPath("/Collisions/Intersections"))
+        names = {prims[value] for name in ("primA", "primB") for value in api.GetPrimvar(name).Get(1)}
+        assert names == {"/World/Floor", "/World/Falling"}
 
 
 def test_overlay_shows_nothing_between_its_samples(tmp_path):
@@ -153,16 +209,17 @@ def test_overlay_shows_nothing_between_its_samples(tmp_path):
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
     at_start = [[contact["position"] for contact in interval["contacts"]] for interval in found["intervals"]]
     assert [len(points) > 0 for points in at_start] == [True, True, True, False, True, False]
-    extent = UsdGeom.Points(overlay.GetPrimAtPath("/Collisions/Contacts")).GetExtentAttr()
-    unlit = [pytest.approx((0.6, 0.6, 0.6))]
+    extents = [
+        overlay.GetPrimAtPath(f"/Collisions/{kind}").GetAttribute("extent") for kind in ("VertexFace", "EdgeEdge")
+    ]
     for time in (0, 1, 2.999, 3, 4.5, 5.999, 6, 7, 9, 10, 11.999, 12, 13, 14.999, 15, 16.5, 18, 20):
         expected = at_start[int(time // 3)] if time < 18 else []
         points, primvars = read_contacts(overlay, time)
         np.testing.assert_array_equal(points, np.float32(expected).reshape(-1, 3))
         assert {len(values) for values in primvars.values()} == {len(expected)}
-        low, high = np.array(extent.Get(time))
-        assert np.all(low <= points) and np.all(points <= high)
-        assert floor_colors(overlay, time, "/World/Falling") == ([pytest.approx(LIT)] if expected else unlit)
+        corners = np.concatenate([extent.Get(time) for extent in extents])
+        assert np.all(corners.min(axis=0) <= points) and np.all(points <= corners.max(axis=0))
+        assert (len(read_polygons(overlay, time)) > 0) == bool(expected)
     assert errors_of(overlay) == []
 
 
@@ -197,7 +254,8 @@ def test_overlay_of_instances_a_package_and_another_overlay(tmp_path):
     assert UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(save(stage)), str(package))
     replay(package)
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    assert floor_colors(overlay, 0, "/World/One/Mesh") == [pytest.approx(LIT)]
+    assert overlay.GetPrimAtPath("/World/One").IsInstance()
+    assert len(read_polygons(overlay, 0)) == 2 * (1 + 2)
     assert len(read_contacts(overlay, 0)[0]) == 1
 
     again = tmp_path / "again"
@@ -205,7 +263,17 @@ def test_overlay_of_instances_a_package_and_another_overlay(tmp_path):
     assert main(["replay", str(tmp_path / "overlay.usda"), "--device", "cpu", "--overlay", str(again / "o.usda")]) == 0
     second = Usd.Stage.Open(str(again / "o.usda"))
     assert second.GetRootLayer().subLayerPaths == ["../overlay.usda"]
-    np.testing.assert_array_equal(read_contacts(second, 0)[0], read_contacts(second, 0, "/Collisions_/Contacts")[0])
+    np.testing.assert_array_equal(read_contacts(second, 0)[0], read_contacts(second, 0, root="/Collisions_")[0])
+
+
+def test_overlay_shows_the_polygons_of_instancers_too(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_mesh(stage, "/World/Instancer/Prototype", FALLING)
+    add_instancer(stage, "/World/Instancer", {0: [(0, 0, 0.25)], 1: [(0, 0, -0.25)]}, ["/World/Instancer/Prototype"])
+    replay(stage)
+    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    assert len(read_polygons(overlay, 0)) == 2 * (1 + 2)
 
 
 def test_overlay_where_the_topology_changes(tmp_path):
@@ -213,34 +281,62 @@ def test_overlay_where_the_topology_changes(tmp_path):
     add_floor(stage)
     quad = [*FALLING, (0.9, -0.9, 1.0)]
     mesh = add_mesh(stage, "/World/Falling", {0: moved(FALLING, (0, 0, 0.25)), 1: moved(FALLING, (0, 0, -0.25)),
-                                              2: moved(quad, (0, 0, 0.25)), 3: moved(quad, (0, 0, 0.125))})  # fmt: skip
+                                              2: moved(quad, (0, 0, 0.25)), 3: moved(quad, (0, 0, -0.2))})  # fmt: skip
     for time, count, corners in ((0, [3], [0, 1, 2]), (2, [3, 3], [0, 1, 2, 1, 3, 2])):
         mesh.GetFaceVertexCountsAttr().Set(count, time)
         mesh.GetFaceVertexIndicesAttr().Set(corners, time)
     replay(stage)
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    assert [len(floor_colors(overlay, time, "/World/Falling")) for time in (0, 1, 2, 3)] == [1, 1, 2, 2]
+    at_floor = [np.ptp(read_polygons(overlay, time)[:, :, 2], axis=1) < 0.1 for time in (0, 2)]
+    assert [np.bincount(flat).tolist() for flat in at_floor] == [[2, 4], [2, 4]]
+    assert errors_of(overlay) == []
 
 
-def test_overlay_agrees_with_json(tmp_path):
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_overlay_agrees_with_json(tmp_path, suffix):
     scene = tmp_path / "cloth_twist.usd"
     shutil.copy(ASSETS / scene.name, scene)
-    replay(scene)
-    found = json.loads((tmp_path / "hits.json").read_text())
-    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    names = [str(tmp_path / name) for name in ("hits.json", f"overlay.{suffix}")]
+    assert main(["replay", str(scene), "--device", "cpu", "--json", names[0], "--overlay", names[1]]) == 0
+    found = json.loads(Path(names[0]).read_text())
+    overlay = Usd.Stage.Open(names[1])
+    positions = {}
+    for result in bsc.replay(bsc.Scene(str(scene)), device="cpu"):
+        positions[result.summary.start] = result.contacts.interval.x0[result.contacts.segment.faces]
+        cuts = result.intersections[0].cuts.points
+        np.testing.assert_array_equal(read_curves(overlay, result.summary.start), np.float32(cuts))
+        assert len(cuts) > 0
     for interval in found["intervals"]:
         points, primvars = read_contacts(overlay, interval["start"])
         contacts = interval["contacts"]
         expected = np.array([contact["position"] for contact in contacts], dtype=np.float32).reshape(-1, 3)
         np.testing.assert_array_equal(points, expected)
         np.testing.assert_array_equal(primvars["toi"], np.float32([contact["toi"] for contact in contacts]))
-        names = [f"{contact['meshes'][1]} {contact['elements'][1]}" for contact in contacts]
-        assert primvars["elementB"] == names
-        colors = floor_colors(overlay, interval["start"], "/root/model/triangles")
-        lit = {number for number, color in enumerate(colors) if color == pytest.approx(LIT)}
+        for side, name in enumerate("AB"):
+            assert primvars[f"prim{name}"] == [contact["meshes"][side] for contact in contacts]
+            numbers = [contact["indices"][side] for contact in contacts]
+            assert primvars[f"element{name}"] == [tuple([*both, -1][:2]) for both in numbers]
+        triangles = read_polygons(overlay, interval["start"])
         faces = {contact["indices"][1][0] for contact in contacts if contact["kind"] == "vertex-face"}
-        assert faces <= lit and bool(lit) == bool(contacts)
+        middles = triangles.mean(axis=1)
+        for middle in positions[interval["start"]].mean(axis=1)[sorted(faces)]:
+            assert np.sort(np.linalg.norm(middles - middle, axis=1))[1] < 2 * LIFT * 2  # the scene's size is below 2
     assert sum(len(interval["contacts"]) for interval in found["intervals"]) == found["hits"] == 33
+
+
+def test_binary_overlay_saves_its_samples_as_they_get_many(tmp_path, monkeypatch):
+    """The same content, whatever is held in memory at once."""
+    scene = tmp_path / "cloth_twist.usd"
+    shutil.copy(ASSETS / scene.name, scene)
+    texts = []
+    for size in (1, 1 << 25):
+        monkeypatch.setattr(usd_overlay, "_SAVED", size)
+        path = tmp_path / "overlay.usdc"
+        assert main(["replay", str(scene), "--device", "cpu", "--overlay", str(path)]) == 0
+        texts.append(Sdf.Layer.OpenAsAnonymous(str(path)).ExportToString())
+    assert texts[0] == texts[1]
+    assert main(["replay", str(scene), "--device", "cpu", "--overlay", str(tmp_path / "overlay.usda")]) == 0
+    assert Sdf.Layer.OpenAsAnonymous(str(tmp_path / "overlay.usda")).ExportToString() == texts[0]
 
 
 # --- JSON and CSV ---
@@ -389,7 +485,7 @@ def test_two_outputs_are_two_files(stage, tmp_path, capsys):
 
 
 def left_behind(folder):
-    return [path.name for path in folder.iterdir() if path.name.endswith(".tmp")]
+    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
 
 def check_partial(folder, count, reason):
@@ -418,7 +514,7 @@ def test_interrupted(stage, tmp_path, monkeypatch, capsys):
     found, overlay = check_partial(tmp_path, 3, "interrupted")
     assert found["hits"] == 1
     assert len(read_contacts(overlay, 2)[0]) == 1 and len(read_contacts(overlay, 3)[0]) == 0
-    assert floor_colors(overlay, 3)[1] != pytest.approx(LIT)  # it is not known to collide after that
+    assert len(read_polygons(overlay, 2)) and not len(read_polygons(overlay, 3))  # not known to collide after that
     assert "Partial: 3 of 4 intervals were checked; interrupted." in (tmp_path / "page.html").read_text()
     output = capsys.readouterr()
     assert output.err == "warp-bsc: interrupted\n"

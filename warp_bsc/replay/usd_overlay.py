@@ -18,9 +18,11 @@ import numpy as np
 from .._atomic_file import OutputFile
 from ..usd.layer import just_before, layer_metadata, unused_path
 from ..usd.scene import Scene
+from ..usd.segment import Segment
 from .intervals import IntervalResult
 from .outputs import without_last_eighth
 from .scene_contacts import SceneContacts
+from .scene_intersections import SceneIntersections
 from .summary import Summary
 
 __all__ = ["COLORS", "LIFT", "Overlay"]
@@ -29,19 +31,22 @@ COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
     "VertexFace": (1.0, 0.9, 0.2),
     "EdgeEdge": (1.0, 0.5, 0.0),
+    "Intersections": (0.6, 0.2, 1.0),
 }
-"""Emitted colours by prim: polygons that collide, contact points by kind."""
+"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut."""
 
 LIFT = 2e-4
 """Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
 
-_POINT_SIZE = 0.006  # diameter of a contact point, as a share of that size
+_MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of that size
+_CURVE_WIDTH = 0.0015  # width of the curves, too
 _SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
 _TEXT_ROWS = 4096  # rows of an array that are text at once
 
 _EXTENT = {"extent": "float3[]"}
 _CONTACTS = _EXTENT | {
-    "points": "point3f[]",
+    "positions": "point3f[]",
+    "protoIndices": "int[]",
     "primvars:toi": "float[]",
     "primvars:primA": "int[]",
     "primvars:primB": "int[]",
@@ -53,8 +58,13 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
         "Mesh",
         _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},
     ),
-    "VertexFace": ("Points", _CONTACTS),
-    "EdgeEdge": ("Points", _CONTACTS),
+    "VertexFace": ("PointInstancer", _CONTACTS),
+    "EdgeEdge": ("PointInstancer", _CONTACTS),
+    "Intersections": (
+        "BasisCurves",
+        _EXTENT
+        | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
+    ),
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
 
@@ -68,17 +78,23 @@ class Overlay:
     Below ``/Collisions`` are
 
     - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
-      are lifted by :data:`LIFT` to both sides, move with the interval, and are there from its start to its end;
-    - ``VertexFace`` and ``EdgeEdge``, the contact points of both kinds, from the start of their interval to its end.
-      Their primvars are ``toi``; ``primA`` and ``primB``, indices in the constant primvar ``prims``, which has the
-      names of all meshes that collide; ``elementA`` and ``elementB``, the elements in the prims' own numbers: the point
-      and -1 for a vertex, the polygon and -1 for a face, the points at both ends of an edge.
+      are lifted by :data:`LIFT` to both sides, move with the scene, and are there from the start of the interval to its
+      end;
+    - ``VertexFace`` and ``EdgeEdge``, markers at the contact points of both kinds, from the start of their interval to
+      its end. Each is an instance with the primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the
+      attribute ``prims`` of ``/Collisions``, which has their names; ``elementA`` and ``elementB``, the two elements in
+      the prims' own numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of
+      an edge;
+    - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
+      next. Each segment in which two triangles meet is a curve of its own, with ``primA`` and ``primB``. Elements that
+      only touch make no curve.
 
-    All of them emit light of their own colour by a material of their own, which no material of the scene hides.
+    All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
+    points are instances of a mesh, as Blender binds no materials to USD's own points.
 
     Their purpose is guide, so that no render of the layer contains them by accident, and a replay of the layer does not
     take them for a part of the scene. Programs hide guides at first. usdview shows them by Display, Display Purposes,
-    Guide; Blender by Guide among the options of its import, Object Types; ``usdrecord`` by ``--purposes guide``.
+    Guide; Blender by Guide among the options of its import; ``usdrecord`` by ``--purposes guide``.
 
     A name that ends in ``.usda`` gives a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
     smaller. USD interpolates between samples, so all that shall not move gets an empty sample just before the next.
@@ -109,7 +125,8 @@ class Overlay:
         self._scene = scene
         self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
         self._ends = []  # where each complete interval ends in the spool
-        self._prims: dict[str, int] = {}  # number of each mesh that collides, by its name
+        self._last: SceneIntersections | None = None  # at the end of the last complete interval
+        self._prims: dict[str, int] = {}  # number of each mesh that is named, by its name
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
@@ -118,20 +135,27 @@ class Overlay:
         self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
     def add(self, result: IntervalResult) -> None:
-        """Adds the contacts of an interval."""
+        """Adds the contacts of an interval, and the intersections at its start."""
         contacts = result.contacts
         interval = contacts.interval
         self._sample("Polygons", interval.start, *self._find_polygons(contacts))
         for kind, name in enumerate(("VertexFace", "EdgeEdge")):
             self._sample(name, interval.start, self._find_points(contacts, np.flatnonzero(contacts.kind == kind)))
+        if result.intersections:
+            self._sample("Intersections", interval.start, self._find_curves(result.intersections[0]))
+            self._last = result.intersections[1]
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
         """Writes the layer and puts it in its place."""
         del self._ends[len(summary.intervals) :]
         summary = summary.first(len(self._ends))
+        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
+        if self._last and self._last.time == end > summary.intervals[-1].start:
+            last, self._last = self._last, None
+            self._sample("Intersections", end, self._find_curves(last), interval=len(self._ends) - 1)
         write = self._write_text if self._is_text else self._write_binary
-        write(summary, summary.intervals[-1].end if summary.intervals else self._scene.times[0])
+        write(summary, end)
         self.file.commit()
 
     def shrink(self) -> bool:
@@ -139,6 +163,7 @@ class Overlay:
         if not self._ends:
             return False
         self._ends = without_last_eighth(self._ends)
+        self._last = None
         self._spool.truncate(self._ends[-1] if self._ends else 0)
         return True
 
@@ -182,17 +207,11 @@ class Overlay:
         """Returns some contacts as points, None if there are none."""
         if not len(rows):
             return None
-        names = (mesh.name for mesh in contacts.interval.segment.meshes)
-        numbers = np.full(len(contacts.interval.segment.meshes), -1)
-        used = np.unique(contacts.meshes[rows])
-        for mesh, name in enumerate(names):
-            if mesh in used:
-                numbers[mesh] = self._prims.setdefault(name, len(self._prims))
-        prims, indices = numbers[contacts.meshes[rows]], contacts.indices[rows]
-        points, size = contacts.position[rows], _POINT_SIZE * self._size / 2
+        prims, indices = self._number_prims(contacts.segment, contacts.meshes[rows]), contacts.indices[rows]
         return {
-            "extent": _box(points) + np.array([[-size], [size]]),
-            "points": points,
+            "extent": _box(contacts.position[rows], _MARKER_SIZE * self._size / 2),
+            "positions": contacts.position[rows],
+            "protoIndices": np.zeros(len(rows)),
             "primvars:toi": contacts.toi[rows],
             "primvars:primA": prims[:, 0],
             "primvars:primB": prims[:, 1],
@@ -200,7 +219,27 @@ class Overlay:
             "primvars:elementB": indices[:, 1],
         }
 
-    def _sample(self, name, time, arrays, moved=None):
+    def _find_curves(self, found: SceneIntersections):
+        """Returns the segments in which triangles meet as curves, None if there are none."""
+        if not found.crossings:
+            return None
+        cuts = found.cuts
+        prims, points = self._number_prims(found.segment, cuts.meshes), cuts.points.reshape(-1, 3)
+        return {
+            "extent": _box(points, _CURVE_WIDTH * self._size / 2),
+            "points": points,
+            "curveVertexCounts": np.full(len(cuts.points), 2),
+            "primvars:primA": prims[:, 0],
+            "primvars:primB": prims[:, 1],
+        }
+
+    def _number_prims(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
+        """Returns numbers of meshes of a segment that hold for the whole layer."""
+        used, places = np.unique(meshes, return_inverse=True)
+        names = [segment.meshes[mesh].name for mesh in used]
+        return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[places].reshape(-1, 2)
+
+    def _sample(self, name, time, arrays, moved=None, interval=None):
         """Adds a sample of a prim's attributes to the spool, unless it would repeat an empty one.
 
         Args:
@@ -208,6 +247,7 @@ class Overlay:
             time: Time code.
             arrays: Values by attribute, None if there is nothing at that time.
             moved: A time just before the next sample, and the points at that time.
+            interval: Number of the interval that the sample belongs to; default: the one that is added.
         """
         samples = self._samples[name]
         if arrays is None and samples and samples[-1].is_empty:
@@ -216,7 +256,7 @@ class Overlay:
         self._spool.seek(0, os.SEEK_END)
         places = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
         after = (moved[0], self._store(types["points"], moved[1])) if moved else None
-        samples.append(_Sample(time, places, after))
+        samples.append(_Sample(len(self._ends) if interval is None else interval, time, places, after))
 
     def _store(self, value_type, array) -> "_Place":
         data = np.ascontiguousarray(array, dtype=_SHAPES[value_type][0])
@@ -238,7 +278,7 @@ class Overlay:
         """Yields the time samples of an attribute up to the end of the last interval, in order."""
         value_type = _PARTS[name][1][attribute]
         empty = self._load(value_type, _Place(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
-        samples = [sample for sample in self._samples[name] if sample.time < end]  # of complete intervals
+        samples = [sample for sample in self._samples[name] if sample.interval < len(self._ends)]
         for index, sample in enumerate(samples):
             if sample.is_empty:
                 yield sample.time, empty
@@ -252,7 +292,7 @@ class Overlay:
             # USD interpolates if both have values, and would show points on the way from one contact to another.
             elif value_type.startswith(("float", "point")) and (before := just_before(following)) > sample.time:
                 yield before, value if attribute == "extent" else empty
-            if is_last:
+            if is_last and end > sample.time:
                 yield end, empty
 
     def _write_binary(self, summary, end):
@@ -311,6 +351,8 @@ class Overlay:
         """Sets the metadata of the layer. It does not open the sublayer, the scene."""
         source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
         found = {"complete": summary.is_complete, "hits": summary.hits, "intervals": len(summary.intervals)}
+        if summary.intersections:
+            found["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
         layer.customLayerData = {"collisions": found | ({"stopped": summary.stopped} if summary.stopped else {})}
         layer.documentation = f"Collisions found by warp-bsc replay, of purpose guide. {summary.motion}"
         for name, value in self._metadata.items():
@@ -322,20 +364,30 @@ class Overlay:
         from pxr import Sdf, Usd, UsdGeom, UsdShade  # noqa: PLC0415 (slow)
 
         stage = Usd.Stage.Open(layer)
-        UsdGeom.Scope.Define(stage, self._root_path).CreatePurposeAttr(UsdGeom.Tokens.guide)
+        root = UsdGeom.Scope.Define(stage, self._root_path)
+        root.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        root.GetPrim().CreateAttribute("prims", Sdf.ValueTypeNames.StringArray).Set(list(self._prims))
         UsdGeom.Scope.Define(stage, f"{self._root_path}/Materials")
         for name, (kind, attributes) in _PARTS.items():
             prim = stage.DefinePrim(f"{self._root_path}/{name}", kind)
             for attribute, type_name in attributes.items():
                 value_type = Sdf.ValueTypeNames.Find(type_name)
                 if attribute.startswith("primvars:"):
-                    UsdGeom.PrimvarsAPI(prim).CreatePrimvar(attribute, value_type, UsdGeom.Tokens.vertex)
+                    interpolation = UsdGeom.Tokens.uniform if kind == "BasisCurves" else UsdGeom.Tokens.vertex
+                    UsdGeom.PrimvarsAPI(prim).CreatePrimvar(attribute, value_type, interpolation)
                 else:
                     prim.CreateAttribute(attribute, value_type, False)
-            gprim = UsdGeom.Gprim(prim)
-            gprim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(
-                [COLORS[name]]
-            )  # where materials are not shown
+            shown = prim
+            if kind == "Mesh":
+                UsdGeom.Mesh(prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+            elif kind == "BasisCurves":
+                UsdGeom.BasisCurves(prim).CreateTypeAttr(UsdGeom.Tokens.linear)
+                UsdGeom.BasisCurves(prim).CreateWidthsAttr([_CURVE_WIDTH * self._size])
+                UsdGeom.BasisCurves(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
+            else:
+                shown = self._define_marker(stage, prim)
+            # The same colour where a program shows no materials.
+            UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([COLORS[name]])
             material = UsdShade.Material.Define(stage, f"{self._root_path}/Materials/{name}")
             shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
             shader.CreateIdAttr("UsdPreviewSurface")
@@ -343,14 +395,22 @@ class Overlay:
             shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(COLORS[name])
             shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
             material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-            UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
-            if kind == "Mesh":
-                UsdGeom.Mesh(prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-            if kind == "Points":
-                UsdGeom.Points(prim).CreateWidthsAttr([_POINT_SIZE * self._size])
-                UsdGeom.Points(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
-                names = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("prims", Sdf.ValueTypeNames.StringArray)
-                names.Set(list(self._prims))
+            UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
+
+    def _define_marker(self, stage, instancer):
+        """Defines an octahedron of which the contact points are instances, and returns its prim."""
+        from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+        marker = UsdGeom.Mesh.Define(stage, f"{instancer.GetPath()}/Marker")
+        points = _MARKER_SIZE * self._size / 2 * np.concatenate([np.eye(3), -np.eye(3)])
+        marker.CreatePointsAttr([tuple(point) for point in points.tolist()])
+        marker.CreateExtentAttr([tuple(corner) for corner in _box(points).tolist()])
+        marker.CreateFaceVertexCountsAttr([3] * 8)
+        sides = [[(0, 1, 2), (3, 1, 2), (0, 4, 2), (0, 1, 5)], [(3, 4, 5), (0, 4, 5), (3, 1, 5), (3, 4, 2)]]
+        marker.CreateFaceVertexIndicesAttr([corner for side in sides for face in side for corner in face])
+        marker.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        UsdGeom.PointInstancer(instancer).CreatePrototypesRel().SetTargets([marker.GetPath()])
+        return marker.GetPrim()
 
 
 @dataclass(frozen=True)
@@ -363,8 +423,16 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Sample:
-    """A sample of a prim in the spool: its time, the places of its arrays by attribute, and its points at its end."""
+    """A sample of a prim in the spool.
 
+    Attributes:
+        interval: Number of the interval.
+        time: Time code.
+        places: The places of its arrays, by attribute.
+        moved: A time just before the next sample, and the place of the points at that time, if they move.
+    """
+
+    interval: int
     time: float
     places: dict[str, _Place]
     moved: tuple[float, _Place] | None
@@ -403,9 +471,9 @@ def _as_os_error(error) -> Exception:
     return error
 
 
-def _box(points) -> np.ndarray:
-    """Returns the smallest and the largest coordinates of points, shape [2, 3]."""
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+def _box(points, margin=0.0) -> np.ndarray:
+    """Returns the corners of the bounding box of points, with a margin around it, shape [2, 3]."""
+    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
