@@ -16,7 +16,7 @@ from warp_bsc import checker
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.contact_buffer import ContactBuffer
-from warp_bsc.detection.intersections import find_intersections
+from warp_bsc.detection.intersections import IntersectionFinder, find_intersections
 from warp_bsc.detection.launch import retry_until_fits
 from warp_bsc.detection.pipeline import DetectionPipeline
 from warp_bsc.detection.settings import Count
@@ -623,3 +623,64 @@ def test_worlds_of_any_number_are_kept_apart(broad_phase):
         world = np.repeat([0, last], 6)
         c = bsc.CollisionDetector(bsc.CollisionMesh(faces, 12, world=wp.array(world, dtype=wp.int64))).detect(x0, x1)
         assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0], [9, 2], [10, 2], [11, 2]]
+
+
+def test_a_finder_of_intersections_is_used_again(broad_phase):
+    """Trees kept from one configuration to the next give the pairs that new ones give, and exactly those that cross."""
+    rng = np.random.default_rng(7)
+    faces = np.arange(300).reshape(100, 3)
+    mesh = bsc.CollisionMesh(faces, 300)
+    finder = IntersectionFinder(mesh)
+    for scale in (8.0, 7.5, 0.01, 40.0, 3.0):
+        corner = rng.uniform(-scale, scale, (100, 1, 3))
+        x = (corner + rng.uniform(-2, 2, (100, 3, 3))).reshape(300, 3).astype(np.float32)
+        found = finder.find(x)
+        edges, others = (numbers.ravel() for numbers in np.indices((len(mesh.edges), len(faces))))
+        pairs = np.stack([edges, others], axis=1)[mesh.edges[edges, 0] // 3 != others]
+        expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[faces[pairs[:, 1]]])]
+        np.testing.assert_array_equal(found.pairs, expected)
+        assert found.crosses.all()  # no three random points are in line with a fourth
+
+
+def test_an_edge_that_touches_a_face_does_not_cross_it(broad_phase):
+    face = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
+    edges = {
+        ((1, 1, -1), (1, 1, 1)): True,
+        ((1, 1, 0), (1, 1, 1)): False,  # an end is in the face
+        ((0, 1, -1), (0, 1, 1)): False,  # passes its boundary
+        ((0, 0, -1), (0, 0, 1)): False,  # passes a corner
+        ((1, 1, 0), (2, 1, 0)): False,  # lies in it
+        ((-1, 1, 0), (5, 1, 0)): False,
+        ((1, 1, 0), (1, 1, 0)): False,  # a point
+    }
+    x = np.array([*face, *(end for edge in edges for end in edge)], dtype=np.float64)
+    corners = [[3 + 2 * i, 4 + 2 * i, 4 + 2 * i] for i in range(len(edges))]
+    mesh = bsc.CollisionMesh([[0, 1, 2], *corners], len(x))
+    found = IntersectionFinder(mesh).find(x)
+    of_face = found.pairs[:, 1] == 0
+    own = dict(zip(map(tuple, mesh.edges[found.pairs[of_face, 0]]), found.crosses[of_face], strict=True))
+    assert own == {(3 + 2 * i, 4 + 2 * i): crosses for i, crosses in enumerate(edges.values())}
+
+
+@pytest.mark.parametrize("ridge", [-1.0, 0.0, 1.0])
+def test_an_edge_crosses_two_faces_where_it_passes_their_common_side(ridge, broad_phase):
+    """The faces are a roof with a ridge at height 0 along y, a flat sheet, or a gutter; their outer sides are lower."""
+    x = [(0, -4, 0), (0, 4, 0), (-4, 0, ridge), (4, 0, ridge)]
+    edges = {
+        ((0, 1, -1), (0, 1, 1)): True,
+        ((-1, 2, -4), (1, 2, 4)): True,
+        ((-4, 1, -1), (4, 1, 1)): ridge == 0.0,  # flatter than the roof: it touches the ridge
+        ((0, 1, 0), (0, 1, 1)): False,
+        ((0, -4, -1), (0, -4, 1)): False,
+    }
+    x = np.array([*x, *(end for edge in edges for end in edge)], dtype=np.float64)
+    corners = [[4 + 2 * i, 5 + 2 * i, 5 + 2 * i] for i in range(len(edges))]
+    for faces in ([[0, 1, 2], [1, 0, 3]], [[2, 0, 1], [0, 1, 3]]):  # also of mixed orientation
+        mesh = bsc.CollisionMesh([*faces, *corners], len(x))
+        found = IntersectionFinder(mesh).find(x)
+        for face in (0, 1):
+            of_face = found.pairs[:, 1] == face
+            own = dict(zip(map(tuple, mesh.edges[found.pairs[of_face, 0]]), found.crosses[of_face], strict=True))
+            assert own == {(4 + 2 * i, 5 + 2 * i): crosses for i, crosses in enumerate(edges.values())}
+    mesh = bsc.CollisionMesh([[0, 1, 2], [1, 0, 3], [0, 1, 3], *corners], len(x))
+    assert not IntersectionFinder(mesh).find(x).crosses.any()  # three faces have that side

@@ -163,7 +163,7 @@ def test_nothing_readable_is_an_error(tmp_path, capsys):
     add_bare_mesh(stage)
     assert main(["replay", save(stage), "--device", "cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "nothing moves" in line
+    assert "/World/Odd: the mesh has no points" in line
     add_floor(stage)
     stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 0)], 0)
     stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 1)], 1)

@@ -43,6 +43,8 @@ other, between each two consecutive time samples; vertices move straight from
 sample to sample. Meshes that never move are obstacles: contacts between
 obstacles are excluded, and so are contacts of a mesh with itself if only its
 transform moves it. Rotations are sampled at every whole time code as well.
+At the time samples themselves, find the edges that pass through faces, those
+of obstacles included; where nothing moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
 finished intervals, marked partial."""
@@ -103,6 +105,12 @@ def add_to(commands: Commands) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="check each mesh with itself (default: yes, unless only its transform moves it)",
+    )
+    which.add_argument(
+        "--intersections",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="find the edges that pass through faces or touch them at the time samples themselves (default: yes)",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
@@ -318,7 +326,7 @@ def _open_outputs(
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
         (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
-        (arguments.csv, HitsCsv),
+        (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, ReportPage),
     )
@@ -344,7 +352,13 @@ def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Ge
     progress.disable = not progress.console.is_terminal
     with progress:
         task = progress.add_task("", total=len(scene.times) - 1, time=scene.times[0], rate="…/s")
-        for result in replay(scene, method=arguments.method, device=device, validate_most=arguments.validate):
+        for result in replay(
+            scene,
+            method=arguments.method,
+            device=device,
+            intersections=arguments.intersections,
+            validate_most=arguments.validate,
+        ):
             yield result
             speed = progress.tasks[task].speed
             rate = f"{speed:.1f}/s" if speed else "…/s"

@@ -100,8 +100,8 @@ class Intersections:
     Attributes:
         pairs: (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in
             ``mesh.edges``, sorted, int32, shape [n, 2].
-        crosses: Whether the edge passes through the face: its ends are strictly on different sides, and it meets the
-            inside of the face. All other edges only touch their face. Bool, shape [n].
+        crosses: Whether the edge passes through the face, as :func:`warp_bsc.checker.edges_pass_faces` defines it. All
+            other edges only touch their face. Bool, shape [n].
     """
 
     pairs: np.ndarray
@@ -138,9 +138,15 @@ class IntersectionFinder:
         pairs = self._kept.numpy()[: self._count]
         meets, crosses = np.ones(len(pairs), dtype=bool), status == HIT
         (unsure,) = np.nonzero(status == UNSURE)
-        edges, faces = positions[mesh.edges[pairs[unsure, 0]]], positions[mesh.faces[pairs[unsure, 1]]]
-        meets[unsure] = checker.edge_face_crossings(edges, faces)
-        crosses[unsure] = checker.edges_pass_faces(edges, faces)
+        if len(unsure):
+            edges, faces = pairs[unsure].T
+            edges, across, faces = (
+                positions[mesh.edges[edges]],
+                positions[self._across[faces]],
+                positions[mesh.faces[faces]],
+            )
+            meets[unsure] = checker.edge_face_crossings(edges, faces)
+            crosses[unsure] = checker.edges_pass_faces(edges, faces, across)
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         return Intersections(pairs[order], crosses[order])
@@ -153,6 +159,19 @@ class IntersectionFinder:
             self._allocate(capacity_for(self._count, "intersections"))
             return True
         return grown
+
+    @functools.cached_property
+    def _across(self) -> np.ndarray:
+        """Third vertex of the only neighbour at each side of each face; of the face itself where there is none."""
+        sides = self._mesh.face_edges.ravel()
+        opposite = np.roll(self._mesh.faces, 1, axis=1).ravel()  # side i goes from corner i to the next
+        order = np.argsort(sides, kind="stable")
+        of_edge = sides[order]
+        first = np.flatnonzero((of_edge[1:] == of_edge[:-1]) & (np.bincount(sides + 1)[of_edge[1:] + 1] == 2))
+        one, other = order[first], order[first + 1]
+        across = opposite.copy()
+        across[one], across[other] = opposite[other], opposite[one]
+        return across.reshape(-1, 3)
 
     def _allocate(self, capacity: int) -> None:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)

@@ -189,7 +189,11 @@ class _SegmentReplay:
         if self._finder:
             start = self._find(interval.x0, interval.start)
             intersections = start, self._find(interval.x1, interval.end)
-        collisions = detector.detect(interval.x0, interval.x1)
+        if self._scene.is_still:  # at rest, coplanar faces would be many collisions between obstacles
+            detector = CollisionDetector(CollisionMesh([], 0, device=self._mesh.device), method=detector.method)
+            collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
+        else:
+            collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
         contacts = find_contacts(interval, self._mesh, collisions, self._scene.selection, intersections)
         validation = None

@@ -157,6 +157,6 @@ def _farthest(keys: np.ndarray, points: np.ndarray) -> np.ndarray:
     ends = [points[starts]]
     for _ in range(2):  # from any point to the farthest, and from there to the farthest
         distance = np.square(points - ends[-1][groups]).sum(axis=1)
-        last = np.lexsort((distance, groups))[np.append(starts[1:], len(keys)) - 1]
-        ends.append(points[last])
+        last = np.append(starts[1:], len(keys))[: len(starts)] - 1
+        ends.append(points[np.lexsort((distance, groups))[last]])
     return np.stack(ends[1:], axis=1)

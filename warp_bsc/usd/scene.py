@@ -35,7 +35,8 @@ stored ones, in single precision; otherwise all are computed and returned in dou
 What cannot be read
 -------------------
 Broken meshes and instances, and files that cannot be opened, are left out from the time on at which they are broken,
-and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves.
+and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
+moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that this module does not read (spheres and other shapes that are not meshes,
 unselected meshes) and the changes that it makes to the motion.
@@ -129,7 +130,8 @@ class Scene:
         selection: Which of its meshes are checked.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
-        times: Time codes between which motion is straight, ascending, at least two.
+        times: Time codes between which motion is straight, ascending, at least two. If nothing moves, appears or
+            vanishes, it is one time code, twice: one interval without motion.
         time_codes_per_second: Number of time codes in a second.
         meters_per_unit: The scene's unit of length [m].
         up_axis: "Y" or "Z".
@@ -167,9 +169,8 @@ class Scene:
 
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If the file is not USD, has no mesh that can be read or none that moves, or a selection selects
-                nothing; if ``strict``, also if a part cannot be read. The message names the file, the prim and the
-                time.
+            ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
+                ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
@@ -228,6 +229,11 @@ class Scene:
             warnings.append(f"vertices in one place at all times were welded: {self._welded}")
         return warnings
 
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing moves, appears or vanishes."""
+        return self.times[0] == self.times[-1]
+
     def __len__(self) -> int:
         """Returns the number of intervals, at least 1."""
         return len(self.times) - 1
@@ -269,19 +275,21 @@ class Scene:
         return Interval(index, start, end, segment, x0, x1, jumps, tuple(warnings))
 
     def _check_meshes(self, is_selection):
-        """Raises a ValueError if there are no meshes, or none moves."""
+        """Raises a ValueError if there are no meshes."""
         reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
         if not self._usd_meshes:
             none_selected = ", or none is selected" * is_selection
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
-        if not any(mesh.times for mesh in self._usd_meshes):
-            raise ValueError(
-                f"{self.path}: nothing moves: no mesh has points or a transform that change with time{reason}"
-            )
 
     def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
         """Sets :attr:`times`. Returns those at which meshes change their topology, appear or vanish."""
         own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
+        if not any(mesh.times for mesh in self._usd_meshes):
+            own.add(self.stage.GetStartTimeCode())  # what appears and vanishes does so between moments at rest
+        if len(own) == 1:
+            self.times = [*own, *own]
+            self._warnings.append(f"nothing moves: checked at rest, at time {self.times[0]:g}")
+            return set()
         whole = set()
         if sample_turns and frames.step is None:
             low, high = frames.bounds(sorted(own))
