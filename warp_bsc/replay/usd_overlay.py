@@ -151,7 +151,7 @@ class Overlay:
         del self._ends[len(summary.intervals) :]
         summary = summary.first(len(self._ends))
         end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
-        if self._last and self._last.time == end > summary.intervals[-1].start:
+        if self._last is not None and self._last.time == end > summary.intervals[-1].start:
             last, self._last = self._last, None
             self._sample("Intersections", end, self._find_curves(last), interval=len(self._ends) - 1)
         write = self._write_text if self._is_text else self._write_binary
