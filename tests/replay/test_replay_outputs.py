@@ -4,6 +4,7 @@ import base64
 import contextlib
 import csv
 import hashlib
+import html
 import json
 import os
 import re
@@ -15,12 +16,13 @@ import struct
 import subprocess
 import sys
 import threading
+import zlib
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chromium import CHROMIUM
+from chromium import CHROMIUM, Browser
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
 
@@ -29,11 +31,13 @@ from warp_bsc import _atomic_file
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
-from warp_bsc.replay import usd_overlay
+from warp_bsc.replay import html_report, usd_overlay
+from warp_bsc.replay.page_view import choose_faces
 from warp_bsc.replay.usd_overlay import COLORS, LIFT
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>"
+KIND_TEXTS = ("vertex-face", "edge-edge", "edge through face", "edge touches face")
 OUTPUTS = ("hits.json", "hits.csv", "overlay.usda", "page.html")
 
 
@@ -621,7 +625,7 @@ def test_full_disk_has_room_for_all_files(tmp_path, size):
     found, _ = check_partial(tmp_path / "left", None, "No space left on device")
     assert 0 < len(found["intervals"]) < 79
     page = Page((tmp_path / "left" / "page.html").read_text())
-    assert page.data["partial"].startswith("Partial: ") and page.data["view"]
+    assert page.data["partial"].startswith("Partial: ") and "view-0" in page.blocks
 
 
 def test_no_room_at_the_end_is_an_error(stage, tmp_path, capsys):
@@ -672,11 +676,11 @@ def test_what_was_there_stays_if_no_interval_is_finished(stage, tmp_path, monkey
 
 
 class Page(HTMLParser):
-    """Tags, handlers, addresses, scripts and data of a page."""
+    """Tags, handlers, addresses, scripts, data and blocks of a page."""
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.attributes, self.scripts, self.data = set(), [], [], None
+        self.tags, self.attributes, self.scripts, self.data, self._packed = set(), [], [], None, {}
         self._inside = None
         self.policy = ""
         self.feed(text)
@@ -687,14 +691,33 @@ class Page(HTMLParser):
         attributes = dict(attrs)
         if attributes.get("http-equiv") == "Content-Security-Policy":
             self.policy = attributes["content"]
-        self._inside = (tag, attributes.get("type"))
+        self._inside = (tag, attributes.get("type"), attributes.get("id"))
 
     def handle_data(self, data):
-        if self._inside == ("script", "application/json"):
+        if self._inside and self._inside[:2] == ("script", "application/json"):
             self.data = json.loads(data)
-        elif self._inside == ("script", None):
+        elif self._inside and self._inside[:2] == ("script", "text/plain"):
+            self._packed[self._inside[2]] = data
+        elif self._inside and self._inside[:2] == ("script", None):
             self.scripts.append(data)
         self._inside = None
+
+    @property
+    def blocks(self):
+        """Names of all blocks."""
+        return self._packed.keys()
+
+    def block(self, name):
+        """The facts and the arrays of a block."""
+        content = zlib.decompress(base64.b64decode(self._packed[name]))
+        at = 4 + int.from_bytes(content[:4], "little")
+        found = json.loads(content[4:at])
+        for key, kind, length in found.pop("arrays"):
+            planes = np.frombuffer(content[at : at + 4 * length], np.uint8).reshape(4, length)
+            found[key] = np.ascontiguousarray(planes.T).view(f"<{kind}4").reshape(-1)
+            at += 4 * length
+        assert at == len(content)
+        return found
 
 
 def hostile_stage(folder):
@@ -715,6 +738,7 @@ def test_page_is_self_contained_and_escapes(tmp_path):
     assert "img" not in page.tags
     assert not [name for name, _ in page.attributes if name.startswith("on")]
     assert not [value for name, value in page.attributes if name in ("src", "href", "action", "data")]
+    assert text.count(html.escape(HOSTILE)) == 2  # the title of the document and that of the page
     assert "http" not in re.sub(r'"http://www\.w3\.org/2000/svg"|http-equiv', "", text)
     (script,) = page.scripts
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -726,28 +750,60 @@ def test_page_is_self_contained_and_escapes(tmp_path):
     assert facts["Comment"] == f"<!-- {HOSTILE}"
 
 
-def test_page_shows_the_worst_interval(stage, tmp_path):
-    replay(stage, "--validate", "all")
-    data = Page((tmp_path / "page.html").read_text()).data
+def test_page_has_every_interval_with_hits(stage, tmp_path):
+    found = json.loads(replay(stage, "--validate", "all")[0].read_text())
+    page = Page((tmp_path / "page.html").read_text())
+    data = page.data
     assert data["intervals"] == [[0, 1, 0, 0], [1, 2, 0, 0], [2, 3, 1, 0], [3, 4, 0, 0]]
+    assert [at for at, *_ in data["rest"]] == [0, 1, 2, 3, 4]
+    assert [crossings > 0 for _, crossings, _ in data["rest"]] == [False, False, False, True, True]
+    assert data["rows"] == [[0, 0], [0, 0], [1, 0], [0, data["rest"][3][1]], [0, data["rest"][4][1]]]
     assert sum(data["toi"]) == 1 and data["toi"][9] + data["toi"][10] == 1
-    assert data["pairs"] == [{"text": "/World/Floor with /World/Falling", "under": "", "hits": 1}]
-    assert (data["view"]["from"], data["view"]["to"], data["view"]["up_axis"]) == (2, 3, "Z")
-    faces = np.frombuffer(base64.b64decode(data["view"]["faces"]), dtype="<u4").reshape(-1, 3)
-    start = np.frombuffer(base64.b64decode(data["view"]["start"]), dtype="<f4").reshape(-1, 3)
-    end = np.frombuffer(base64.b64decode(data["view"]["end"]), dtype="<f4").reshape(-1, 3)
-    assert len(faces) == 5 and faces.max() == len(start) - 1
+    (pair,) = data["pairs"]
+    assert (pair["meshes"], pair["hits"]) == (["/World/Floor", "/World/Falling"], 1)
+    assert pair["rest"] == [[3, 4, data["rest"][3][1], "stays"]]
+    assert data["up_axis"] == "Z" and data["validation"]["disagreements"] == []
+    assert page.blocks == {"view-0", "faces-0", "hits-2", "view-2", "rest-3", "view-3", "rest-4"}
+    center = np.array(data["center"])
+
+    (contact,) = (contact for interval in found["intervals"] for contact in interval["contacts"])
+    block = page.block("hits-2")
+    assert [data["meshes"][int(block[side][0])]["name"] for side in ("first", "second")] == contact["meshes"]
+    assert (block["kind"][0], block["elements"][0], block["first_0"][0], block["second_0"][0]) == (0, 1, 0, 1)
+    assert block["toi"] == pytest.approx([0.5], abs=1e-5) and block["separate"][0] == 1
+    np.testing.assert_allclose(block["position"] + center, contact["position"], atol=1e-6)
+
+    faces, view = page.block("faces-0")["faces"].reshape(-1, 3), page.block("view-2")
+    start, end = (view[name].reshape(-1, 3) + center for name in ("start", "end"))
+    assert len(faces) == 5 and faces.max() == len(start) - 1 and view["faces"] == 0
     np.testing.assert_allclose((end - start)[-3:], [(0, 0, -0.5)] * 3, atol=1e-6)
-    assert data["validation"]["disagreements"] == []
+    np.testing.assert_allclose(start[-3:], moved(FALLING, (0, 0, 0.25)), atol=1e-6)
+    assert [data["meshes"][mesh] for mesh in page.block("faces-0")["mesh_of_vertex"][[0, -1]]] == [
+        {"name": "/World/Floor", "moves": False}, {"name": "/World/Falling", "moves": True}
+    ]  # fmt: skip
+
+    scene = bsc.Scene(str(tmp_path / "scene.usda"))
+    *_, last = bsc.replay(scene, device="cpu")
+    for index, at_rest in ((3, last.intersections[0]), (4, last.intersections[1])):
+        block = page.block(f"rest-{index}")
+        assert (block["crosses"] == at_rest.crosses).all()
+        np.testing.assert_allclose(block["curves"].reshape(-1, 2, 3) + center, at_rest.cuts.points, atol=1e-6)
 
 
 def test_page_without_collisions(tmp_path):
     stage = new_stage(tmp_path / "scene.usda")
     add_mesh(stage, "/World/Falling", falling(1, 0.5))
     replay(stage)
-    view = Page((tmp_path / "page.html").read_text()).data["view"]
-    assert (view["from"], view["contacts"], view["lit"]) == (0, "", "")
-    assert view["faces"]  # the scene is there to be seen
+    page = Page((tmp_path / "page.html").read_text())
+    assert page.blocks == {"view-0", "faces-0"}  # the scene is there to be seen
+    assert page.data["rows"] == [[0, 0], [0, 0]] and page.data["pairs"] == []
+
+
+def test_page_without_intersections(stage, tmp_path):
+    replay(stage, "--no-intersections")
+    page = Page((tmp_path / "page.html").read_text())
+    assert page.data["rest"] == [] and page.blocks == {"view-0", "faces-0", "hits-2", "view-2"}
+    assert "separate" not in page.block("hits-2")
 
 
 @pytest.mark.parametrize("visible", ["inherited", "invisible"])
@@ -758,48 +814,195 @@ def test_page_where_little_is_there(tmp_path, visible):
     mesh.GetVisibilityAttr().Set("inherited", 1)
     mesh.GetPointsAttr().Set(FALLING, 2)
     replay(stage)
-    view = Page((tmp_path / "page.html").read_text()).data["view"]
-    assert (view is None) == (visible == "invisible")
+    blocks = Page((tmp_path / "page.html").read_text()).blocks
+    assert ("view-0" in blocks) == (visible == "inherited")
 
 
-def browse(page, profile, *options):
-    """What headless Chromium prints, and what the page wrote to its console."""
-    command = [
-        CHROMIUM, "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle",
-        "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=1200,1800",
-        "--virtual-time-budget=4000", "--enable-logging=stderr", f"--user-data-dir={profile}", *options,
-        page.resolve().as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+def many_hits(path, columns=40, samples=4):
+    """Strips that swing through a floor of quads, to and fro: many collisions of three pairs of meshes."""
+    stage = new_stage(path)
+    x = np.arange(columns, dtype=float)
+    add_mesh(stage, "/World/Floor", [(a, b, 0) for b in (-1, 1) for a in [*x, columns]], [4] * columns,
+             [i for a in range(columns) for i in (a, a + 1, a + columns + 2, a + columns + 1)])  # fmt: skip
+    for number in range(3):
+        triangles = [
+            (a + 0.2 * number + 0.1 + dx, dy, dz)
+            for a in x
+            for dx, dy, dz in ((0, 0, 0), (0.1, 0.1, 9), (0.1, -0.1, 9))
+        ]
+        points = {time: moved(triangles, (0, 0, -0.5 if time % 2 else 0.5)) for time in range(samples)}
+        add_mesh(stage, f"/World/Strip{number}", points, [3] * columns, list(range(3 * columns)))
+    return stage
+
+
+def test_page_says_what_it_leaves_out(tmp_path, monkeypatch):
+    for name, value in {"_ALL_ROWS": 40, "_FEWEST_ROWS": 5, "_ALL_FACES": 90, "_FEWEST_FACES": 10}.items():
+        monkeypatch.setattr(html_report, name, value)
+    stage = many_hits(tmp_path / "scene.usda")
+    found = json.loads(replay(stage)[0].read_text())
+    page = Page((tmp_path / "page.html").read_text())
+    listed = sum(hits for hits, _ in page.data["rows"])
+    assert [hits for hits, _ in page.data["rows"][:3]] == [6, 6, 6] and found["hits"] > 300
+    (note, rest) = page.data["notes"][-2:]
+    assert note.startswith(f"The table has {listed} of {found['hits']} collisions: ") and "edges at rest" in rest
+    for index in range(3):
+        block = page.block(f"hits-{index}")
+        assert block["of"] == found["intervals"][index]["hits"]
+        assert len(set(block["first"]) | set(block["second"])) == 4  # every pair of meshes is there
+        view = page.block(f"view-{index}")
+        faces = page.block(f"faces-{view['faces']}")["faces"].reshape(-1, 3)
+        assert view["of"] == 200 and 0 < len(faces) <= 30 and view["lit"].max() < len(faces)
+
+    monkeypatch.setattr(html_report, "_VIEW_BYTES", 1000)
+    replay(stage)
+    page = Page((tmp_path / "page.html").read_text())
+    assert "view-0" in page.blocks and "view-2" not in page.blocks and "hits-2" in page.blocks
+    assert page.data["notes"][-1].endswith("intervals have no view in 3D, as the page is full.")
+
+
+def test_faces_around_places_are_chosen():
+    rng = np.random.default_rng(1)
+    corners = rng.uniform(0, 1, (20_000, 3))
+    places = np.array([(0.1, 0.1, 0.1), (0.9, 0.2, 0.5)])
+    wanted = np.array([5, 17, 19_000])
+    chosen = choose_faces(corners, places, wanted, 2_000)
+    assert np.array_equal(chosen, np.unique(chosen)) and set(wanted) <= set(chosen.tolist())
+    assert 100 < len(chosen) <= 2_000
+    distance = np.abs(corners[:, None] - places).max(axis=2).min(axis=1)
+    near, far = distance[np.setdiff1d(chosen, wanted)].max(), np.delete(distance, chosen).min()
+    assert near < 3 * far  # cells, not spheres
+    assert len(choose_faces(corners, places, wanted, 20_000)) == 20_000
+    assert np.array_equal(choose_faces(corners, corners, wanted, 2), wanted[[0, 2]])  # nothing fits but some of these
+
+
+@pytest.fixture
+def browser(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here")
+    with Browser(tmp_path / "profile") as opened:
+        yield opened
 
 
 @pytest.mark.browser
-def test_page_in_chromium(tmp_path):
+def test_page_in_chromium(tmp_path, browser):
     scene = tmp_path / "cloth_twist.usd"
     shutil.copy(ASSETS / scene.name, scene)
     page = replay(scene)[3]
-    dom, console = browse(page, tmp_path / "profile", "--dump-dom")
-    assert console == []
-    assert dom.count('class="hover"') == 14 + 20  # a bar an interval, and a bar a part of the interval
-    assert re.search(r'id="viewer-message" hidden', dom)  # it would say why there is no view in 3D
-    assert "/root/model/triangles" in dom and "time 250 to 251" in dom
+    browser.open(page)
+    assert browser.value("document.querySelectorAll('.hover').length") == 14 + 14 + 20  # bars: hits, at rest, impacts
+    assert browser.value("document.getElementById('viewer-message').hidden")  # it would say why there is no view in 3D
+    assert browser.value("document.getElementById('viewer-heading').textContent") == "Time 250 to 251"
+    assert browser.value("location.hash") == "#interval=4"
 
-    picture = tmp_path / "page.png"
-    _, console = browse(page, tmp_path / "profile", f"--screenshot={picture}")
-    assert console == []
+    def pixels():
+        picture = tmp_path / "page.png"
+        browser.value("document.getElementById('canvas').scrollIntoView({block: 'center'})")
+        left, top, right, bottom = map(int, browser.box("#canvas"))
+        browser.screenshot(picture, whole=False)
+        return np.moveaxis(matplotlib.image.imread(picture)[top:bottom, left:right, :3], 2, 0)
+
     import matplotlib.image  # noqa: PLC0415
 
-    pixels = matplotlib.image.imread(picture)[:, :, :3]
-    red, green, blue = np.moveaxis(pixels[200:720, 100:1100], 2, 0)
+    red, green, blue = pixels()
     assert (blue > red + 0.15).mean() > 0.03  # the cloth
     assert ((red > 0.7) & (green < 0.75) & (blue < 0.4)).sum() > 30  # contacts
+    assert ((blue > 0.7) & (green < 0.4) & (red > 0.4) & (red < 0.75)).sum() > 10  # cut curves
+    for width in (1400, 390):
+        browser.resize(width, 900)
+        assert browser.value("document.documentElement.scrollWidth") <= width
+        assert browser.box("#viewer-legend")[1] >= browser.box("#canvas")[3]  # the legend does not cover the view
+    assert browser.console == []
 
 
 @pytest.mark.browser
-def test_hostile_names_do_nothing_in_chromium(tmp_path):
-    page = replay(hostile_stage(tmp_path))[3]
-    dom, console = browse(page, tmp_path / "profile", "--dump-dom")
-    assert console == []  # neither an error nor a refusal by the policy: there was nothing to refuse
+def test_intervals_are_gone_through_in_chromium(stage, tmp_path, browser):
+    browser.open(replay(stage)[3])
+    heading = "document.getElementById('viewer-heading').textContent"
+    assert browser.value(heading) == "Time 2 to 3"
+    for key, expected in (
+        ("ArrowRight", "3 to 4"),
+        ("ArrowRight", "3 to 4"),
+        ("ArrowLeft", "2 to 3"),
+        ("End", "3 to 4"),
+        ("Home", "2 to 3"),
+    ):
+        browser.press(key)
+        assert browser.value(heading) == f"Time {expected}"
+    browser.click("#intervals .hover", 3)  # the fourth bar
+    assert browser.value(heading) == "Time 3 to 4" and browser.value("location.hash") == "#interval=3"
+    browser.click("#intervals .hover", 1)
+    browser.wait("!document.getElementById('viewer-message').hidden")
+    assert "Nothing collides or intersects here" in browser.value(
+        "document.getElementById('viewer-message').textContent"
+    )
+    browser.click("#next")
+    browser.wait("document.getElementById('viewer-message').hidden")
+    assert browser.value(heading) == "Time 2 to 3"
+    assert browser.value("document.getElementById('time-label').textContent").startswith("time 2.5")
+    browser.click("#viewer-heading")  # off the button, which the space bar would press
+    browser.press(" ")
+    assert browser.value("document.getElementById('play').textContent") == "Pause"
+    assert browser.console == []
+
+
+@pytest.mark.browser
+def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
+    found = json.loads(replay(many_hits(tmp_path / "scene.usda"))[0].read_text())
+    page = tmp_path / "page.html"
+    browser.open(page)
+    total = sum(hits + rest for hits, rest in Page(page.read_text()).data["rows"])
+    count = "document.getElementById('rows-count').textContent"
+    assert browser.value(count) == f"{total:,} of {total:,} rows"
+    assert browser.value("document.querySelectorAll('#rows tbody tr').length") < 60  # only those in sight
+    column = "[...document.querySelectorAll('#rows tr[data-at] td:nth-child({})')].map((cell) => cell.textContent)"
+
+    browser.click("#rows th button", 0)
+    browser.click("#rows th button", 0)  # the latest first
+    assert browser.value("document.querySelector('#rows th').getAttribute('aria-sort')") == "descending"
+    times = [float(text) for text in browser.value(column.format(1))]
+    assert times == sorted(times, reverse=True) and times[0] == 3
+
+    browser.press("/")
+    browser.type("strip1 face")
+    browser.wait(f"{count} !== '{total:,} of {total:,} rows'")
+    pairs = list(zip(browser.value(column.format(3)), browser.value(column.format(4)), strict=True))
+    assert pairs and all("/World/Strip1" in first + second and "face" in first + second for first, second in pairs)
+    of_strip = [
+        contact for interval in found["intervals"] for contact in interval["contacts"]
+        if "/World/Strip1" in contact["meshes"] and contact["kind"] == "vertex-face"
+    ]  # fmt: skip
+    browser.value("(byId('kind').value = '0', byId('kind').dispatchEvent(new Event('change')))")
+    assert browser.value(count) == f"{len(of_strip):,} of {total:,} rows"
+
+    browser.open(page, "#prim=/World/Strip2")  # an address that leads to a prim
+    both = [
+        contact
+        for interval in found["intervals"]
+        for contact in interval["contacts"]
+        if "/World/Strip2" in contact["meshes"]
+    ]
+    names = "[rows.first[row], rows.second[row]].map((mesh) => data.meshes[mesh].name)"
+    rows = browser.value(f"table.rows.map((row) => {names})")
+    assert len(rows) > len(both) > 0 and all("/World/Strip2" in names for names in rows)
+    browser.click("#rows tr[data-at] a.prim", 0)
+    browser.wait("location.hash.startsWith('#prim=') || location.hash.includes('&prim=')")
+    browser.click(".chip")
+    browser.wait(f"{count} === '{total:,} of {total:,} rows'")
+
+    browser.click("#rows tr[data-at]", 3)
+    chosen = browser.value("document.querySelector('#rows tr.chosen').dataset.at")
+    assert chosen == "3" and not browser.value("document.getElementById('selected').hidden")
+    browser.value("document.getElementById('rows').focus()")
+    browser.press("ArrowDown")
+    assert browser.value("document.querySelector('#rows tr.chosen').dataset.at") == "4"
+    assert browser.value("document.getElementById('selected').textContent").startswith(tuple(KIND_TEXTS))
+    assert browser.console == []
+
+
+@pytest.mark.browser
+def test_hostile_names_do_nothing_in_chromium(tmp_path, browser):
+    browser.open(replay(hostile_stage(tmp_path))[3])
+    assert browser.console == []  # neither an error nor a refusal by the policy: there was nothing to refuse
+    dom = browser.value("document.documentElement.outerHTML")
     assert "<img" not in dom
     assert "&lt;img src=x onerror=alert(1)&gt;" in dom

@@ -328,7 +328,7 @@ def _open_outputs(
         (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
-        (arguments.report, ReportPage),
+        (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )
     outputs = []
     for path, make in makers:
