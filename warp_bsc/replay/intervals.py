@@ -231,6 +231,10 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )
+    at_rest = None
+    if intersections:
+        start, end = map(_summarize_intersections, intersections)
+        at_rest = start, end
     hits_by_meshes = contacts.count_by_meshes(np.ones((len(contacts), 1), dtype=int))
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
@@ -245,7 +249,7 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
         certified=collisions.certified,
         stats=collisions.stats,
         validation=validation,
-        intersections=tuple(map(_summarize_intersections, intersections)) if intersections else None,
+        intersections=at_rest,
         separate_hits=int(contacts.separate.sum()) if intersections else None,
         phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
     )
