@@ -684,3 +684,52 @@ def test_an_edge_crosses_two_faces_where_it_passes_their_common_side(ridge, broa
             assert own == {(4 + 2 * i, 5 + 2 * i): crosses for i, crosses in enumerate(edges.values())}
     mesh = bsc.CollisionMesh([[0, 1, 2], [1, 0, 3], [0, 1, 3], *corners], len(x))
     assert not IntersectionFinder(mesh).find(x).crosses.any()  # three faces have that side
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_flat_sheets_at_rest_need_no_exact_arithmetic(dtype, monkeypatch, broad_phase):
+    """Pairs of one plane, which no orientation in space decides, are apart in a coordinate plane."""
+    positions, faces = grid(24)
+    turned, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    decided = []
+    decide = checker.edge_face_crossings
+    monkeypatch.setattr(checker, "edge_face_crossings", lambda *pair: decided.append(len(pair[0])) or decide(*pair))
+    for turn in (np.eye(3), np.eye(3)[[2, 0, 1]], turned):
+        x = (positions @ turn).astype(dtype)
+        mesh = bsc.CollisionMesh(faces, len(x))
+        assert len(IntersectionFinder(mesh).find(x).pairs) == 0
+    assert sum(decided) <= len(faces) // 100
+
+
+def test_edges_beside_faces_do_not_meet_them(broad_phase):
+    """Edges and faces with small integer coordinates in one plane, of all positions to each other."""
+    rng = np.random.default_rng(8)
+    x = rng.integers(0, 5, (4000, 5, 3)).astype(np.float64)
+    x[..., 2] = x[..., 0] - 2 * x[..., 1]
+    x += 100.0 * np.stack(np.indices((20, 20, 10)), axis=-1).reshape(-1, 1, 3)  # queries are far from each other
+    faces = np.arange(20000).reshape(4000, 5)
+    mesh = bsc.CollisionMesh(np.concatenate([faces[:, 2:], faces[:, [0, 1, 1]]]), 20000)
+    found = IntersectionFinder(mesh).find(x.reshape(-1, 3))
+    found = {
+        (*edge, *face) for edge, face in zip(mesh.edges[found.pairs[:, 0]], mesh.faces[found.pairs[:, 1]], strict=True)
+    }
+    truth = checker.edge_face_crossings(x[:, :2], x[:, 2:])
+    assert 1000 < truth.sum() < 3000
+    for query, meets in zip(faces.tolist(), truth.tolist(), strict=True):
+        if not (x[query[0] // 5, 0] == x[query[0] // 5, 1]).all():
+            assert (tuple(query) in found) == meets
+
+
+def test_a_detector_used_again_forgets_nothing(broad_phase):
+    """Trees are kept from one detection to the next, also where everything has moved elsewhere meanwhile."""
+    rng = np.random.default_rng(2)
+    faces = np.arange(600).reshape(200, 3)
+    mesh = bsc.CollisionMesh(faces, 600)
+    detector = bsc.CollisionDetector(mesh)
+    for scale in (3.0, 3.1, 0.5, 50.0, 4.0):
+        x0 = (rng.uniform(-scale, scale, (200, 1, 3)) + rng.uniform(-1, 1, (200, 3, 3))).reshape(-1, 3)
+        x1 = x0 + rng.uniform(-1, 1, x0.shape)
+        again, first = detector.detect(x0, x1), bsc.CollisionDetector(mesh).detect(x0, x1)
+        assert_same(again, first)
+        assert again.stats.vertex_face == first.stats.vertex_face
+        assert again.stats.edge_edge == first.stats.edge_edge

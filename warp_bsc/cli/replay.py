@@ -17,6 +17,7 @@ from ..replay.html_report import ReportPage
 from ..replay.intervals import IntervalResult, replay
 from ..replay.outputs import ReplayOutput
 from ..replay.summary import Summary
+from ..replay.threads import WriteBehind
 from ..replay.usd_overlay import Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
@@ -234,20 +235,30 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
     with contextlib.ExitStack() as stack:
         outputs = _open_outputs(stack, scene, arguments, settings)
         intervals, interrupt, problems = [], None, []
+
+        def write(result: IntervalResult) -> None:
+            scene.files.check()
+            for output in outputs:
+                with naming(output.file.name):
+                    output.add(result)
+            intervals.append(result.summary)
+
+        written = stack.enter_context(contextlib.closing(WriteBehind(write)))
         with INTERRUPTS.held():
             try:
                 with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
                     for result in found:
-                        scene.files.check()
-                        for output in outputs:
-                            with naming(output.file.name):
-                                output.add(result)
-                        intervals.append(result.summary)
+                        written.put(result)
                         INTERRUPTS.check()
+                    written.wait()
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
             except Exception as error:
                 interrupt = INTERRUPTS.came  # which a library may have turned into another error
+                problems += [] if interrupt else [_explain(error, scene)]
+            try:
+                written.wait()
+            except Exception as error:
                 problems += [] if interrupt else [_explain(error, scene)]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)

@@ -52,6 +52,24 @@ def print_replay(console: Console, summary: Summary) -> None:
     if summary.intersections:
         _print_intersections(console, summary)
 
+    if not scene.is_still:
+        _print_certificate(console, summary)
+    if scene.left_out:
+        say(
+            console,
+            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
+        )
+    if summary.validation:
+        _print_validation(console, summary.validation)
+    if scene.is_still:
+        return
+    total = sum(summary.milliseconds.values())
+    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
+
+
+def _print_certificate(console: Console, summary: Summary) -> None:
+    """Prints whether a collision may be missing."""
+    intervals = summary.intervals
     if uncertain := sum(not interval.certified for interval in intervals):
         say(
             console,
@@ -67,15 +85,6 @@ def print_replay(console: Console, summary: Summary) -> None:
         )
     else:
         say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
-    if scene.left_out:
-        say(
-            console,
-            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
-        )
-    if summary.validation:
-        _print_validation(console, summary.validation)
-    total = sum(summary.milliseconds.values())
-    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
 
 
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:

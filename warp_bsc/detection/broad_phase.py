@@ -55,8 +55,8 @@ class BroadPhase(Protocol):
             vertex_face: Queue for (vertex, face), array of vec2i.
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
-            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, nothing
-                is allocated, but the traversal is slower if much has moved.
+            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, and
+                nothing is allocated on a GPU. A CPU sorts the tree anew where its boxes have become much larger.
             changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all. More pairs may be
                 found than wanted.
         """

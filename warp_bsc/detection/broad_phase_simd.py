@@ -22,6 +22,8 @@ _CODE_BITS = 10
 """Bits of a Morton code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
+_LOOSE = 1.5
+"""Trees are sorted anew where their packets are so many times larger, in sum, than when they were sorted."""
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
@@ -199,6 +201,12 @@ class _Tree:
         self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
+        self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether the boxes fitted last are so much larger than those after sorting that sorting is worth its time."""
+        return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
         """Sorts the elements along a Morton curve of a motion's grid.
@@ -214,6 +222,7 @@ class _Tree:
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
+        self._sorted_size = 0.0
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Computes the boxes of all packets and nodes for a motion, without sorting.
@@ -229,6 +238,10 @@ class _Tree:
         device = self._corners.device
         launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
+        with np.errstate(over="ignore"):
+            sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
+        self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
+        self._sorted_size = self._sorted_size or self._size
         for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
             _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
             _join(nodes[start:end, 1::2].max(axis=2), nodes[end:above, 1::2])
@@ -321,9 +334,13 @@ class BroadPhaseSimd:
     def _build(
         self, trees: Sequence[_Tree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
     ) -> None:
-        """Builds trees for a motion, or refits their boxes without sorting."""
-        if not refit:
-            _sort(trees, x0, x1, self._used)
+        """Builds trees for a motion; or refits their boxes, and sorts only if they have become loose."""
+        if refit:
+            for tree in trees:
+                tree.fit(x0, x1, changed)
+            if not any(tree.is_loose for tree in trees):
+                return
+        _sort(trees, x0, x1, self._used)
         for tree in trees:
             tree.fit(x0, x1, changed)
 

@@ -77,7 +77,7 @@ class CollisionDetector:
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
-            self._pipeline.find_contacts(x0, x1, sort=True, timer=timer)
+            self._pipeline.find_contacts(x0, x1, refit=self._has_run, sort=True, timer=timer)
             return timer
 
         timer = retry_until_fits(launch, self._pipeline, self.mesh.device)

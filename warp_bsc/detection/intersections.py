@@ -8,7 +8,7 @@ import warp as wp
 
 from .. import checker
 from .._arrays import check_finite
-from ..kernels.crossing import edge_crosses_face
+from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
 from .broad_phase import make_broad_phase
@@ -46,9 +46,15 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
             return
         edge = pairs[i][0]
         face = pairs[i][1]
-        answer = edge_crosses_face(
-            x[edges[edge, 0]], x[edges[edge, 1]], x[faces[face, 0]], x[faces[face, 1]], x[faces[face, 2]]
-        )
+        p = x[edges[edge, 0]]
+        q = x[edges[edge, 1]]
+        a = x[faces[face, 0]]
+        b = x[faces[face, 1]]
+        c = x[faces[face, 2]]
+        answer = edge_crosses_face(p, q, a, b, c)
+        if answer == UNSURE:
+            if edge_beside_face(p, q, a, b, c):
+                answer = FREE
         if answer != FREE:
             slot = take_slot(counts, _FOUND)
             if slot < wp.int64(kept.shape[0]):

@@ -14,6 +14,7 @@ from ..usd.interval import Interval
 from ..usd.scene import Scene
 from .scene_contacts import PHASES, SceneContacts, find_contacts
 from .scene_intersections import SceneIntersections, name_intersections
+from .threads import read_ahead
 from .validation import Validation, validate
 
 __all__ = ["TOI_BINS", "Contact", "IntersectionSummary", "IntervalResult", "IntervalSummary", "replay"]
@@ -158,13 +159,14 @@ def replay(
             for all.
 
     Yields:
-        IntervalResult: The collisions of one interval. Only what the caller keeps stays in memory.
+        IntervalResult: The collisions of one interval. Only what the caller keeps stays in memory. A thread reads the
+        next interval meanwhile.
 
     Raises:
         ValueError: If the positions at some time are broken, or there is no such method.
     """
     segment_replay = None
-    for interval in scene:
+    for interval in read_ahead(scene):
         if segment_replay is None or interval.segment is not segment_replay.segment:
             segment_replay = None  # before the next is made, to free its memory
             segment_replay = _SegmentReplay(scene, interval, method, device, intersections)
@@ -231,6 +233,10 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )
+    at_rest = None
+    if intersections:
+        start, end = map(_summarize_intersections, intersections)
+        at_rest = start, end
     hits_by_meshes = contacts.count_by_meshes(np.ones((len(contacts), 1), dtype=int))
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
@@ -245,7 +251,7 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
         certified=collisions.certified,
         stats=collisions.stats,
         validation=validation,
-        intersections=tuple(map(_summarize_intersections, intersections)) if intersections else None,
+        intersections=at_rest,
         separate_hits=int(contacts.separate.sum()) if intersections else None,
         phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
     )

@@ -183,6 +183,8 @@ class Summary:
     @property
     def motion(self) -> str:
         """A sentence on the motion that is assumed between samples."""
+        if self.scene.is_still:
+            return "Nothing moves: there are no collisions, only intersections at rest."
         sentence = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"

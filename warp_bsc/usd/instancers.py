@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from .stage import LeftOut, UnreadableError, reading, sample_times
+from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
 
 __all__ = ["Instance", "find_instances", "is_shown", "transform_attributes", "transform_times", "visibility_times"]
 
@@ -24,6 +24,7 @@ class Instance:
         root: The prototype's topmost prim.
         times: Time codes at which its transform to the world has a sample.
         break_times: Time codes at which it may appear or vanish.
+        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
     """
 
     def __init__(self, instancer: "_Instancer", index: int, prototype: int, root: Usd.Prim, parent: "Instance | None"):
@@ -36,6 +37,7 @@ class Instance:
         self.name = f"{parent.name_of(path) if parent else path}[{index}]"
         self.root = root
         self.times = instancer.times | (parent.times if parent else set())
+        self.may_jump: bool = instancer.may_jump or (parent is not None and parent.may_jump)
         self.break_times = instancer.break_times | (parent.break_times if parent else set())
 
     def name_of(self, path: Sdf.Path) -> str:
@@ -86,12 +88,14 @@ class _Instancer:
         self._instancer = UsdGeom.PointInstancer(prim)
         self._last: tuple[Usd.TimeCode | None, tuple] = None, ()
         self._last_presence: tuple[Usd.TimeCode | None, tuple] = None, ()
-        self.times = transform_times(prim, root) | sample_times(
+        placing = (
             self._instancer.GetPositionsAttr(),
             self._instancer.GetOrientationsAttr(),
             self._instancer.GetOrientationsfAttr(),
             self._instancer.GetScalesAttr(),
         )
+        self.times = transform_times(prim, root) | sample_times(*placing)
+        self.may_jump = may_jump([*transform_attributes(prim, root), *placing])
         self.break_times = visibility_times(prim, root) | sample_times(
             self._instancer.GetProtoIndicesAttr(), self._instancer.GetInvisibleIdsAttr(), self._instancer.GetIdsAttr()
         )

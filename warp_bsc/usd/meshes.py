@@ -22,7 +22,7 @@ from .instancers import (
 )
 from .selection import Selection
 from .skinning import Skin, find_bindings
-from .stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
+from .stage import LeftOut, UnreadableError, as_time_code, may_jump, reading, sample_times
 from .triangulation import triangulate
 
 __all__ = ["UsdMesh", "find_meshes"]
@@ -192,7 +192,13 @@ class UsdMesh:
         self.times = sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set())
         self.deforms = bool(self.times)
         self.turns = bool(skin and skin.times)
-        self.may_jump = any(attribute.HasSpline() for attribute in transform_attributes(self._frame, self._root))
+        points = mesh.GetPointsAttr()  # of which the number must not change
+        self.may_jump = (
+            may_jump(transform_attributes(self._frame, self._root))
+            or points.GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
+            or bool(instance and instance.may_jump)
+            or bool(skin and skin.may_jump)
+        )
 
         placed = sorted(transform_times(self._frame, self._root) | (instance.times if instance else set()))
         # Between samples as well, because a whole turn ends where it began.
@@ -361,7 +367,8 @@ class UsdMesh:
     def _time_code(self, time, before) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
-        return as_time_code(first if before else last, before=before)
+        # Reading the moment before a time takes twice as long: USD interpolates from the sample before.
+        return as_time_code(first if before else last, before=before and (self.may_jump or time in self.states))
 
     def _transform(self, time, *, before=False) -> np.ndarray:
         """Returns the matrix that takes points, as rows, to world space, shape [4, 4]."""

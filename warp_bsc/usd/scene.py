@@ -47,7 +47,7 @@ unselected meshes) and the changes that it makes to the motion.
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -155,6 +155,7 @@ class Scene:
         subdivide: int = 1,
         sample_turns: bool = True,
         strict: bool = False,
+        progress: Callable[[int, int], None] | None = None,
     ):
         """Opens the file and finds its meshes.
 
@@ -166,6 +167,8 @@ class Scene:
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
+            progress: Called while vertices are welded, which reads the scene once: with the number of its times that
+                have been compared, and of all.
 
         Raises:
             FileNotFoundError: If there is no such file.
@@ -204,7 +207,7 @@ class Scene:
             self._last = None  # index, segment and positions of the last interval that was read
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
-            segment = self._segment_at(0)
+            segment = self._segment_at(0, progress)
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
         self.names = [mesh.name for mesh in read]
@@ -260,7 +263,10 @@ class Scene:
             while True:
                 segment = self._segment_at(index)
                 try:
-                    x0, x1 = segment.positions(start), segment.positions(end, before=True)
+                    last = self._last
+                    known = last[3] if last and last[:2] == (index - 1, segment) else None
+                    x0 = segment.positions(start, last=known)
+                    x1 = segment.positions(end, before=True)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
@@ -310,7 +316,7 @@ class Scene:
             ] + self.times[-1:]
         return changes
 
-    def _segment_at(self, index) -> Segment:
+    def _segment_at(self, index, progress=None) -> Segment:
         """Returns the segment that an interval is in: the one in memory if possible."""
         while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
             span = next(span for span in self._spans if span[0] <= index < span[1])
@@ -318,7 +324,7 @@ class Scene:
             present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
             self._segment = self._span = self._last = None  # before the next is read, to free memory
             try:
-                self._segment = Segment(present, self.times[start : stop + 1], self.dtype)
+                self._segment = Segment(present, self.times[start : stop + 1], self.dtype, progress)
             except self._unreadable as error:
                 self._leave_out(error, start)
             else:
@@ -343,7 +349,7 @@ class Scene:
     def _find_jumps(self, index, segment, start, end) -> tuple[str, ...]:
         """Returns the names of the meshes that do not start an interval where they ended the one before."""
         last, self._last = self._last, (index, segment, start, end)
-        if last is None or last[:2] != (index - 1, segment) or np.array_equal(start, last[3]):
+        if last is None or last[:2] != (index - 1, segment) or start is last[3] or np.array_equal(start, last[3]):
             return ()
         _, _, last_start, last_end = last
         gaps = np.abs(start - last_end).max(axis=1)

@@ -1,7 +1,9 @@
 """A stretch of a scene's time over which the same meshes are there and keep their topology."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,13 +59,20 @@ class Segment:
     meshes: list[SceneMesh]
     faces: np.ndarray
 
-    def __init__(self, usd_meshes: "list[UsdMesh]", times: list[float], dtype: np.dtype):
+    def __init__(
+        self,
+        usd_meshes: "list[UsdMesh]",
+        times: list[float],
+        dtype: np.dtype,
+        progress: Callable[[int, int], None] | None = None,
+    ):
         """Reads the topology and welds vertices.
 
         Args:
             usd_meshes: The meshes.
             times: The segment's times, its first and its last included.
             dtype: Type of the positions.
+            progress: Called with the number of times at which vertices have been compared, and of all.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -100,31 +109,44 @@ class Segment:
 
         self._start = np.zeros((vertex_count, 3), dtype)
         for number, mesh in enumerate(self.meshes):
-            self._start[mesh.vertices] = self._read_positions(number, times[0], False)
-        self._welded_to = self._find_welds(times)
+            self._start[mesh.vertices] = self._read_positions(number, times[0], False, mesh.points)
+        self._welded_to = self._find_welds(times, progress)
         self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
         self.faces = corners.reshape(-1, 3).astype(np.int32)
         self.vertex_count = len(self._kept)
         self.welded = vertex_count - self.vertex_count
+        self._start = self._start[self._kept]
+        ends = np.searchsorted(self._kept, [mesh.vertices.stop for mesh in self.meshes]).tolist()
+        self._rows = [slice(start, end) for start, end in pairwise([0, *ends])]  # of each mesh, among the kept vertices
+        self._points = [
+            mesh.points[self._kept[rows] - mesh.vertices.start]
+            for mesh, rows in zip(self.meshes, self._rows, strict=True)
+        ]
 
-    def positions(self, time: float, *, before: bool = False) -> np.ndarray:
+    def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
         """Reads the positions of all vertices in world space.
 
         Args:
             time: Time code.
             before: Whether to read the moment just before that time, which differs where a mesh jumps at it.
+            last: Positions just before that time, if they are known: only meshes that may jump are read again.
 
         Returns:
-            Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`.
+            Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`; ``last`` itself if
+            no mesh may jump.
 
         Raises:
             UnreadableError: If a mesh has another number of points than at first, or a coordinate is not finite.
         """
-        positions = self._start.copy()
-        for number, mesh in enumerate(self.meshes):
-            if mesh.moves:
-                positions[mesh.vertices] = self._read_positions(number, time, before)
-        return positions[self._kept]
+        numbers = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
+        if last is not None:
+            numbers = [number for number in numbers if self._usd_meshes[number].may_jump]
+            if not numbers:
+                return last
+        positions = (self._start if last is None else last).copy()
+        for number in numbers:
+            positions[self._rows[number]] = self._read_positions(number, time, before, self._points[number])
+        return positions
 
     @property
     def vertex_meshes(self) -> np.ndarray:
@@ -250,34 +272,62 @@ class Segment:
             points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
         return meshes, points
 
-    def _read_positions(self, number, time, before) -> np.ndarray:
-        mesh = self.meshes[number]
+    def _read_positions(self, number, time, before, points) -> np.ndarray:
         return self._usd_meshes[number].read_positions(
-            time, before=before, used=mesh.points, point_count=mesh.point_count, dtype=self.dtype
+            time, before=before, used=points, point_count=self.meshes[number].point_count, dtype=self.dtype
         )
 
-    def _find_welds(self, times) -> np.ndarray:
+    def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
-        _, places, counts = np.unique(self._start, axis=0, return_inverse=True, return_counts=True)
-        places = places.reshape(-1)  # NumPy 2.0 shapes it otherwise
-        (crowded,) = np.nonzero(counts[places] > 1)
-        welded_to = np.arange(len(places))
-        if len(crowded):
-            groups = places[crowded]
-            owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right"))
-            moving = [number for number in owners if self.meshes[number].moves]
-            jumping = {number for number in moving if self._usd_meshes[number].may_jump}
-            moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
-            positions = self._start.copy()
-            for time, before in [*moments, (times[-1], True)] if moving else ():
-                for number in moving:
-                    vertices = self.meshes[number].vertices
-                    positions[vertices] = self._read_positions(number, time, before)
-                motion = np.column_stack([groups, positions[crowded]])
-                groups = np.unique(motion, axis=0, return_inverse=True)[1].reshape(-1)
-            _, firsts, groups = np.unique(groups, return_index=True, return_inverse=True)
-            welded_to[crowded] = crowded[firsts[groups]]
+        welded_to = _split(_group(self._start), self._start)
+        (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
+        ends = np.searchsorted(crowded, [mesh.vertices.stop for mesh in self.meshes]).tolist()
+        rows = [slice(start, end) for start, end in pairwise([0, *ends])]
+        moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves and rows[number].start < ends[number]]
+        if not moving:
+            return welded_to
+        jumping = any(self._usd_meshes[number].may_jump for number in moving)
+        moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
+        moments.append((times[-1], True))
+        positions = self._start[crowded]
+        groups = np.searchsorted(crowded, welded_to[crowded])
+        for done, (time, before) in enumerate(moments):
+            if progress:
+                progress(done, len(moments))
+            for number in moving:
+                mesh = self.meshes[number]
+                points = mesh.points[crowded[rows[number]] - mesh.vertices.start]
+                positions[rows[number]] = self._read_positions(number, time, before, points)
+            groups = _split(groups, positions)
+        welded_to[crowded] = crowded[groups]
         return welded_to
+
+
+def _group(positions) -> np.ndarray:
+    """Returns for each position the first one with the same hash, shape [n]."""
+    bits = (positions + positions.dtype.type(0.0)).view(f"u{positions.itemsize}").astype(np.uint64)  # no -0.0
+    hashes = np.zeros(len(positions), dtype=np.uint64)
+    for column in bits.T:
+        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        hashes ^= hashes >> np.uint64(29)
+    _, firsts, numbers = np.unique(hashes, return_index=True, return_inverse=True)
+    return firsts[numbers]
+
+
+def _split(groups, positions) -> np.ndarray:
+    """Splits groups by position: returns for each vertex the first of its group that is in the same place, shape [n].
+
+    Args:
+        groups: The first vertex of each vertex's group, shape [n].
+        positions: Positions of the vertices, shape [n, 3].
+    """
+    (rows,) = np.nonzero((positions != positions[groups]).any(axis=1))
+    if len(rows):
+        keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
+        _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        groups = groups.copy()
+        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
+    return groups
 
 
 def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
