@@ -68,11 +68,12 @@ class ReportPage(RecordFile):
             "style": style,
             "script": script,
         }
-        page = (folder / "page.html").read_text(encoding="utf-8")
-        for name, text in fields.items():
-            page = page.replace("{{" + name + "}}", text)
-        self._before, _, rest = page.partition("{{blocks}}")
-        self._between, _, self._after = rest.partition("{{data}}")
+        # Text, name, text, name, ...: a text that is filled in may have braces of its own.
+        parts = (folder / "page.html").read_text(encoding="utf-8").replace("{{", "}}").split("}}")
+        filled = [fields.get(part, part) if index % 2 else part for index, part in enumerate(parts)]
+        blocks, data = filled.index("blocks"), filled.index("data")
+        self._before, self._between = "".join(filled[:blocks]), "".join(filled[blocks + 1 : data])
+        self._after = "".join(filled[data + 1 :])
         self._most_faces = int(np.clip(_ALL_FACES // len(scene), _FEWEST_FACES, _MOST_FACES))
         self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
         self._view_bytes = 0
@@ -80,9 +81,7 @@ class ReportPage(RecordFile):
         self._moves: list[bool] = []  # whether each moves
         self._faces: tuple[Any, int] | None = None  # the segment whose faces are all in the page, and their block
         self._center: np.ndarray | None = None  # of all positions in the page
-        self._rows: list[
-            tuple[int, int]
-        ] = []  # number of rows of each interval: collisions, intersections at its start
+        self._rows: list[tuple[int, int]] = []  # number of rows by interval: collisions, intersections at its start
         self._last: SceneIntersections | None = None  # at the end of the last complete interval
         self._without_view = 0
 
