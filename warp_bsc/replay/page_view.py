@@ -21,21 +21,23 @@ def choose_faces(corners: np.ndarray, places: np.ndarray, wanted: np.ndarray, mo
     """
     if len(corners) <= most:
         return np.arange(len(corners))
-    low = corners.min(axis=0).astype(np.float64)
-    size = max(float((corners.max(axis=0) - low).max()), np.finfo(np.float32).tiny)
+    columns = np.ascontiguousarray(corners.T)  # fast along the rows
+    low = columns.min(axis=1)[:, None]
+    size = max(float((columns.max(axis=1, keepdims=True) - low).max()), np.finfo(np.float32).tiny)
 
     def cells(points):
         return np.clip((points - low) * (2**_LEVELS / size), 0, 2**_LEVELS - 1).astype(np.int16)
 
-    cells_of_faces, cells_of_places = cells(corners), cells(places if len(places) else corners[:1])
-    shown = wanted if len(wanted) <= most else wanted[np.linspace(0, len(wanted) - 1, most).astype(int)]
+    cells_of_faces, cells_of_places = cells(columns), cells(places.T if len(places) else columns[:, :1])
     for level in range(1, _LEVELS + 1):
         count, shift = 2**level, _LEVELS - level
         around = np.zeros((count + 2,) * 3, dtype=bool)  # a cell more on each side
-        for step in np.ndindex(3, 3, 3):
-            around[tuple(((cells_of_places >> shift) + step).T)] = True
-        x, y, z = ((cells_of_faces >> shift) + 1).T
-        near = np.union1d(np.flatnonzero(around[x, y, z]), wanted)
-        if len(near) <= most:
-            return near
-    return shown
+        x, y, z = np.unique(cells_of_places >> shift, axis=1)
+        for i, j, k in np.ndindex(3, 3, 3):
+            around[x + i, y + j, z + k] = True
+        x, y, z = (cells_of_faces >> shift) + 1
+        near = around[x, y, z]
+        near[wanted] = True
+        if np.count_nonzero(near) <= most:
+            return np.flatnonzero(near)
+    return wanted[np.linspace(0, len(wanted) - 1, min(len(wanted), most)).astype(int)]
