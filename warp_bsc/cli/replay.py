@@ -152,9 +152,16 @@ def add_to(commands: Commands) -> None:
     )
 
     out = command.add_argument_group("output")
-    out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, which shows the collisions")
+    out.add_argument(
+        "--overlay",
+        metavar="FILE",
+        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides: in usdview by Display, "
+        "Display Purposes, Guide, in Blender by Guide in the import's options",
+    )
     file = {"type": _output, "metavar": "FILE"}
-    out.add_argument("--report", **file, help="a page with charts and the worst interval in 3D, .html")
+    out.add_argument(
+        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
+    )
     printed = {"nargs": "?", "const": STDOUT, **file}
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")

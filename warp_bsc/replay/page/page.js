@@ -4,7 +4,7 @@
 const SVG = "http://www.w3.org/2000/svg";
 const byId = (id) => document.getElementById(id);
 const count = (number) => number.toLocaleString("en");
-const short = (number) => String(Number(number.toPrecision(7)));
+const short = (number) => String(Number(number.toPrecision(Math.abs(number) < 1e4 ? 6 : 9)));
 const plural = (number, one) => `${count(number)} ${one}${number === 1 ? "" : "s"}`;
 
 function add(parent, name, attributes = {}, text = null) {
@@ -177,14 +177,14 @@ function fillIntervals() {
   }
   timeline = addBars(byId("intervals"), bars, ["first", "second"], width, "time code", 200, 64);
   if (data.rest.length) addBars(byId("intervals"), restBars, ["third"], width, "", 80, 64);
-  mark = add(timeline.chart, "path", { class: "mark" });
+  mark = add(timeline.chart, "rect", { class: "mark", y: 2, height: timeline.bottom - 1, rx: 3 });
 }
 
 function markInterval() {
   const [from, to] = data.intervals[state.interval];
   const [left, right] = [timeline.x(from), timeline.x(to > from ? to : from + 1)];
-  const [middle, bottom] = [(left + right) / 2, timeline.bottom];
-  mark.setAttribute("d", `M${left} ${bottom + 1.5}H${right}M${middle - 6} ${bottom + 9}L${middle} ${bottom + 2}L${middle + 6} ${bottom + 9}Z`);
+  mark.setAttribute("x", left - 1);
+  mark.setAttribute("width", right - left + 2);
 }
 
 // --- The tables ---
@@ -275,7 +275,7 @@ function fillPairs() {
       const both = add(cell, "a", { class: "element", href: addressOf(-1, first === second ? [first] : [first, second]) }, "rows of the two");
       both.hidden = first === second;
     } },
-    { title: "Collisions", number: true, class: "narrow", key: (row) => pairs[row].hits, fill: (cell, row) => { cell.textContent = count(pairs[row].hits); } },
+    { title: "Collisions", number: true, class: "count", key: (row) => pairs[row].hits, fill: (cell, row) => { cell.textContent = count(pairs[row].hits); } },
     { title: "Intersections at rest", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => { add(cell, "span", { class: "clip" }, spans(pairs[row])); } },
   ];
   byId("pairs-count").textContent = pairs.length ? plural(pairs.length, "pair") : "No meshes collide.";

@@ -176,6 +176,7 @@ function makeViewer() {
     const [from, to] = data.intervals[index];
     byId("viewer-heading").textContent = from === to ? `Time ${short(from)}` : `Time ${short(from)} to ${short(to)}`;
     canvas.setAttribute("aria-label", `${byId("viewer-heading").textContent} in 3D. Drag to turn, scroll to zoom.`);
+    byId("selected").hidden = true;
     if (!gl) return;
     if (isNew) {
       const shown = await loadView(index);
@@ -192,7 +193,6 @@ function makeViewer() {
   function fill(shown, index) {
     state.parts.forEach((part) => part.free());
     [state.parts, state.shown, state.chosen] = [[], shown, null];
-    byId("selected").hidden = true;
     const legend = byId("viewer-legend");
     legend.replaceChildren();
     const [hits, rest] = [hitsIn(index), restAt(index)];
@@ -255,7 +255,7 @@ function makeViewer() {
     state.chosen = vertexArray(gl, points, [["start", point, 3], ["color", new Float32Array(CHOSEN_COLOR), 3], ["toi", new Float32Array([0]), 1]]);
     state.parts.push(state.chosen);
     camera.center = turned([...point]);
-    camera.distance = Math.min(camera.distance, 1.2 * state.shown.whole.radius);
+    camera.distance = Math.min(camera.distance, 0.5 * state.shown.whole.radius);
   }
 
   function draw(now) {
