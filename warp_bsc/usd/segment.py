@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,11 +80,17 @@ class Segment:
         self.dtype = dtype
         self.meshes, faces = [], []
         vertex_count = face_count = 0
+        compact: dict[int, tuple] = {}  # triangles that instances share, and what is made of them, by their identity
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
             triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
-            used, corners = np.unique(triangles, return_inverse=True)
-            faces.append(corners.reshape(-1, 3) + vertex_count)
+            if id(triangles) not in compact:
+                used, corners = np.unique(triangles, return_inverse=True)
+                compact[id(triangles)] = used, corners.reshape(-1, 3), triangles
+            used, corners, _ = compact[id(triangles)]
+            if not mesh.group:
+                compact.clear()
+            faces.append(corners + vertex_count)
             self.meshes.append(
                 SceneMesh(
                     path=mesh.path,
@@ -108,20 +113,18 @@ class Segment:
         self._corners = np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64)
 
         self._start = np.zeros((vertex_count, 3), dtype)
-        for number, mesh in enumerate(self.meshes):
-            self._start[mesh.vertices] = self._read_positions(number, times[0], False, mesh.points)
+        everything = np.arange(vertex_count)
+        self._reader(everything, range(len(self.meshes))).read(self._start, times[0], False)
         self._welded_to = self._find_welds(times, progress)
         self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
         self.faces = corners.reshape(-1, 3).astype(np.int32)
         self.vertex_count = len(self._kept)
         self.welded = vertex_count - self.vertex_count
         self._start = self._start[self._kept]
-        ends = np.searchsorted(self._kept, [mesh.vertices.stop for mesh in self.meshes]).tolist()
-        self._rows = [slice(start, end) for start, end in pairwise([0, *ends])]  # of each mesh, among the kept vertices
-        self._points = [
-            mesh.points[self._kept[rows] - mesh.vertices.start]
-            for mesh, rows in zip(self.meshes, self._rows, strict=True)
-        ]
+        moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
+        jumping = [number for number in moving if usd_meshes[number].may_jump]
+        self._moving = self._reader(self._kept, moving)
+        self._jumping = self._reader(self._kept, jumping) if jumping else None
 
     def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
         """Reads the positions of all vertices in world space.
@@ -138,14 +141,12 @@ class Segment:
         Raises:
             UnreadableError: If a mesh has another number of points than at first, or a coordinate is not finite.
         """
-        numbers = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
-        if last is not None:
-            numbers = [number for number in numbers if self._usd_meshes[number].may_jump]
-            if not numbers:
-                return last
+        if last is not None and not self._jumping:
+            return last
+        reader = self._moving if last is None else self._jumping
+        assert reader
         positions = (self._start if last is None else last).copy()
-        for number in numbers:
-            positions[self._rows[number]] = self._read_positions(number, time, before, self._points[number])
+        reader.read(positions, time, before)
         return positions
 
     @property
@@ -272,35 +273,75 @@ class Segment:
             points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
         return meshes, points
 
-    def _read_positions(self, number, time, before, points) -> np.ndarray:
-        return self._usd_meshes[number].read_positions(
-            time, before=before, used=points, point_count=self.meshes[number].point_count, dtype=self.dtype
-        )
+    def _reader(self, vertices, numbers) -> "_Reader":
+        """Returns a reader of some vertices, ascending among the unwelded ones, in the meshes of some numbers."""
+        ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
+        parts = []
+        for number in numbers:
+            mesh, rows = self.meshes[number], slice(ends[number], ends[number + 1])
+            points = mesh.points[vertices[rows] - mesh.vertices.start]
+            parts.append((self._usd_meshes[number], mesh.point_count, rows, points))
+        return _Reader(parts, self.dtype)
 
     def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
         welded_to = _split(_group(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
-        ends = np.searchsorted(crowded, [mesh.vertices.stop for mesh in self.meshes]).tolist()
-        rows = [slice(start, end) for start, end in pairwise([0, *ends])]
-        moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves and rows[number].start < ends[number]]
+        owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
+        moving = [number for number in owners if self.meshes[number].moves]
         if not moving:
             return welded_to
         jumping = any(self._usd_meshes[number].may_jump for number in moving)
         moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
         moments.append((times[-1], True))
+        reader = self._reader(crowded, moving)
         positions = self._start[crowded]
         groups = np.searchsorted(crowded, welded_to[crowded])
         for done, (time, before) in enumerate(moments):
             if progress:
                 progress(done, len(moments))
-            for number in moving:
-                mesh = self.meshes[number]
-                points = mesh.points[crowded[rows[number]] - mesh.vertices.start]
-                positions[rows[number]] = self._read_positions(number, time, before, points)
+            reader.read(positions, time, before)
             groups = _split(groups, positions)
         welded_to[crowded] = crowded[groups]
         return welded_to
+
+
+class _Reader:
+    """Reads positions of some vertices; those of instances of one prim together."""
+
+    def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
+        """Takes for each mesh the number of its points, the rows of its vertices in the result, and their points."""
+        self._dtype = dtype
+        groups: dict[tuple, list] = {}
+        self._single = []
+        for part in parts:
+            (groups.setdefault(part[0].group, []) if part[0].group else self._single).append(part)
+        self._groups = []
+        for members in groups.values():
+            instances = np.array([mesh.index for mesh, *_ in members])
+            rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
+            taken = np.concatenate([place * count + points for place, (_, count, _, points) in enumerate(members)])
+            self._groups.append((members, instances, rows, taken))
+
+    def read(self, positions: np.ndarray, time: float, before: bool) -> None:
+        """Writes the positions at a time, or just before it, to the rows of the meshes.
+
+        Raises:
+            UnreadableError: If a mesh is broken at that time.
+        """
+        singles = list(self._single)
+        for members, instances, rows, taken in self._groups:
+            first, count, *_ = members[0]
+            together = first.read_instances(time, instances, before=before)
+            found = together.reshape(-1, 3)[taken] if together.shape[1] == count else np.full((1, 3), np.nan)
+            if np.isfinite(found).all():
+                positions[rows] = found
+            else:
+                singles += members  # one of them is broken, and says so
+        for mesh, count, rows, points in singles:
+            positions[rows] = mesh.read_positions(
+                time, before=before, used=points, point_count=count, dtype=self._dtype
+            )
 
 
 def _group(positions) -> np.ndarray:
