@@ -396,6 +396,7 @@ def test_what_is_printed_names_the_files(stage, capsys, tmp_path):
     output = capsys.readouterr().out
     for name in OUTPUTS:
         assert f"Wrote {tmp_path / name}." in output
+    assert "usdview shows them by Display, Display Purposes, Guide" in " ".join(output.split())
     assert "note: Motion between time samples is taken to be linear." in output
 
 

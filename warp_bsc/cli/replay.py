@@ -18,7 +18,7 @@ from ..replay.intervals import IntervalResult, replay
 from ..replay.outputs import ReplayOutput
 from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
-from ..replay.usd_overlay import Overlay
+from ..replay.usd_overlay import SHOWN_BY, Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
@@ -155,8 +155,7 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--overlay",
         metavar="FILE",
-        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides: in usdview by Display, "
-        "Display Purposes, Guide, in Blender by Guide in the import's options",
+        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
     )
     file = {"type": _output, "metavar": "FILE"}
     out.add_argument(
@@ -288,6 +287,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
                 print_replay(console, summary)
                 for output in finished:
                     say(console, f"Wrote {output.file.path}.")
+                    if isinstance(output, Overlay):
+                        say(console, f"  {SHOWN_BY}")
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:

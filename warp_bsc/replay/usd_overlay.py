@@ -25,7 +25,7 @@ from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .summary import Summary
 
-__all__ = ["COLORS", "LIFT", "Overlay"]
+__all__ = ["COLORS", "LIFT", "SHOWN_BY", "Overlay"]
 
 COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
@@ -37,6 +37,12 @@ COLORS = {
 
 LIFT = 2e-4
 """Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
+
+SHOWN_BY = (
+    "Its prims are guides, which programs hide at first: usdview shows them by Display, Display Purposes, Guide; "
+    "Blender by Guide among the options of its import; usdrecord by --purposes guide."
+)
+"""How to see the overlay."""
 
 _MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of that size
 _CURVE_WIDTH = 0.0015  # width of the curves, too
@@ -90,11 +96,12 @@ class Overlay:
       only touch make no curve.
 
     All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
-    points are instances of a mesh, as Blender binds no materials to USD's own points.
+    points are instances of a mesh, as Blender binds no materials to USD's own points; it shows the curves grey, as it
+    binds none to USD's curves either.
 
     Their purpose is guide, so that no render of the layer contains them by accident, and a replay of the layer does not
-    take them for a part of the scene. Programs hide guides at first. usdview shows them by Display, Display Purposes,
-    Guide; Blender by Guide among the options of its import; ``usdrecord`` by ``--purposes guide``.
+    take them for a part of the scene. Programs hide guides until they are asked for them; :data:`SHOWN_BY` says how,
+    which the layer's documentation and the command line repeat.
 
     A name that ends in ``.usda`` gives a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
     smaller. USD interpolates between samples, so all that shall not move gets an empty sample just before the next.
@@ -354,7 +361,7 @@ class Overlay:
         if summary.intersections:
             found["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
         layer.customLayerData = {"collisions": found | ({"stopped": summary.stopped} if summary.stopped else {})}
-        layer.documentation = f"Collisions found by warp-bsc replay, of purpose guide. {summary.motion}"
+        layer.documentation = f"Collisions found by warp-bsc replay. {SHOWN_BY} {summary.motion}"
         for name, value in self._metadata.items():
             layer.pseudoRoot.SetInfo(name, value)
         layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
