@@ -183,7 +183,7 @@ def test_recording_of_newton(capsys):
 
 
 def test_fail_on_collision(capsys, falling_scene, safe_scene):
-    options = ["--fail-on-collision", "--device", "cpu"]
+    options = ["--fail-on", "collisions", "--device", "cpu"]
     assert main(["replay", falling_scene, *options]) == 1
     assert "Collisions in 1 of 4" in capsys.readouterr().out
     assert main(["replay", safe_scene, *options]) == 0
@@ -423,7 +423,7 @@ def test_output_that_cannot_encode_all(monkeypatch, scenes):
     write_scene(scenes / "näme.usda")
     output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", output)
-    assert main(["replay", str(scenes / "näme.usda"), "--device", "cpu", "--fail-on-collision"]) == 1
+    assert main(["replay", str(scenes / "näme.usda"), "--device", "cpu", "--fail-on", "collisions"]) == 1
     text = output.buffer.getvalue().decode("ascii")
     assert "3 -> 4" in text and "n\\xe4me.usda: 2 meshes" in text
     assert output.errors == "strict"

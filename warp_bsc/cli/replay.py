@@ -6,12 +6,14 @@ import errno
 import importlib
 import math
 import os
+import shlex
 from collections.abc import Generator
 
 import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .._atomic_file import STDOUT, naming
+from ..replay.baseline import Baseline
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
 from ..replay.intervals import IntervalResult, replay
@@ -30,10 +32,9 @@ from .options import (
     Commands,
     add_command,
     add_detection_options,
-    add_fail_on_collision,
     positive,
 )
-from .replay_tables import print_replay
+from .replay_tables import print_new, print_replay
 from .tables import Console, say
 
 __all__ = ["add_to", "open_scene", "run_replay"]
@@ -58,7 +59,8 @@ examples:
   warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
   warp-bsc replay cloth.usd --device cpu --method conservative
   warp-bsc replay cloth.usd --json > collisions.json
-  warp-bsc replay cloth.usd --fail-on-collision || echo "it collides"
+  warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
+  warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
 
   a recording of one of Newton's examples:
   python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
@@ -67,7 +69,7 @@ examples:
 
 exit status:
   0  done, whether or not anything collides
-  1  collisions found, with --fail-on-collision
+  1  found what --fail-on names
 {ERROR_STATUS}
   3  --validate found a wrong answer
   4  done, but parts of the scene could not be read and were left out; --strict
@@ -75,7 +77,7 @@ exit status:
 {SIGNAL_STATUS}
 If several apply, a signal comes before 2, then 3, 1 and 4."""
 
-_COLLIDES = 1
+_FAILS = 1
 _DISAGREES = 3
 _LEFT_OUT = 4
 
@@ -115,6 +117,25 @@ def add_to(commands: Commands) -> None:
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
+    )
+    which.add_argument(
+        "--ignore",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("A", "B"),
+        help="ignore pairs of a mesh of pattern A and one of pattern B, which are only counted; may be repeated",
+    )
+    which.add_argument(
+        "--ignore-from",
+        metavar="FILE",
+        help="pairs to ignore from a file: two patterns a line, in quotation marks if they contain blanks; # begins a "
+        "comment",
+    )
+    which.add_argument(
+        "--ignore-initial",
+        action="store_true",
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then",
     )
     which.add_argument(
         "--purpose",
@@ -158,8 +179,21 @@ def add_to(commands: Commands) -> None:
     printed = {"nargs": "?", "const": STDOUT, **file}
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
+    out.add_argument(
+        "--baseline",
+        metavar="FILE",
+        help="compare with the JSON file of an earlier replay: print which meshes collide or cross at times at which "
+        "they did not",
+    )
+    out.add_argument(
+        "--fail-on",
+        type=_reasons,
+        default=frozenset(),
+        metavar="WHAT",
+        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces), "
+        "collisions, new (what --baseline does not have)",
+    )
     add_detection_options(command, method="exact")
-    add_fail_on_collision(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -185,6 +219,10 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
+    if "new" in arguments.fail_on and not arguments.baseline:
+        raise ValueError("--fail-on new needs --baseline")
+    if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
+        raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
     places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
@@ -197,6 +235,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         self_collisions=arguments.self_collisions,
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
+        ignore=(*map(tuple, arguments.ignore), *(_read_pairs(arguments.ignore_from) if arguments.ignore_from else ())),
     )
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         importlib.import_module("warp_bsc.usd.meshes")
@@ -232,6 +271,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
             disk, as far as it has space.
     """
     settings = {"method": arguments.method, "device": str(device)}
+    baseline = Baseline(arguments.baseline) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
         outputs = _open_outputs(stack, scene, arguments, settings)
         intervals, interrupt, problems = [], None, []
@@ -279,14 +319,21 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
             with naming("standard output"):
                 console = Console()
                 print_replay(console, summary)
+                if baseline:
+                    print_new(console, baseline.new_in(summary))
                 for output in finished:
                     say(console, f"Wrote {output.file.path}.")
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:
         return _DISAGREES
-    if arguments.fail_on_collision and summary.hits:
-        return _COLLIDES
+    fails = {
+        "intersections": any(sample.crossings for sample in summary.intersections),
+        "collisions": summary.hits > 0,
+        "new": baseline is not None and bool(baseline.new_in(summary)),
+    }
+    if any(fails[reason] for reason in arguments.fail_on):
+        return _FAILS
     return _LEFT_OUT if scene.left_out else 0
 
 
@@ -368,12 +415,42 @@ def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Ge
             method=arguments.method,
             device=device,
             intersections=arguments.intersections,
+            ignore_initial=arguments.ignore_initial,
             validate_most=arguments.validate,
         ):
             yield result
             speed = progress.tasks[task].speed
             rate = f"{speed:.1f}/s" if speed else "…/s"
             progress.update(task, advance=1, time=result.summary.end, rate=rate)
+
+
+def _reasons(text: str) -> frozenset[str]:
+    reasons = frozenset(text.split(","))
+    if unknown := reasons - {"intersections", "collisions", "new"}:
+        raise argparse.ArgumentTypeError(
+            f"must be of intersections, collisions, new, not {', '.join(sorted(unknown))!r}"
+        )
+    return reasons
+
+
+def _read_pairs(path: str) -> list[tuple[str, str]]:
+    """Reads pairs of patterns from a file.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If a line has not two patterns.
+    """
+    pairs = []
+    with naming(path), open(path, encoding="utf-8") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                patterns = shlex.split(line, comments=True)
+            except ValueError as error:
+                raise ValueError(f"{path}: line {number}: {error}") from None
+            if len(patterns) not in (0, 2):
+                raise ValueError(f"{path}: line {number}: must be two patterns, not {len(patterns)}")
+            pairs += [(patterns[0], patterns[1])] if patterns else []
+    return pairs
 
 
 def _output(text: str) -> str:
