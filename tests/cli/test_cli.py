@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import re
 import os
 import subprocess
 import sys
@@ -180,6 +181,14 @@ def test_recording_of_newton(capsys):
     found = json.loads(run(capsys, "replay", ASSETS / "cloth_twist.usd", "--json"))
     assert [interval["hits"] for interval in found["intervals"]] == [1, 2, 2, 3, 7, 3, 5, 0, 0, 3, 2, 1, 3, 1]
     assert found["mesh_pairs"] == [{"meshes": ["/root/model/triangles"] * 2, "hits": 33}]
+
+
+def test_progress_without_a_terminal(capsys, falling_scene, monkeypatch):
+    monkeypatch.setattr("warp_bsc.cli.replay._LOG_SECONDS", -1.0)
+    assert main(["replay", falling_scene, "--device", "cpu"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in lines] == [f"Replaying: {done} of 4" for done in (1, 2, 3, 4)]
+    assert re.fullmatch(r"Replaying: 2 of 4, time \S+, \d+\.\d/s, about \d+ s left", lines[1])
 
 
 def test_fail_on_collision(capsys, falling_scene, safe_scene):

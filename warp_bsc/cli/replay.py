@@ -7,6 +7,7 @@ import importlib
 import math
 import os
 import shlex
+import time
 from collections.abc import Generator
 
 import warp as wp
@@ -76,6 +77,9 @@ exit status:
      ends with 2 instead
 {SIGNAL_STATUS}
 If several apply, a signal comes before 2, then 3, 1 and 4."""
+
+_LOG_SECONDS = 10.0
+"""Time between two lines on the progress, where there is no terminal."""
 
 _FAILS = 1
 _DISAGREES = 3
@@ -241,13 +245,15 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         importlib.import_module("warp_bsc.usd.meshes")
     INTERRUPTS.check()
     try:
-        scene = Scene(
-            arguments.scene,
-            selection=selection,
-            frames=arguments.frames,
-            subdivide=arguments.subdivide,
-            strict=arguments.strict,
-        )
+        with _Progress("Comparing vertices") as progress:
+            scene = Scene(
+                arguments.scene,
+                selection=selection,
+                frames=arguments.frames,
+                subdivide=arguments.subdivide,
+                strict=arguments.strict,
+                progress=progress.show,
+            )
     except (OSError, ValueError):
         raise
     except Exception as error:
@@ -396,20 +402,47 @@ def _open_outputs(
     return outputs
 
 
+class _Progress:
+    """Shows how far a run is: a bar on a terminal, else a line on standard error every few seconds."""
+
+    def __init__(self, what: str):
+        self._what = what
+        self._bar = Progress(
+            TextColumn(what),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._bar.disable = not self._bar.console.is_terminal
+        self._task = self._bar.add_task("", total=None, note="")
+        self._started = self._said = time.monotonic()
+
+    def __enter__(self) -> "_Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, done: int, total: int, note: str = "") -> None:
+        """Shows how much is done of all, and a note on it."""
+        now = time.monotonic()
+        if done:
+            note += f"{', ' * bool(note)}{done / max(now - self._started, 1e-9):.1f}/s"
+        self._bar.update(self._task, completed=done, total=total, note=note)
+        if self._bar.disable and done and now - self._said > _LOG_SECONDS:
+            self._said = now
+            left = (now - self._started) / done * (total - done)
+            say(self._bar.console, f"{self._what}: {done} of {total}, {note}, about {left:,.0f} s left")
+
+
 def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Generator[IntervalResult, None, None]:
-    """Yields the intervals as they are found, and shows progress, rate and time left on a terminal."""
-    progress = Progress(
-        TextColumn("Replaying"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("time {task.fields[time]:g}, {task.fields[rate]}"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )
-    progress.disable = not progress.console.is_terminal
-    with progress:
-        task = progress.add_task("", total=len(scene.times) - 1, time=scene.times[0], rate="…/s")
+    """Yields the intervals as they are found, and shows progress, rate and time left."""
+    with _Progress("Replaying") as progress:
+        progress.show(0, len(scene))
         for result in replay(
             scene,
             method=arguments.method,
@@ -419,9 +452,7 @@ def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Ge
             validate_most=arguments.validate,
         ):
             yield result
-            speed = progress.tasks[task].speed
-            rate = f"{speed:.1f}/s" if speed else "…/s"
-            progress.update(task, advance=1, time=result.summary.end, rate=rate)
+            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
 
 
 def _reasons(text: str) -> frozenset[str]:

@@ -82,10 +82,10 @@ def count_by_meshes(
         meshes: The two meshes of each pair, indices in ``segment.meshes``, shape [n, 2].
         weights: What is added up instead of the number 1, bool or integers, shape [n, k].
     """
-    weights = np.ones((len(meshes), 1), dtype=int) if weights is None else weights
+    numbers: np.ndarray = np.ones((len(meshes), 1), dtype=int) if weights is None else weights
     pairs, groups = np.unique(np.sort(meshes, axis=1) @ np.array([len(segment.meshes), 1]), return_inverse=True)
-    sums = np.zeros((len(pairs), weights.shape[1]), dtype=np.int64)
-    np.add.at(sums, groups, weights)
+    sums = np.zeros((len(pairs), numbers.shape[1]), dtype=np.int64)
+    np.add.at(sums, groups, numbers)
     names = [mesh.name for mesh in segment.meshes]
     return {
         (names[pair // len(names)], names[pair % len(names)]): tuple(row)
