@@ -140,7 +140,7 @@ def test_nothing_is_left_out_that_must_not_be(stage, capfd, tmp_path, add, reaso
 
 def test_collisions_come_before_what_is_left_out(stage):
     add_bare_mesh(stage)
-    assert main(["replay", save(stage), "--device", "cpu", "--fail-on-collision"]) == 1
+    assert main(["replay", save(stage), "--device", "cpu", "--fail-on", "collisions"]) == 1
 
 
 def test_what_is_not_selected_need_not_be_whole(stage):

@@ -278,7 +278,7 @@ def test_a_mesh_that_only_its_transform_moves_does_not_collide_with_itself(stage
     assert found["validation"]["hits"] == 0 and found["validation"]["disagreements"] == []
     assert found["intervals"][0]["stages"]["vertex_face"]["candidates"] > 0
     capsys.readouterr()
-    assert main(["replay", save(stage), "--device", "cpu", "--method", "conservative", "--fail-on-collision"]) == 0
+    assert main(["replay", save(stage), "--device", "cpu", "--method", "conservative", "--fail-on", "collisions"]) == 0
     assert "No collision in 2 intervals." in capsys.readouterr().out
 
 

@@ -1,5 +1,7 @@
 """Shows the results of a replay on the terminal."""
 
+from collections import defaultdict
+
 from rich.console import Console
 from rich.text import Text
 
@@ -8,7 +10,10 @@ from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .tables import LONGEST, count, make_table, say
 
-__all__ = ["print_replay"]
+__all__ = ["print_new", "print_replay"]
+
+_RANGES = 4
+"""Most ranges of time in a line."""
 
 
 def print_replay(console: Console, summary: Summary) -> None:
@@ -51,6 +56,11 @@ def print_replay(console: Console, summary: Summary) -> None:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
     if summary.intersections:
         _print_intersections(console, summary)
+    if summary.ignored:
+        ignored = sum(hits for _, hits in summary.ignored)
+        say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
+        for meshes, hits in summary.ignored[:LONGEST]:
+            say(console, f"  {hits:,} of {_pair(meshes)}")
 
     if not scene.is_still:
         _print_certificate(console, summary)
@@ -65,6 +75,19 @@ def print_replay(console: Console, summary: Summary) -> None:
         return
     total = sum(summary.milliseconds.values())
     say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
+
+
+def print_new(console: Console, new: list[tuple[tuple[str, str], float, float]]) -> None:
+    """Prints what is new against a baseline: names of two meshes, start and end each."""
+    if not new:
+        say(console, "Nothing is new against the baseline.")
+        return
+    say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
+    for meshes, start, end in new[:LONGEST]:
+        says = f"crosses at {start:g}" if start == end else f"collides from {start:g} to {end:g}"
+        say(console, f"  {_pair(meshes)} {says}")
+    if len(new) > LONGEST:
+        say(console, f"  and {len(new) - LONGEST} more.")
 
 
 def _print_certificate(console: Console, summary: Summary) -> None:
@@ -132,8 +155,13 @@ def _print_collisions(console: Console, summary: Summary) -> None:
         f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
         f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
     )
+    spans = defaultdict(list)
+    for span in summary.collision_spans:
+        spans[span.meshes].append(span)
     for meshes, hits in summary.mesh_pairs[:LONGEST]:
-        say(console, f"  {hits:,} of {_pair(meshes)}")
+        ranges = [f"{span.since:g} to {span.until:g}" for span in spans[meshes]]
+        more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
+        say(console, f"  {hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
     if len(summary.mesh_pairs) > LONGEST:
         say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest

@@ -100,6 +100,8 @@ class HitsJson(RecordFile):
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
             "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
+            "collision_spans": [asdict(span) for span in summary.collision_spans],
+            "ignored": _mesh_pairs_to_list(summary.ignored),
             "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
             "validation": asdict(summary.validation) if summary.validation else None,
         }

@@ -1,7 +1,7 @@
 """Replays a USD scene: finds the collisions between each two consecutive times, holding one interval at a time."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,11 @@ from ..detection.intersections import IntersectionFinder
 from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.scene import Scene
+from ..usd.segment import Segment
+from ..usd.selection import Selection
 from .scene_contacts import PHASES, SceneContacts, find_contacts
 from .scene_intersections import SceneIntersections, name_intersections
+from .scene_pairs import count_by_meshes
 from .threads import read_ahead
 from .validation import Validation, validate
 
@@ -79,6 +82,7 @@ class IntervalSummary:
         intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
+        ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
         phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
     """
 
@@ -94,6 +98,7 @@ class IntervalSummary:
     stats: DetectionStats
     validation: Validation | None
     intersections: tuple[IntersectionSummary, IntersectionSummary] | None
+    ignored: dict[tuple[str, str], int]
     separate_hits: int | None
     phases: tuple[int, ...] | None
 
@@ -135,6 +140,7 @@ def replay(
     method: str = "exact",
     device: Any = None,
     intersections: bool = True,
+    ignore_initial: bool = False,
     validate_most: int | None = 0,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
@@ -155,6 +161,8 @@ def replay(
         method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default.
         intersections: Whether to find the intersections at each time.
+        ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
+            themselves then: their collisions and intersections are only counted.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
@@ -163,41 +171,49 @@ def replay(
         next interval meanwhile.
 
     Raises:
-        ValueError: If the positions at some time are broken, or there is no such method.
+        ValueError: If the positions at some time are broken, there is no such method, or initial intersections are to
+            be ignored and none are to be found.
     """
-    segment_replay = None
+    if ignore_initial and not intersections:
+        raise ValueError("what crosses at first can be ignored only if intersections are found")
+    selection, segment_replay = scene.selection, None
     for interval in read_ahead(scene):
         if segment_replay is None or interval.segment is not segment_replay.segment:
-            segment_replay = None  # before the next is made, to free its memory
-            segment_replay = _SegmentReplay(scene, interval, method, device, intersections)
-        yield segment_replay.check(interval, validate_most)
+            is_first, segment_replay = segment_replay is None, None  # before the next is made, to free its memory
+            segment_replay = _SegmentReplay(interval.segment, scene.is_still, method, device, intersections)
+            if is_first and ignore_initial:
+                at_first = _summarize_intersections(segment_replay.find(interval.x0, interval.start, selection))
+                crossing = {tuple(sorted(names)) for names, (crossings, _) in at_first.mesh_pairs.items() if crossings}
+                selection = replace(selection, ignored_names=selection.ignored_names | crossing)
+                segment_replay.forget()
+        yield segment_replay.check(interval, selection, validate_most)
 
 
 class _SegmentReplay:
     """Checks the intervals of one segment."""
 
-    def __init__(self, scene: Scene, interval: Interval, method: str, device: Any, intersections: bool):
-        self._scene = scene
-        self.segment = segment = interval.segment
+    def __init__(self, segment: Segment, is_still: bool, method: str, device: Any, intersections: bool):
+        self.segment = segment
+        self._is_still = is_still
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
         self._detector = CollisionDetector(self._mesh, method=method)
         self._finder = IntersectionFinder(self._mesh) if intersections else None
         self._last: SceneIntersections | None = None  # those found last
 
-    def check(self, interval: Interval, validate_most: int | None) -> IntervalResult:
+    def check(self, interval: Interval, selection: Selection, validate_most: int | None) -> IntervalResult:
         """Returns the collisions of an interval."""
         detector = self._detector
         intersections = None
         if self._finder:
-            start = self._find(interval.x0, interval.start)
-            intersections = start, self._find(interval.x1, interval.end)
-        if self._scene.is_still:  # at rest, coplanar faces would be many collisions between obstacles
+            start = self.find(interval.x0, interval.start, selection)
+            intersections = start, self.find(interval.x1, interval.end, selection)
+        if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
             detector = CollisionDetector(CollisionMesh([], 0, device=self._mesh.device), method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        contacts = find_contacts(interval, self._mesh, collisions, self._scene.selection, intersections)
+        contacts = find_contacts(interval, self._mesh, collisions, selection, intersections)
         validation = None
         if validate_most != 0:
             validation = validate(
@@ -212,14 +228,18 @@ class _SegmentReplay:
         summary = _summarize(contacts, collisions, intersections, validation)
         return IntervalResult(summary, contacts, intersections)
 
-    def _find(self, x: np.ndarray, time: float) -> SceneIntersections:
+    def find(self, x: np.ndarray, time: float, selection: Selection) -> SceneIntersections:
         """Returns the intersections at a time, those found last if these are the ones."""
         last = self._last
-        if last is None or last.time != time or not np.array_equal(last.x, x):
+        if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
             assert self._finder
             found = self._finder.find(x)
-            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, self._scene.selection)
+            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, selection)
         return last
+
+    def forget(self) -> None:
+        """Forgets what was found last: another selection counts."""
+        self._last = None
 
 
 def _summarize(contacts, collisions, intersections, validation) -> IntervalSummary:
@@ -237,7 +257,7 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
     if intersections:
         start, end = map(_summarize_intersections, intersections)
         at_rest = start, end
-    hits_by_meshes = contacts.count_by_meshes(np.ones((len(contacts), 1), dtype=int))
+    hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
         index=interval.index,
@@ -252,13 +272,14 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
         stats=collisions.stats,
         validation=validation,
         intersections=at_rest,
+        ignored=contacts.ignored,
         separate_hits=int(contacts.separate.sum()) if intersections else None,
         phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
     )
 
 
 def _summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
-    by_meshes = found.count_by_meshes(np.stack([found.crosses, ~found.crosses], axis=1))
+    by_meshes = count_by_meshes(found.segment, found.meshes, np.stack([found.crosses, ~found.crosses], axis=1))
     return IntersectionSummary(
         found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
     )

@@ -9,7 +9,7 @@ from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
-from .scene_pairs import DIAGONAL, EDGE, FACE, VERTEX, ScenePairs
+from .scene_pairs import DIAGONAL, EDGE, FACE, VERTEX, ScenePairs, count_by_meshes
 
 __all__ = ["KINDS", "PHASES", "SceneContacts", "find_contacts"]
 
@@ -34,6 +34,7 @@ class SceneContacts(ScenePairs):
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
         counted: Which of the pairs that the detector found are among these, vertex-face before edge-edge, bool.
+        ignored: Number of pairs that collide and are to be ignored, by the names of their meshes, in order.
         separate: Whether the two meshes did not intersect at the start of the interval, nor touch, shape [n]; for a
             mesh with itself, whether no part of it did. None if intersections were not looked for.
         phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it.
@@ -46,6 +47,7 @@ class SceneContacts(ScenePairs):
     time: np.ndarray
     normal: np.ndarray
     counted: np.ndarray = field(repr=False)
+    ignored: dict[tuple[str, str], int]
     separate: np.ndarray | None = None
     phase: np.ndarray | None = None
 
@@ -71,8 +73,8 @@ def find_contacts(
 ) -> SceneContacts:
     """Names the pairs that a detection found and that count.
 
-    Excluded are pairs of meshes that never move, pairs that the selection excludes, and pairs of a mesh with itself if
-    only its transform moves it. Elements that are apart in such a mesh stay apart, and elements that touch, at
+    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
+    itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
     T-junctions or in coplanar faces, would collide by rounding alone. (If a transform turns by half a circle from one
     sample to the next, or scales by zero, the straight ways of the vertices meet although the mesh does not.)
 
@@ -122,6 +124,8 @@ def find_contacts(
     moves = np.array([part.moves for part in segment.meshes])
     counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
     counted &= ~_are_stiff(segment, vertices, meshes[:n_vertex_face, 1], ends)
+    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~ignored
     arrays = {
         "kind": kind,
         "elements": elements,
@@ -135,7 +139,11 @@ def find_contacts(
         "normal": normal,
     }
     contacts = SceneContacts(
-        segment, **{name: array[counted] for name, array in arrays.items()}, interval=interval, counted=counted
+        segment,
+        **{name: array[counted] for name, array in arrays.items()},
+        interval=interval,
+        counted=counted,
+        ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
     )
     return _compare(contacts, *intersections) if intersections else contacts
 

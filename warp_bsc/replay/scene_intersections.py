@@ -96,8 +96,8 @@ def name_intersections(
 ) -> SceneIntersections:
     """Names the intersections that count.
 
-    Excluded are pairs that the selection excludes, and pairs of a mesh with itself if only its transform moves it:
-    where its parts touch, rounding of its positions makes them cross. Meshes that never move are checked.
+    Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
+    moves it: where its parts touch, rounding of its positions makes them cross. Meshes that never move are checked.
 
     Args:
         segment: The segment.
@@ -112,7 +112,8 @@ def name_intersections(
     edge_meshes, points, diagonal = segment.locate_edges(ends)
     face_meshes, polygons = segment.locate_faces(faces)
     meshes = np.stack([edge_meshes, face_meshes], axis=1)
-    counted = selection.counted_pairs(segment.meshes, meshes) & ~segment.are_stiff(ends, face_meshes)
+    counted = selection.counted_pairs(segment.meshes, meshes) & ~selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~segment.are_stiff(ends, face_meshes)
     nowhere = np.full_like(faces, -1)
     arrays = {
         "elements": np.stack([np.where(diagonal, DIAGONAL, EDGE), np.full(len(faces), FACE)], axis=1),

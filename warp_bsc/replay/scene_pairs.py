@@ -6,7 +6,7 @@ import numpy as np
 
 from ..usd.segment import Segment
 
-__all__ = ["DIAGONAL", "EDGE", "FACE", "VERTEX", "ScenePairs"]
+__all__ = ["DIAGONAL", "EDGE", "FACE", "VERTEX", "ScenePairs", "count_by_meshes"]
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
@@ -71,11 +71,23 @@ class ScenePairs:
         first, second = np.sort(self.meshes, axis=1).T
         return first * len(self.segment.meshes) + second
 
-    def count_by_meshes(self, weights: np.ndarray) -> dict[tuple[str, str], tuple[int, ...]]:
-        """Returns sums of weights, bool or integers of shape [n, k], for each two meshes, by their names, in order."""
-        keys, groups = np.unique(self.mesh_keys(), return_inverse=True)
-        sums = np.zeros((len(keys), weights.shape[1]), dtype=np.int64)
-        np.add.at(sums, groups, weights)
-        names = [mesh.name for mesh in self.segment.meshes]
-        pairs = zip(*(half.tolist() for half in np.divmod(keys, len(names))), strict=True)
-        return {(names[a], names[b]): tuple(row) for (a, b), row in zip(pairs, sums.tolist(), strict=True)}
+
+def count_by_meshes(
+    segment: Segment, meshes: np.ndarray, weights: np.ndarray | None = None
+) -> dict[tuple[str, str], tuple[int, ...]]:
+    """Returns the number of pairs for each two meshes, by their names, in order.
+
+    Args:
+        segment: The segment.
+        meshes: The two meshes of each pair, indices in ``segment.meshes``, shape [n, 2].
+        weights: What is added up instead of the number 1, bool or integers, shape [n, k].
+    """
+    numbers: np.ndarray = np.ones((len(meshes), 1), dtype=int) if weights is None else weights
+    pairs, groups = np.unique(np.sort(meshes, axis=1) @ np.array([len(segment.meshes), 1]), return_inverse=True)
+    sums = np.zeros((len(pairs), numbers.shape[1]), dtype=np.int64)
+    np.add.at(sums, groups, numbers)
+    names = [mesh.name for mesh in segment.meshes]
+    return {
+        (names[pair // len(names)], names[pair % len(names)]): tuple(row)
+        for pair, row in zip(pairs.tolist(), sums.tolist(), strict=True)
+    }

@@ -7,7 +7,7 @@ from functools import cached_property
 from ..usd.scene import Scene
 from .intervals import TOI_BINS, Contact, IntersectionSummary, IntervalSummary
 
-__all__ = ["CERTIFIED_FOR", "IntersectionSpan", "Summary", "ValidationSummary"]
+__all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "Summary", "ValidationSummary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
 """The motion that a certificate holds for."""
@@ -32,6 +32,23 @@ class ValidationSummary:
     certified: int
     false_hits: int
     disagreements: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CollisionSpan:
+    """Consecutive intervals of a scene in all of which two meshes collide, or a mesh collides with itself.
+
+    Attributes:
+        meshes: Names of the two.
+        since: Start of the first interval, as a time code.
+        until: End of the last interval.
+        hits: Number of their pairs that collide.
+    """
+
+    meshes: tuple[str, str]
+    since: float
+    until: float
+    hits: int
 
 
 @dataclass(frozen=True)
@@ -115,6 +132,26 @@ class Summary:
     def hits(self) -> int:
         """Number of pairs that collide in some interval."""
         return sum(interval.hits for interval in self.intervals)
+
+    @cached_property
+    def ignored(self) -> list[tuple[tuple[str, str], int]]:
+        """Names of two meshes and their number of colliding pairs that were ignored, the largest first."""
+        total: Counter[tuple[str, str]] = Counter()
+        for interval in self.intervals:
+            total.update(interval.ignored)
+        return total.most_common()
+
+    @cached_property
+    def collision_spans(self) -> list[CollisionSpan]:
+        """Which meshes collide from when to when, in order of time; then those with the most hits first."""
+        spans, running = [], {}
+        for interval in self.intervals:
+            for meshes in [meshes for meshes in running if meshes not in interval.mesh_pairs]:
+                spans.append(running.pop(meshes))
+            for meshes, hits in interval.mesh_pairs.items():
+                before = running.get(meshes, CollisionSpan(meshes, interval.start, interval.end, 0))
+                running[meshes] = replace(before, until=interval.end, hits=before.hits + hits)
+        return sorted([*spans, *running.values()], key=lambda span: (span.since, -span.hits))
 
     @cached_property
     def intersections(self) -> list[IntersectionSummary]:

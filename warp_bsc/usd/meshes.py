@@ -54,6 +54,10 @@ def find_meshes(
     selection.check_patterns(finder.places)
 
     meshes, invisible, passed_over, warnings = [], [], Counter(), finder.warnings
+    if unmatched := selection.unmatched(finder.places):
+        warnings.append(
+            f"pairs to ignore that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
+        )
     first_instances: dict[tuple, UsdMesh] = {}
     for place in finder.places:
         if not selection.includes(place):
