@@ -34,6 +34,7 @@ from warp_bsc.cli.main import main
 from warp_bsc.replay import html_report, usd_overlay
 from warp_bsc.replay.page_view import choose_faces
 from warp_bsc.replay.usd_overlay import COLORS, LIFT
+from warp_bsc.usd import layer_writer
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>{{script}}"
@@ -353,7 +354,7 @@ def test_binary_overlay_saves_its_samples_as_they_get_many(tmp_path, monkeypatch
     shutil.copy(ASSETS / scene.name, scene)
     texts = []
     for size in (1, 1 << 25):
-        monkeypatch.setattr(usd_overlay, "_SAVED", size)
+        monkeypatch.setattr(layer_writer, "_SAVED", size)
         path = tmp_path / "overlay.usdc"
         assert main(["replay", str(scene), "--device", "cpu", "--overlay", str(path)]) == 0
         texts.append(Sdf.Layer.OpenAsAnonymous(str(path)).ExportToString())
@@ -652,15 +653,15 @@ def test_full_disk_has_room_for_all_files(tmp_path, size):
 def test_no_room_at_the_end_is_an_error(tmp_path, monkeypatch, capsys, suffix):
     stage = many_hits(tmp_path / "scene.usda", samples=9)
     path = tmp_path / f"overlay.{suffix}"
-    method = {"usda": "_write_text", "usdc": "_write_binary"}[suffix]
-    write, calls = getattr(usd_overlay.Overlay, method), []
+    name = {"usda": "write_text_layer", "usdc": "write_binary_layer"}[suffix]
+    write, calls = getattr(usd_overlay, name), []
 
     def without_room(*arguments):
         calls.append(arguments)
         with largest_file(10_000) if len(calls) == 1 else contextlib.nullcontext():
             write(*arguments)
 
-    monkeypatch.setattr(usd_overlay.Overlay, method, without_room)
+    monkeypatch.setattr(usd_overlay, name, without_room)
     command = ["replay", save(stage), "--device", "cpu", "--no-intersections", "--overlay", str(path)]
     assert main(command) == 2
     assert f"overlay.{suffix}: not all of it is written: [Errno 27] File too large" in capsys.readouterr().err

@@ -1,22 +1,17 @@
 """Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
-import errno
 import os
-import re
 import secrets
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .._atomic_file import OutputFile
 from ..usd.layer import just_before, layer_metadata, unused_path
+from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from .intervals import IntervalResult
@@ -46,8 +41,6 @@ SHOWN_BY = (
 
 _MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of that size
 _CURVE_WIDTH = 0.0015  # width of the curves, too
-_SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
-_TEXT_ROWS = 4096  # rows of an array that are text at once
 
 _EXTENT = {"extent": "float3[]"}
 _CONTACTS = _EXTENT | {
@@ -73,9 +66,6 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
     ),
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
-
-_SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
-"""Type and number of the components of a row, by the type of an attribute."""
 
 
 class Overlay:
@@ -161,8 +151,14 @@ class Overlay:
         if self._last is not None and self._last.time == end > summary.intervals[-1].start:
             last, self._last = self._last, None
             self._sample("Intersections", end, self._find_curves(last), interval=len(self._ends) - 1)
-        write = self._write_text if self._is_text else self._write_binary
-        write(summary, end)
+        content = self._content(summary, end)
+        if self._is_text:
+            self.file.truncate(0)
+            write_text_layer(content, self.file.write)
+        else:
+            temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+            write_binary_layer(content, temporary)
+            self.file.adopt(temporary)
         self.file.commit()
 
     def shrink(self) -> bool:
@@ -266,7 +262,7 @@ class Overlay:
         samples.append(_Sample(len(self._ends) if interval is None else interval, time, places, after))
 
     def _store(self, value_type, array) -> "_Place":
-        data = np.ascontiguousarray(array, dtype=_SHAPES[value_type][0])
+        data = np.ascontiguousarray(array, dtype=SHAPES[value_type][0])
         place = _Place(self._spool.tell(), data.nbytes)
         rest = memoryview(data).cast("B")
         while rest:
@@ -274,7 +270,7 @@ class Overlay:
         return place
 
     def _load(self, value_type, place) -> np.ndarray:
-        dtype, width = _SHAPES[value_type]
+        dtype, width = SHAPES[value_type]
         data = np.empty(place.size, np.uint8)
         self._spool.seek(place.offset)
         if self._spool.readinto(data) != place.size:
@@ -302,122 +298,28 @@ class Overlay:
             if is_last and end > sample.time:
                 yield end, empty
 
-    def _write_binary(self, summary, end):
-        """Writes the layer in USD's binary format, which can save samples and drop them from memory."""
-        from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
-
-        path = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-        try:
-            layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(path))
-            self._define_prims(layer)
-            self._describe(layer, summary)
-            waiting = 0
-            for prim, attribute in _attributes():
-                place = f"{self._root_path}/{prim}.{attribute}"
-                for time, value in self._time_samples(prim, attribute, end):
-                    layer.SetTimeSample(place, time, _to_vt(_PARTS[prim][1][attribute], value))
-                    waiting += value.nbytes
-                    if waiting > _SAVED:
-                        layer.Save()
-                        waiting = 0
-            layer.Save()
-            del layer  # closes the file
-            self.file.adopt(path)
-        except BaseException as error:
-            path.unlink(missing_ok=True)
-            if isinstance(error, Tf.ErrorException):
-                raise _as_os_error(error) from error
-            raise
-
-    def _write_text(self, summary, end):
-        """Writes the layer in USD's text format, sample by sample into the text of a layer without samples."""
-        from pxr import Sdf  # noqa: PLC0415 (slow)
-
-        head, body = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
-        self._describe(head, summary)
-        self._define_prims(body)
-        attributes = list(_attributes())
-        for number, (prim, attribute) in enumerate(attributes):  # whose sample is at the time of its number
-            empty = _to_vt(_PARTS[prim][1][attribute], self._load(_PARTS[prim][1][attribute], _Place(0, 0)))
-            body.SetTimeSample(f"{self._root_path}/{prim}.{attribute}", number, empty)
-        self.file.truncate(0)
-        self.file.write(head.ExportToString().rstrip("\n"))
-        # Text, number of the attribute, text, number, ...: no name of a prim has a line break in it.
-        parts = re.split(r"\n *(\d+): \[\],\n", body.ExportToString().removeprefix("#usda 1.0"))
-        for part, number in zip(parts[::2], [*parts[1::2], None], strict=True):
-            self.file.write(part + "\n")
-            if number is not None:
-                prim, attribute = attributes[int(number)]
-                for time, value in self._time_samples(prim, attribute, end):
-                    self.file.write(f"{time!r}: [")
-                    for start in range(0, len(value), _TEXT_ROWS):
-                        self.file.write(", " * bool(start) + _to_text(value[start : start + _TEXT_ROWS]))
-                    self.file.write("],\n")
-
-    def _describe(self, layer, summary):
-        """Sets the metadata of the layer. It does not open the sublayer, the scene."""
+    def _content(self, summary: Summary, end: float) -> LayerContent:
+        """Returns the content of the layer, given the last time of its intervals."""
         source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
         found = {"complete": summary.is_complete, "hits": summary.hits, "intervals": len(summary.intervals)}
         if summary.intersections:
             found["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
-        layer.customLayerData = {"collisions": found | ({"stopped": summary.stopped} if summary.stopped else {})}
-        layer.documentation = f"Collisions found by warp-bsc replay. {SHOWN_BY} {summary.motion}"
-        for name, value in self._metadata.items():
-            layer.pseudoRoot.SetInfo(name, value)
-        layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
-
-    def _define_prims(self, layer):
-        """Defines the prims of the layer, without time samples."""
-        from pxr import Sdf, Usd, UsdGeom, UsdShade  # noqa: PLC0415 (slow)
-
-        stage = Usd.Stage.Open(layer)
-        root = UsdGeom.Scope.Define(stage, self._root_path)
-        root.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        root.GetPrim().CreateAttribute("prims", Sdf.ValueTypeNames.StringArray).Set(list(self._prims))
-        UsdGeom.Scope.Define(stage, f"{self._root_path}/Materials")
-        for name, (kind, attributes) in _PARTS.items():
-            prim = stage.DefinePrim(f"{self._root_path}/{name}", kind)
-            for attribute, type_name in attributes.items():
-                value_type = Sdf.ValueTypeNames.Find(type_name)
-                if attribute.startswith("primvars:"):
-                    interpolation = UsdGeom.Tokens.uniform if kind == "BasisCurves" else UsdGeom.Tokens.vertex
-                    UsdGeom.PrimvarsAPI(prim).CreatePrimvar(attribute, value_type, interpolation)
-                else:
-                    prim.CreateAttribute(attribute, value_type, False)
-            shown = prim
-            if kind == "Mesh":
-                UsdGeom.Mesh(prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-            elif kind == "BasisCurves":
-                UsdGeom.BasisCurves(prim).CreateTypeAttr(UsdGeom.Tokens.linear)
-                UsdGeom.BasisCurves(prim).CreateWidthsAttr([_CURVE_WIDTH * self._size])
-                UsdGeom.BasisCurves(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
-            else:
-                shown = self._define_marker(stage, prim)
-            # The same colour where a program shows no materials.
-            UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([COLORS[name]])
-            material = UsdShade.Material.Define(stage, f"{self._root_path}/Materials/{name}")
-            shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
-            shader.CreateIdAttr("UsdPreviewSurface")
-            shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
-            shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(COLORS[name])
-            shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-            material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-            UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
-
-    def _define_marker(self, stage, instancer):
-        """Defines an octahedron of which the contact points are instances, and returns its prim."""
-        from pxr import UsdGeom  # noqa: PLC0415 (slow)
-
-        marker = UsdGeom.Mesh.Define(stage, f"{instancer.GetPath()}/Marker")
-        points = _MARKER_SIZE * self._size / 2 * np.concatenate([np.eye(3), -np.eye(3)])
-        marker.CreatePointsAttr([tuple(point) for point in points.tolist()])
-        marker.CreateExtentAttr([tuple(corner) for corner in _box(points).tolist()])
-        marker.CreateFaceVertexCountsAttr([3] * 8)
-        sides = [[(0, 1, 2), (3, 1, 2), (0, 4, 2), (0, 1, 5)], [(3, 4, 5), (0, 4, 5), (3, 1, 5), (3, 4, 2)]]
-        marker.CreateFaceVertexIndicesAttr([corner for side in sides for face in side for corner in face])
-        marker.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        UsdGeom.PointInstancer(instancer).CreatePrototypesRel().SetTargets([marker.GetPath()])
-        return marker.GetPrim()
+        if summary.stopped:
+            found["stopped"] = summary.stopped
+        widths = {"Mesh": 0.0, "PointInstancer": _MARKER_SIZE * self._size, "BasisCurves": _CURVE_WIDTH * self._size}
+        return LayerContent(
+            metadata=self._metadata,
+            documentation=f"Collisions found by warp-bsc replay. {SHOWN_BY} {summary.motion}",
+            custom={"collisions": found},
+            sublayer=source if source.startswith("../") else f"./{source}",
+            root=self._root_path,
+            strings={"prims": list(self._prims)},
+            prims=[
+                LayerPrim(name, kind, attributes, COLORS[name], widths[kind])
+                for name, (kind, attributes) in _PARTS.items()
+            ],
+            samples=lambda name, attribute: self._time_samples(name, attribute, end),
+        )
 
 
 @dataclass(frozen=True)
@@ -448,34 +350,6 @@ class _Sample:
     def is_empty(self) -> bool:
         """Whether there is nothing at that time."""
         return not self.places
-
-
-def _attributes() -> Iterator[tuple[str, str]]:
-    """Yields all attributes with time samples: the names of their prims and their own."""
-    return ((prim, attribute) for prim, (_, attributes) in _PARTS.items() for attribute in attributes)
-
-
-def _to_vt(value_type, array) -> Any:
-    from pxr import Vt  # noqa: PLC0415 (slow)
-
-    types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
-    types |= {"int[]": Vt.IntArray, "int2[]": Vt.Vec2iArray}
-    return types[value_type].FromNumpy(array)
-
-
-def _to_text(rows) -> str:
-    """Returns rows of an array in the syntax of USD's text format."""
-    number = "{:.9g}" if rows.dtype.kind == "f" else "{}"
-    row = number if rows.ndim == 1 else "(" + ", ".join([number] * rows.shape[1]) + ")"
-    return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
-
-
-def _as_os_error(error) -> Exception:
-    """Returns the system's error in an error of OpenUSD, such as a full disk, or the error itself if there is none."""
-    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        if os.strerror(number) in str(error):
-            return OSError(number, os.strerror(number))
-    return error
 
 
 def _box(points, margin=0.0) -> np.ndarray:
