@@ -794,7 +794,7 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     assert sum(data["toi"]) == 1 and data["toi"][9] + data["toi"][10] == 1
     (pair,) = data["pairs"]
     assert (pair["meshes"], pair["hits"]) == (["/World/Floor", "/World/Falling"], 1)
-    assert pair["rest"] == [[3, 4, data["rest"][3][1], "stays"]]
+    assert pair["spans"] == [[2, 3, 1]] and pair["rest"] == [[3, 4, data["rest"][3][1], "stays"]]
     assert data["up_axis"] == "Z" and data["validation"]["disagreements"] == []
     assert page.blocks == {"view-0", "faces-0", "hits-2", "view-2", "rest-3", "view-3", "rest-4"}
     center = np.array(data["center"])
@@ -986,7 +986,9 @@ def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
     total = sum(hits + rest for hits, rest in Page(page.read_text()).data["rows"])
     count = "document.getElementById('rows-count').textContent"
     assert browser.value(count) == f"{total:,} of {total:,} rows"
-    assert browser.value("document.querySelectorAll('#rows tbody tr').length") < 60  # only those in sight
+    assert (
+        browser.value("document.querySelectorAll('#rows tbody tr').length") < 90
+    )  # only those around what is in sight
     column = "[...document.querySelectorAll('#rows tr[data-at] td:nth-child({})')].map((cell) => cell.textContent)"
 
     browser.click("#rows th button", 0)
@@ -1017,8 +1019,10 @@ def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
     names = "[rows.first[row], rows.second[row]].map((mesh) => data.meshes[mesh].name)"
     rows = browser.value(f"table.rows.map((row) => {names})")
     assert len(rows) > len(both) > 0 and all("/World/Strip2" in names for names in rows)
-    browser.click("#rows tr[data-at] a.prim", 0)
-    browser.wait("location.hash.startsWith('#prim=') || location.hash.includes('&prim=')")
+    prim = browser.value("document.querySelectorAll('#rows tr[data-at] a.prim')[1].textContent")
+    browser.click("#rows tr[data-at] a.prim", 1)
+    browser.wait(f"document.querySelector('.chip').textContent.startsWith('{prim} ')")
+    assert browser.value("new URLSearchParams(location.hash.slice(1)).get('prim')") == prim
     browser.click(".chip")
     browser.wait(f"{count} === '{total:,} of {total:,} rows'")
 

@@ -129,9 +129,12 @@ class Browser:
 
     def click(self, selector: str, number: int = 0) -> None:
         """Clicks in the middle of an element, one of those that a selector selects."""
+        element = f"document.querySelectorAll({json.dumps(selector)})[{number}]"
+        # What listens to scrolling has done so two frames later.
         x, y = self.value(
-            f"(() => {{ const element = document.querySelectorAll({json.dumps(selector)})[{number}];"
-            "element.scrollIntoView({block: 'center'}); const box = element.getBoundingClientRect();"
+            f"(async () => {{ {element}.scrollIntoView({{block: 'center'}});"
+            "for (let i = 0; i < 2; i += 1) await new Promise(requestAnimationFrame);"
+            f"const box = {element}.getBoundingClientRect();"
             "return [box.left + box.width / 2, box.top + box.height / 2]; })()"
         )
         for kind in ("mousePressed", "mouseReleased"):

@@ -202,8 +202,12 @@ class ReportPage(RecordFile):
             notes.append(f"The table has {rest:,} of {found:,} edges at rest: {most}. --json and --csv have all.")
         if self._without_view:
             notes.append(f"{self._without_view:,} intervals have no view in 3D, as the page is full.")
-        if len(summary.mesh_pairs) > _MAX_PAIRS:
-            notes.append(f"The page has {_MAX_PAIRS:,} of {len(summary.mesh_pairs):,} pairs of meshes, the worst.")
+        pairs = len({span.meshes for span in [*summary.collision_spans, *summary.intersection_spans]})
+        if pairs > _MAX_PAIRS:
+            notes.append(f"The page has {_MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
+        if ignored := summary.ignored:
+            hits = sum(hits for _, hits in ignored)
+            notes.append(f"{hits:,} collisions of {len(ignored):,} ignored pairs of meshes are left out.")
         return notes
 
 
@@ -269,20 +273,26 @@ def _data(summary: Summary) -> dict:
 
 
 def _pairs_of_meshes(summary: Summary) -> list[dict]:
-    """Returns the meshes that collide or intersect: names, collisions, and when they intersect at rest."""
+    """Returns the meshes that collide or intersect: names, collisions, and when they collide and intersect.
+
+    Each has at most :data:`_MAX_ROWS` spans of time; ``more`` numbers count the others.
+    """
     hits = dict(summary.mesh_pairs)
-    spans: dict[tuple[str, str], list] = {}
+    spans: dict[tuple[str, str], tuple[list, list]] = {}
+    for span in summary.collision_spans:
+        spans.setdefault(span.meshes, ([], []))[0].append((span.since, span.until, span.hits))
     for span in summary.intersection_spans:
-        spans.setdefault(span.meshes, []).append(span)
-    names = sorted({*hits, *spans}, key=lambda meshes: -hits.get(meshes, 0))[:_MAX_PAIRS]
+        spans.setdefault(span.meshes, ([], []))[1].append((span.since, span.until, span.most, span.trend))
     return [
         {
             "meshes": meshes,
             "hits": hits.get(meshes, 0),
-            "rest": [(span.since, span.until, span.most, span.trend) for span in spans.get(meshes, ())[:_MAX_ROWS]],
-            "more": max(0, len(spans.get(meshes, ())) - _MAX_ROWS),
+            "spans": collisions[:_MAX_ROWS],
+            "more": max(0, len(collisions) - _MAX_ROWS),
+            "rest": at_rest[:_MAX_ROWS],
+            "more_rest": max(0, len(at_rest) - _MAX_ROWS),
         }
-        for meshes in names
+        for meshes, (collisions, at_rest) in sorted(spans.items(), key=lambda item: -hits.get(item[0], 0))[:_MAX_PAIRS]
     ]
 
 

@@ -264,8 +264,8 @@ function filterRows() {
 function fillPairs() {
   const numbers = new Map(data.meshes.map(({ name }, index) => [name, index]));
   const pairs = data.pairs;
-  const spans = ({ rest, more }) => rest.map(([since, until, most, trend]) =>
-    `${since === until ? `at ${short(since)}` : `${short(since)} to ${short(until)}`}: ${most} edges, ${trend}`).join("; ") + (more ? `; ${more} more` : "");
+  const range = (since, until) => (since === until ? `at ${short(since)}` : `${short(since)} to ${short(until)}`);
+  const fillSpans = (cell, texts, more) => add(cell, "span", { class: "clip" }, texts.join("; ") + (more ? `; ${count(more)} more` : ""));
   const columns = [
     { title: "Meshes", key: (row) => pairs[row].meshes.join(" "), fill: (cell, row) => {
       const [first, second] = pairs[row].meshes;
@@ -275,8 +275,14 @@ function fillPairs() {
       const both = add(cell, "a", { class: "element", href: addressOf(-1, first === second ? [first] : [first, second]) }, "rows of the two");
       both.hidden = first === second;
     } },
-    { title: "Collisions", number: true, class: "count", key: (row) => pairs[row].hits, fill: (cell, row) => { cell.textContent = count(pairs[row].hits); } },
-    { title: "Intersections at rest", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => { add(cell, "span", { class: "clip" }, spans(pairs[row])); } },
+    { title: "Collisions", key: (row) => pairs[row].hits, fill: (cell, row) => {
+      const { spans, more } = pairs[row];
+      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more);
+    } },
+    { title: "Intersections at rest", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => {
+      const { rest, more_rest } = pairs[row];
+      fillSpans(cell, rest.map(([since, until, most, trend]) => `${range(since, until)}: ${plural(most, "edge")}, ${trend}`), more_rest);
+    } },
   ];
   byId("pairs-count").textContent = pairs.length ? plural(pairs.length, "pair") : "No meshes collide.";
   byId("pairs").hidden = !pairs.length;

@@ -4,7 +4,7 @@
 class LongTable {
   // columns: {title, width, number, fill(cell, row), key(row)}; key gives a number or a text to sort by.
   constructor(parent, columns, rowHeight, select) {
-    Object.assign(this, { parent, columns, rowHeight, select, rows: [], sorted: null, selected: -1 });
+    Object.assign(this, { parent, columns, rowHeight, select, rows: [], sorted: null, selected: -1, drawn: null });
     const table = add(parent, "table");
     const head = add(add(table, "thead"), "tr");
     this.heads = columns.map((column, index) => {
@@ -67,8 +67,12 @@ class LongTable {
 
   draw() {
     const { parent, rows, rowHeight } = this;
-    const first = Math.max(0, Math.floor(parent.scrollTop / rowHeight) - 5);
-    const last = Math.min(rows.length, first + Math.ceil(parent.clientHeight / rowHeight) + 10);
+    const top = Math.floor(parent.scrollTop / rowHeight), seen = Math.ceil(parent.clientHeight / rowHeight);
+    // Rows that are in the document stay there while they are in sight: a click needs its row when it ends, too.
+    const { drawn } = this;
+    if (drawn && drawn.rows === rows && drawn.selected === this.selected && drawn.first <= Math.max(0, top - 1) && drawn.last >= Math.min(rows.length, top + seen + 1)) return;
+    const first = Math.max(0, top - 20), last = Math.min(rows.length, top + seen + 20);
+    this.drawn = { rows, selected: this.selected, first, last };
     const lines = document.createDocumentFragment();
     const space = (count) => { if (count) add(add(lines, "tr"), "td").style.height = `${count * rowHeight}px`; };
     space(first);
