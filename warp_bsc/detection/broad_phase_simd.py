@@ -278,9 +278,10 @@ class _Tree:
 
 def _join(children: np.ndarray, parents: np.ndarray) -> None:
     """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
-    for lane in range(8):
-        lanes = children[lane::8]
-        parents[: len(lanes), :, lane] = lanes
+    whole = len(children) // 8
+    parents[:whole] = children[: 8 * whole].reshape(whole, 8, children.shape[1]).transpose(0, 2, 1)
+    if 8 * whole < len(children):
+        parents[whole, :, : len(children) - 8 * whole] = children[8 * whole :].T
 
 
 class BroadPhaseSimd:

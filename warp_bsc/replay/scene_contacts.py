@@ -9,7 +9,7 @@ from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
-from .scene_pairs import DIAGONAL, EDGE, FACE, VERTEX, ScenePairs, count_by_meshes
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, count_by_meshes
 
 __all__ = ["KINDS", "PHASES", "SceneContacts", "find_contacts"]
 
@@ -90,6 +90,21 @@ def find_contacts(
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     n_vertex_face, n_edge_edge = len(vertices), len(ends)
     n = n_vertex_face + n_edge_edge
+    if not n:
+        none = np.zeros(0, dtype=np.int64)
+        return SceneContacts(
+            segment,
+            **NO_PAIRS,
+            interval=interval,
+            kind=none,
+            toi=np.zeros(0),
+            time=np.zeros(0),
+            normal=np.zeros((0, 3)),
+            counted=none.astype(bool),
+            ignored={},
+            separate=none.astype(bool) if intersections else None,
+            phase=none if intersections else None,
+        )
 
     kind = np.repeat([0, 1], [n_vertex_face, n_edge_edge])
     elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])

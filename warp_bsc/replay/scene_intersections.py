@@ -10,7 +10,7 @@ from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import DIAGONAL, EDGE, FACE, ScenePairs
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, ScenePairs
 
 __all__ = ["Cuts", "SceneIntersections", "name_intersections"]
 
@@ -107,6 +107,8 @@ def name_intersections(
         time: Time code.
         selection: Which pairs of meshes count.
     """
+    if not len(found.pairs):
+        return SceneIntersections(segment, **NO_PAIRS, time=time, crosses=found.crosses, x=x)
     ends = mesh.edges[found.pairs[:, 0]].astype(np.int64)
     faces = found.pairs[:, 1].astype(np.int64)
     edge_meshes, points, diagonal = segment.locate_edges(ends)
