@@ -733,3 +733,21 @@ def test_a_detector_used_again_forgets_nothing(broad_phase):
         assert_same(again, first)
         assert again.stats.vertex_face == first.stats.vertex_face
         assert again.stats.edge_edge == first.stats.edge_edge
+
+
+def test_intersections_at_the_end_of_a_motion(broad_phase):
+    """A finder that shares the detector's trees finds the same, at the end of a motion and elsewhere."""
+    rng = np.random.default_rng(5)
+    mesh = bsc.CollisionMesh(np.arange(600).reshape(200, 3), 600)
+    detector = bsc.CollisionDetector(mesh)
+    finder = detector.intersection_finder()
+    for scale in (3.0, 3.1, 0.5, 12.0, 4.0):
+        corner = rng.uniform(-scale, scale, (200, 1, 3))
+        x0, x1 = ((corner + rng.uniform(-2, 2, (200, 3, 3))).reshape(-1, 3) for _ in range(2))
+        at_start = finder.find(x0)
+        expected = bsc.CollisionDetector(mesh).detect(x0, x1)
+        assert_same(detector.detect(x0, x1), expected)
+        at_end = finder.find(x1, is_end=True)
+        np.testing.assert_array_equal(at_start.pairs, find_intersections(mesh, x0))
+        np.testing.assert_array_equal(at_end.pairs, find_intersections(mesh, x1))
+        assert len(at_end.pairs)

@@ -68,7 +68,9 @@ class BroadPhase(Protocol):
         """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
         ...
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False) -> None:
+    def pair_edges_with_faces(
+        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
+    ) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
 
         Args:
@@ -76,6 +78,8 @@ class BroadPhase(Protocol):
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
             refit: As of :meth:`pair_elements`.
+            is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
+                boxes a CPU uses again.
         """
         ...
 

@@ -142,6 +142,7 @@ def _pair_packets(
     # options
     symmetric: int,
     keep_separated: int,
+    at_end: int,
     # out
     counts: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
@@ -160,6 +161,7 @@ def _pair_packets(
         level_starts,
         symmetric,
         keep_separated,
+        at_end,
         counts,
         _CANDIDATES,
         _QUEUED,
@@ -248,7 +250,9 @@ class _Tree:
             _join(worlds[start:end, :1, 0], worlds[end:above, :1])
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
-    def pair(self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False) -> None:
+    def pair(
+        self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False, at_end: bool = False
+    ) -> None:
         """Enqueues the candidates between this tree and another, or within this tree.
 
         See :func:`warp_bsc.kernels.pipeline.wide_bvh.pair_packet`.
@@ -258,6 +262,7 @@ class _Tree:
             counts: By :class:`Count`, array of int64.
             pairs: Queue of the candidates, array of vec2i.
             keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
+            at_end: Whether to enqueue the pairs that overlap at the end of the motion.
         """
         inputs = [
             self._boxes.flatten(),
@@ -271,6 +276,7 @@ class _Tree:
             other._level_starts,
             other is self,
             keep_separated,
+            at_end,
             counts,
         ]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
@@ -327,10 +333,13 @@ class BroadPhaseSimd:
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=True)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=True)
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False) -> None:
+    def pair_edges_with_faces(
+        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
+    ) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
-        self._build([self._edges, self._faces], x, x, refit)
-        self._edges.pair(self._faces, counts, pairs)
+        if not is_end:
+            self._build([self._edges, self._faces], x, x, refit)
+        self._edges.pair(self._faces, counts, pairs, at_end=True)
 
     def _build(
         self, trees: Sequence[_Tree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None

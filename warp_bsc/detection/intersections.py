@@ -11,10 +11,10 @@ from .._arrays import check_finite
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
-from .broad_phase import make_broad_phase
+from .broad_phase import BroadPhase, make_broad_phase
 from .launch import launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
-from .settings import NO_GRADIENTS, Count, Counters, capacity_for
+from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
 __all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections"]
 
@@ -73,18 +73,26 @@ class CrossingCandidates:
         count: Number of pairs that the last :meth:`grow` has read.
     """
 
-    def __init__(self, mesh: CollisionMesh):
+    def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            broad_phase: A broad phase that is shared if it has no queue of its own; otherwise a new one is made.
+        """
         self._counters = Counters(mesh.device)
-        self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        if broad_phase is None or broad_phase.capacity < UNLIMITED:
+            broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._broad_phase = broad_phase
         # the counts of the edges' pairs with faces take the place of those with edges
         self.counts = self._counters.edge_edge
         self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self.count = 0
 
-    def find(self, x: wp.array, *, refit: bool = False) -> None:
-        """Launches the broad phase; ``refit`` keeps the tree of the run before."""
+    def find(self, x: wp.array, *, refit: bool = False, is_end: bool = False) -> None:
+        """Launches the broad phase; options are those of :meth:`.BroadPhase.pair_edges_with_faces`."""
         self._counters.array.zero_()
-        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, refit=refit)
+        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, refit=refit, is_end=is_end)
 
     def grow(self) -> bool:
         """Enlarges the queues that were too small, and returns whether any was; synchronizes with the device."""
@@ -117,19 +125,25 @@ class Intersections:
 class IntersectionFinder:
     """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses."""
 
-    def __init__(self, mesh: CollisionMesh):
-        """Allocates the buffers on the mesh's device."""
+    def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            broad_phase: As of :class:`CrossingCandidates`.
+        """
         self._mesh = mesh
-        self._candidates = CrossingCandidates(mesh)
+        self._candidates = CrossingCandidates(mesh, broad_phase)
         self._has_run = False
         self._allocate(len(mesh.faces))
 
-    def find(self, x: np.ndarray | wp.array) -> Intersections:
+    def find(self, x: np.ndarray | wp.array, *, is_end: bool = False) -> Intersections:
         """Returns the intersections of one configuration.
 
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
                 vertices that no face uses may be anything.
+            is_end: Whether they are those at the end of the last motion that the given broad phase has seen.
 
         Raises:
             ValueError: If the positions have another shape or type, or are not finite.
@@ -138,7 +152,7 @@ class IntersectionFinder:
         x = mesh.device_positions(x, "x")
         positions = x.numpy()
         check_finite(positions, "x", mesh.vertices)
-        retry_until_fits(lambda: self._launch(x), self, mesh.device)
+        retry_until_fits(lambda: self._launch(x, is_end), self, mesh.device)
         self._has_run = True
         status = self._status.numpy()[: self._count]
         pairs = self._kept.numpy()[: self._count]
@@ -183,9 +197,9 @@ class IntersectionFinder:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)
         self._status = wp.empty(capacity, dtype=wp.int8, device=self._mesh.device)
 
-    def _launch(self, x: wp.array) -> None:
+    def _launch(self, x: wp.array, is_end: bool) -> None:
         candidates, mesh = self._candidates, self._mesh
-        candidates.find(x, refit=self._has_run)
+        candidates.find(x, refit=self._has_run, is_end=is_end)
         launch_over_queue(
             _keep_crossings(x.dtype),
             candidates.pairs,

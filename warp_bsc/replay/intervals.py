@@ -8,7 +8,6 @@ import numpy as np
 
 from ..detection.collisions import Collisions, DetectionStats
 from ..detection.detector import CollisionDetector
-from ..detection.intersections import IntersectionFinder
 from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.scene import Scene
@@ -197,22 +196,22 @@ class _SegmentReplay:
         self._is_still = is_still
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
         self._detector = CollisionDetector(self._mesh, method=method)
-        self._finder = IntersectionFinder(self._mesh) if intersections else None
+        self._finder = self._detector.intersection_finder() if intersections else None
         self._last: SceneIntersections | None = None  # those found last
 
     def check(self, interval: Interval, selection: Selection, validate_most: int | None) -> IntervalResult:
         """Returns the collisions of an interval."""
         detector = self._detector
-        intersections = None
-        if self._finder:
-            start = self.find(interval.x0, interval.start, selection)
-            intersections = start, self.find(interval.x1, interval.end, selection)
+        start = self.find(interval.x0, interval.start, selection) if self._finder else None
         if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
             detector = CollisionDetector(CollisionMesh([], 0, device=self._mesh.device), method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
+        intersections = None
+        if start is not None:
+            intersections = start, self.find(interval.x1, interval.end, selection, is_end=not self._is_still)
         contacts = find_contacts(interval, self._mesh, collisions, selection, intersections)
         validation = None
         if validate_most != 0:
@@ -228,12 +227,19 @@ class _SegmentReplay:
         summary = _summarize(contacts, collisions, intersections, validation)
         return IntervalResult(summary, contacts, intersections)
 
-    def find(self, x: np.ndarray, time: float, selection: Selection) -> SceneIntersections:
-        """Returns the intersections at a time, those found last if these are the ones."""
+    def find(self, x: np.ndarray, time: float, selection: Selection, *, is_end: bool = False) -> SceneIntersections:
+        """Returns the intersections at a time, those found last if these are the ones.
+
+        Args:
+            x: Positions at that time, shape [vertex_count, 3].
+            time: Time code.
+            selection: Which pairs of meshes count.
+            is_end: Whether a motion that ends there has just been detected.
+        """
         last = self._last
         if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
             assert self._finder
-            found = self._finder.find(x)
+            found = self._finder.find(x, is_end=is_end)
             self._last = last = name_intersections(self.segment, self._mesh, found, x, time, selection)
         return last
 
