@@ -724,13 +724,13 @@ class Page(HTMLParser):
         attributes = dict(attrs)
         if attributes.get("http-equiv") == "Content-Security-Policy":
             self.policy = attributes["content"]
-        self._inside = (tag, attributes.get("type"), attributes.get("id"))
+        self._inside = (tag, attributes.get("type"), attributes.get("id"), attributes.get("data-packed"))
 
     def handle_data(self, data):
         if self._inside and self._inside[:2] == ("script", "application/json"):
             self.data = json.loads(data)
         elif self._inside and self._inside[:2] == ("script", "text/plain"):
-            self._packed[self._inside[2]] = data
+            self._packed[self._inside[2]] = data, self._inside[3]
         elif self._inside and self._inside[:2] == ("script", None):
             self.scripts.append(data)
         self._inside = None
@@ -742,7 +742,9 @@ class Page(HTMLParser):
 
     def block(self, name):
         """The facts and the arrays of a block."""
-        content = zlib.decompress(base64.b64decode(self._packed[name]))
+        text, packed = self._packed[name]
+        content = base64.b64decode(text)
+        content = zlib.decompress(content) if packed else content
         at = 4 + int.from_bytes(content[:4], "little")
         found = json.loads(content[4:at])
         for key, kind, length in found.pop("arrays"):

@@ -35,6 +35,7 @@ _FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... to a number from the first to
 _ALL_ROWS = 600_000  # in the table, likewise; the time to open the page grows with them
 _FEWEST_ROWS, _MOST_ROWS = 100, 50_000
 _VIEW_BYTES = 64 << 20  # of all views together
+_SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 _MAX_PAIRS = 10_000  # of meshes
 _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
@@ -309,7 +310,8 @@ def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:
     """Returns arrays as an element that the page's script unpacks by its name.
 
     The content is the header, JSON, and the arrays in 32 bits, the first bytes of all numbers before the second ones,
-    which makes them easier to compress; all of it compressed and in base64.
+    which makes them easier to compress; all of it in base64, and compressed unless it is small: browsers take a
+    millisecond to unpack anything.
     """
     columns = {}
     for key, array in arrays.items():
@@ -317,8 +319,10 @@ def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:
         columns[key] = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).reshape(-1)
     header = json.dumps(facts | {"arrays": [(key, column.dtype.kind, len(column)) for key, column in columns.items()]})
     planes = [column.view(np.uint8).reshape(-1, 4).T.tobytes() for column in columns.values()]
-    content = zlib.compress(b"".join([len(header).to_bytes(4, "little"), header.encode(), *planes]))
-    return f'<script type="text/plain" id="{name}">{base64.b64encode(content).decode()}</script>\n'
+    content, packed = b"".join([len(header).to_bytes(4, "little"), header.encode(), *planes]), ""
+    if len(content) > _SMALL_BLOCK:
+        content, packed = zlib.compress(content), ' data-packed="deflate"'
+    return f'<script type="text/plain" id="{name}"{packed}>{base64.b64encode(content).decode()}</script>\n'
 
 
 def _title(scene):

@@ -12,8 +12,11 @@ async function unpack(name) {
   const text = atob(block.textContent);
   const packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i += 1) packed[i] = text.charCodeAt(i);
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+  let bytes = packed;
+  if (block.dataset.packed) {
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+    bytes = new Uint8Array(await new Response(stream).arrayBuffer());
+  }
   let at = 4 + new DataView(bytes.buffer).getUint32(0, true);
   const facts = JSON.parse(new TextDecoder().decode(bytes.subarray(4, at)));
   const result = { ...facts };
@@ -44,14 +47,16 @@ async function loadRows() {
   };
   const numbers = ["first", "second", "first_0", "first_1", "second_0", "second_1"];
   for (const key of numbers) rows[key] = new Int32Array(total);
+  const wanted = data.rows.flatMap((counts, index) => ["hits", "rest"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
   let at = 0;
-  for (let index = 0; index < data.rows.length; index += 1) {
-    const interval = Math.min(index, data.intervals.length - 1);
-    const [start, end] = data.intervals[interval];
-    for (const name of ["hits", "rest"]) {
-      const isRest = name === "rest";
-      if (!data.rows[index][isRest ? 1 : 0]) continue;
-      const block = await unpack(`${name}-${index}`);
+  const together = 64; // blocks that are unpacked at the same time
+  for (let first = 0; first < wanted.length; first += together) {
+    const some = wanted.slice(first, first + together);
+    const blocks = await Promise.all(some.map(({ name, index }) => unpack(`${name}-${index}`)));
+    for (const [which, block] of blocks.entries()) {
+      const { name, index } = some[which], isRest = name === "rest";
+      const interval = Math.min(index, data.intervals.length - 1);
+      const [start, end] = data.intervals[interval];
       const length = block.first.length;
       rows.interval.fill(interval, at, at + length);
       for (const key of numbers) rows[key].set(block[key], at);
