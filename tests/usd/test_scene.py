@@ -202,12 +202,12 @@ def test_what_is_passed_over_is_named(stage):
     add_mesh(stage, "/World/Cloth", {0: TRIANGLE, 1: moved((0, 0, 1))})
     hidden = add_mesh(stage, "/World/Hidden", TRIANGLE)
     hidden.CreateVisibilityAttr("invisible")
-    UsdGeom.Sphere.Define(stage, "/World/Ball")
+    UsdGeom.BasisCurves.Define(stage, "/World/Hair")
     add_mesh(stage, "/World/Stand_in", TRIANGLE).CreatePurposeAttr("proxy")
     scene = read(stage)
     assert [mesh.path for mesh in first_segment(scene).meshes] == ["/World/Cloth"]
     warnings = "\n".join(scene.warnings)
-    for part in ("1, the first is /World/Hidden", "1 Sphere", "purpose proxy are not checked: 1"):
+    for part in ("1, the first is /World/Hidden", "are not checked: 1 BasisCurves", "purpose proxy are not checked: 1"):
         assert part in warnings
 
 

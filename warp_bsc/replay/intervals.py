@@ -150,10 +150,16 @@ def replay(
 
         import warp_bsc as bsc
 
-        for interval in bsc.replay(bsc.Scene("scene.usd")):
-            print(interval.summary.start, interval.summary.hits, interval.contacts.position)
+        selection = bsc.Selection(exclude=("/World/Hair",))
+        scene = bsc.Scene("scene.usd", frames=bsc.FrameRange(101.0, 150.0), selection=selection)
+        for interval in bsc.replay(scene, ignore_initial=True):
+            contacts = interval.contacts
+            for rows in contacts.chunks():  # 4,096 pairs at a time, as text takes memory
+                for meshes, elements in zip(contacts.mesh_names(rows), contacts.element_names(rows)):
+                    print(interval.summary.start, meshes, elements)
+            print(contacts.toi, contacts.position, contacts.separate)
             start, end = interval.intersections
-            print(start.crossings, start.mesh_names(slice(0, 5)), start.position)
+            print(start.crossings, start.position[start.crosses], start.cuts.points)
 
     Args:
         scene: The scene; its selection says which pairs count.

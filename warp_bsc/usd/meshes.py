@@ -23,6 +23,7 @@ from .instancers import (
     visibility_times,
 )
 from .selection import Selection
+from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
 from .skinning import Skin, find_bindings
 from .stage import LeftOut, UnreadableError, as_time_code, may_jump, reading, sample_times
 from .triangulation import triangulate
@@ -87,9 +88,14 @@ def find_meshes(
     for purpose, count in sorted(passed_over.items()):
         warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
     if finder.other:
-        shapes = ", ".join(f"{count} {name}" for name, count in sorted(finder.other.items()))
-        warnings.append(f"shapes that are not meshes are not checked: {shapes}")
+        warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
+    if shapes := Counter(mesh.shape for mesh in meshes if mesh.shape):
+        warnings.append(f"shapes are checked as polyhedra, round ones as inscribed ones: {_listed(shapes)}")
     return meshes, warnings
+
+
+def _listed(counts) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 
 class _Place:
@@ -114,7 +120,7 @@ class _Place:
 
     @cached_property
     def purpose(self) -> str:
-        return str(UsdGeom.Mesh(self.prim).ComputePurpose())
+        return str(UsdGeom.Imageable(self.prim).ComputePurpose())
 
     @property
     def is_bound_in_vain(self) -> bool:
@@ -142,7 +148,7 @@ class _Finder:
             elif prim.IsA(UsdSkel.Root):
                 if not self._find_bindings(prim):
                     prims.PruneChildren()
-            elif prim.IsA(UsdGeom.Mesh):
+            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim):
                 self.places.append(_Place(prim, instance, self._bindings.get(prim.GetPath())))
             elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
                 self.other[prim.GetTypeName()] += 1
@@ -169,6 +175,7 @@ class UsdMesh:
         name: The same, with the number of the instance if a point instancer places it.
         group: The same for all instances of a prim that one instancer places; empty if none places it.
         display_name: Display name in the file, empty if there is none.
+        shape: Type of the prim if it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`; empty for a mesh.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
             is invisible, not there or empty, else a digest of its topology.
@@ -192,7 +199,9 @@ class UsdMesh:
         self._file = file
         self.path = place.path
         self.display_name = prim.GetDisplayName()
-        self._mesh = mesh = UsdGeom.Mesh(prim)
+        self.shape = "" if prim.IsA(UsdGeom.Mesh) else str(prim.GetTypeName())
+        self._prim = prim
+        self._polygons: Polygons = MeshPolygons(prim) if prim.IsA(UsdGeom.Mesh) else ShapePolygons(prim)
         self._skin = skin = Skin(*place.binding, where=f"{file}: {self.path}") if place.binding else None
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
@@ -203,9 +212,7 @@ class UsdMesh:
         self._last_points: dict[tuple, np.ndarray] = {}  # shared by all instances, as are the next ones
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
-        breaks = visibility_times(prim, self._root) | sample_times(
-            mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
-        )
+        breaks = visibility_times(prim, self._root) | sample_times(*self._polygons.topology_attributes)
         if instancer:
             breaks |= instancer.break_times
         self._breaks = (-math.inf, *sorted(breaks))
@@ -213,12 +220,13 @@ class UsdMesh:
             Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
         self._states = [self._topology_digest(code) if self._is_present(code) else None for code in self._break_codes]
-        self._deformed_times = frozenset(sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set()))
+        self._deformed_times = frozenset(
+            sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
+        )
         self.deforms = bool(self._deformed_times)
-        points = mesh.GetPointsAttr()  # of which the number must not change
         self.may_jump = (
             may_jump(transform_attributes(self._frame, self._root))
-            or points.GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
+            or self._polygons.may_jump
             or bool(instancer and instancer.may_jump)
             or bool(skin and skin.may_jump)
         )
@@ -328,9 +336,9 @@ class UsdMesh:
             key = code.GetValue(), code.IsPreTime(), before and time not in self.states
             if key in self._last_points:
                 return self._last_points[key]
-            attribute = self._mesh.GetPointsAttr()
             # Where the topology stays, a changed number of points is an error, which the moment before would hide.
-            points = attribute.Get(Usd.TimeCode(code.GetValue()) if before and time not in self.states else code)
+            at_time = before and time not in self.states
+            points = self._polygons.read_points(Usd.TimeCode(code.GetValue()) if at_time else code)
             if _is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
             if self._skin:
@@ -453,7 +461,7 @@ class UsdMesh:
         solid = ~np.isin(polygons, holes)
         if not solid.any():
             raise UnreadableError(f"{self._where}: all faces of the mesh are holes")
-        is_left_handed = self._mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        is_left_handed = UsdGeom.Gprim(self._prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if is_left_handed != is_mirrored:
             triangles = triangles[:, ::-1]
         return triangles[solid], polygons[solid], len(counts)
@@ -496,25 +504,22 @@ class UsdMesh:
 
     def _read_topology(self, time) -> list[np.ndarray]:
         """Reads counts, indices and holes at a time."""
-        mesh = self._mesh
-        attributes = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
-        return [self._read_integers(attribute, time) for attribute in attributes]
+        names = "faceVertexCounts", "faceVertexIndices", "holeIndices"
+        values = self._polygons.read_topology(time)
+        return [self._as_integers(name, value) for name, value in zip(names, values, strict=True)]
 
-    def _read_integers(self, attribute, time) -> np.ndarray:
-        value = attribute.Get(time)
+    def _as_integers(self, name, value) -> np.ndarray:
         array = np.array(Vt.IntArray() if value is None else value)
         if array.ndim != 1 or array.dtype.kind not in "iu":
-            raise UnreadableError(f"{self._where}: {attribute.GetName()} is no list of integers")
+            raise UnreadableError(f"{self._where}: {name} is no list of integers")
         return array.astype(np.int64)
 
     def _is_present(self, time) -> bool:
         """Returns whether the prim is visible and not empty, wherever it is placed."""
-        if not is_shown(self._mesh.GetPrim(), self._root, time):
+        if not is_shown(self._prim, self._root, time):
             return False
         # A mesh may be empty for some time, as where a fluid has not begun to flow.
-        values = [
-            attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())
-        ]
+        values = self._polygons.read_points(time), self._polygons.read_topology(time)[0]
         return not all(value is not None and _is_empty(value) for value in values)
 
     def _topology_digest(self, time) -> bytes:

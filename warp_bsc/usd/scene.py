@@ -3,10 +3,10 @@
 What is read
 ------------
 Every ``UsdGeom.Mesh`` that is loaded and selected is read, wherever references, payloads, variants, native instances
-and point instancers put it. All meshes are merged to one list of vertices and one of faces, so that collisions of a
-mesh with itself and with others are found alike. A mesh with a subdivision scheme is read as its control cage. Polygons
-are cut into triangles once; holes and points that no face refers to are left out. Blend shapes and joints move the
-points as UsdSkel computes them.
+and point instancers put it. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra. All meshes are
+merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
+alike. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once; holes and
+points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel computes them.
 
 Vertices that are in one place at every time are welded to one. The two sides of a seam are an example, or a cloth that
 was written as one mesh for each of its colours: unwelded, they would touch all the time.
@@ -38,7 +38,7 @@ Broken meshes and instances, and files that cannot be opened, are left out from 
 and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
 moves is read at one time.
 
-:attr:`Scene.warnings` names the contents that this module does not read (spheres and other shapes that are not meshes,
+:attr:`Scene.warnings` names the contents that this module does not read (curves and other shapes without polygons,
 unselected meshes) and the changes that it makes to the motion.
 """
 
