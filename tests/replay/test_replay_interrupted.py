@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 import pytest
+from progress_lines import without_progress
 from pxr import Sdf, UsdGeom, Vt
 from stages import new_stage, save
 
@@ -217,7 +218,7 @@ def test_error_leaves_what_was_finished(tmp_path, monkeypatch, capsys, scene, er
         raise error
 
     assert replay_with(monkeypatch, scene, tmp_path, fail) == 2
-    said = capsys.readouterr().err
+    said = without_progress(capsys.readouterr().err)
     assert said.startswith("warp-bsc: error: ") and "broken" in said and len(said.splitlines()) == 1
     assert read_left(tmp_path, "stopped by an error: .*broken.*") == [3] * 4
 
