@@ -18,6 +18,7 @@ class StepTotals:
     """Totals over all steps so far; each field is an array of one element."""
 
     steps: wp.array[int]
+    coupled_steps: wp.array[int]
     uncertified_steps: wp.array[int]
     undetected_steps: wp.array[int]
     truncated_steps: wp.array[int]
@@ -157,7 +158,10 @@ class SolverReport:
 
     @property
     def milliseconds(self) -> float | None:
-        """Time of the last step that was not captured, without the inner solver [ms]; None if there was none."""
+        """Time of the last step that was not captured [ms]; None if there was none.
+
+        Without the inner solver, but for its substeps in a coupled step.
+        """
         if self._start is None:
             return None
         assert self._end is not None
@@ -169,6 +173,11 @@ class SolverReport:
     def steps(self) -> int:
         """Steps taken so far."""
         return _read(self._totals.steps)
+
+    @property
+    def coupled_steps(self) -> int:
+        """Steps so far that were taken in substeps, see :mod:`.coupling`."""
+        return _read(self._totals.coupled_steps)
 
     @property
     def uncertified_steps(self) -> int:

@@ -190,6 +190,19 @@ class Response:
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
+        self.find_contacts(motion, record)
+        return self.finish(dt)
+
+    def find_contacts(self, motion: ModelMotion, record: StepRecorder | None = None) -> None:
+        """Detects the contacts of a motion, as the first half of :meth:`resolve`; ``status`` says whether any are left.
+
+        Args:
+            motion: The motion that is wanted; it is only read.
+            record: As for :meth:`resolve`.
+
+        Raises:
+            RuntimeError: As for :meth:`resolve`.
+        """
         self._begin(motion, record)
         if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
@@ -198,8 +211,38 @@ class Response:
             wp.capture_if(self.constraints.count, self._leave_planes)
         self._detect(refit=False)
         self._record_offsets(after=1)
+
+    def finish(self, dt: float) -> Resolution:
+        """Resolves the contacts that :meth:`find_contacts` found, as the second half of :meth:`resolve`."""
         wp.capture_if(self.status.unfinished, self._finish, dt=dt)
+        return self.resolution
+
+    @property
+    def resolution(self) -> Resolution:
+        """The motion as it was resolved last."""
         return Resolution(self.vertices, self.constraints, self.status, self._status_values)
+
+    def collect_near_pairs(self) -> None:
+        """Adds constraints for proximities after :meth:`find_contacts`, in worlds that have contacts."""
+        wp.capture_if(self.status.active, self._collect_near_pairs)
+
+    def collect_penetrations(self, motion: ModelMotion) -> None:
+        """Adds constraints for vertices that a motion takes into solids of planes."""
+        if self._most_penetrations:
+            self._motion = motion
+            self._reserve(self._most_penetrations)
+            self._collect_penetrations(ahead=True)
+
+    def project(self, motion: ModelMotion, dt: float) -> None:
+        """Projects positions and velocities of a motion onto the constraints as they are, without detection.
+
+        Args:
+            motion: The motion that is wanted, of ``vertices``; it is only read.
+            dt: Its length [s].
+        """
+        self._motion = motion
+        self._project(self._sweep_positions)
+        self._change_velocities(dt)
 
     def inspect(self, motion: ModelMotion) -> Resolution:
         """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
@@ -209,7 +252,7 @@ class Response:
         """
         self._begin(motion, None)
         self._detect(refit=False)
-        return Resolution(self.vertices, self.constraints, self.status, self._status_values)
+        return self.resolution
 
     def _begin(self, motion, recorder):
         """Initializes everything for a step, and counts crossings at its start."""
