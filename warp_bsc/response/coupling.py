@@ -11,6 +11,8 @@ References:
     Simulation, Symposium on Computer Animation, 2019, doi:10.1145/3309486.3340247.
 """
 
+from collections.abc import Callable
+
 import newton
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
@@ -237,10 +239,19 @@ class Coupling:
         touches, so that its substeps cost their time in each step.
     """
 
-    def __init__(self, solver: SolverBase, mesh: ModelMesh, motion: ModelMotion, response: Response, substeps: int):
+    def __init__(
+        self,
+        step: Callable[..., None],
+        solver: SolverBase,
+        mesh: ModelMesh,
+        motion: ModelMotion,
+        response: Response,
+        substeps: int,
+    ):
         """Allocates buffers.
 
         Args:
+            step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
             mesh: The mesh.
             motion: The motion of the whole step.
@@ -248,7 +259,8 @@ class Coupling:
             substeps: Number of substeps, at least 2.
         """
         self.substeps = substeps
-        self._solver, self._mesh, self._motion, self._response = solver, mesh, motion, response
+        self._step, self._solver = step, solver
+        self._mesh, self._motion, self._response = mesh, motion, response
         self._substep = ModelMotion(mesh, motion.vertices.friction, motion.planes.friction)
         model, device = mesh.model, mesh.device
         self._start, self._in, self._out = model.state(), model.state(), model.state()
@@ -261,16 +273,17 @@ class Coupling:
     def save(self, state: newton.State) -> None:
         """Copies the state at the start of the step, before the inner solver changes it."""
         self._start.assign(state)
-        for name, array in self._arrays():
-            saved = self._histories.get(name)
-            if saved is None or saved.shape != array.shape or saved.dtype != array.dtype:
-                self._histories[name] = wp.empty_like(array, requires_grad=False)
 
-    def _arrays(self):
-        """Yields the arrays of the inner solver, with their names."""
-        for name, value in vars(self._solver).items():
-            if isinstance(value, wp.array) and value.size and value.device == self._mesh.device:
-                yield name, value
+    def _histories_of_solver(self):
+        """Returns the arrays of the inner solver, each with one of its size, allocated here where memory can be."""
+        pairs = []
+        for name, array in vars(self._solver).items():
+            if isinstance(array, wp.array) and array.size and array.device == self._mesh.device:
+                saved = self._histories.get(name)
+                if saved is None or saved.shape != array.shape or saved.dtype != array.dtype:
+                    self._histories[name] = saved = wp.empty_like(array, requires_grad=False)
+                pairs.append((array, saved))
+        return pairs
 
     def resolve(
         self,
@@ -294,6 +307,7 @@ class Coupling:
         wp.copy(is_coupled, response.status.unfinished)
         wp.copy(self._active, response.status.unfinished)
         arguments = {"state": state, "control": control, "contacts": contacts, "dt": dt}
+        arguments["histories"] = self._histories_of_solver()
         if device.is_capturing and not isinstance(self._solver, _ALLOCATION_FREE):
             self._take_substeps(**arguments)
         else:
@@ -301,7 +315,7 @@ class Coupling:
         wp.capture_if(self._active, self._finish, dt=dt)
         return response.resolution
 
-    def _take_substeps(self, state, control, contacts, dt):
+    def _take_substeps(self, state, control, contacts, dt, histories):
         """Takes the step again in substeps, and writes the end to the wanted motion and to the state."""
         response, mesh = self._response, self._mesh
         response.collect_near_pairs()
@@ -311,18 +325,17 @@ class Coupling:
         response._launch_over_constraints(_find_worlds, inputs)
         outputs = [progress, self._detected, self._remaining]
         self._launch(_begin_substeps, response.worlds, [constraints, self.substeps, self._is_coupled], outputs)
-        arrays = list(self._arrays())
         attributes = dict(vars(self._solver))
-        for name, array in arrays:
-            wp.copy(self._histories[name], array)
+        for array, saved in histories:
+            wp.copy(saved, array)
         self._in.assign(self._start)
         wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
         wp.capture_while(
             self._remaining, self._take_substep, body_q=state.body_q, control=control, contacts=contacts, dt=dt
         )
         vars(self._solver).update(attributes)
-        for name, array in arrays:
-            wp.copy(array, self._histories[name])
+        for array, saved in histories:
+            wp.copy(array, saved)
         inputs = [self._is_coupled, self._in.particle_q, self._in.particle_qd]
         outputs = [self._motion.vertices, state.particle_q, state.particle_qd]
         self._launch(_end_substeps, mesh.model.particle_count, inputs, outputs)
@@ -336,7 +349,7 @@ class Coupling:
             inputs = [self._start.body_q, body_q, self.substeps, self._remaining]
             self._launch(_move_bodies, mesh.model.body_count, inputs, [start.body_q, end.body_q])
         substep_dt = dt / self.substeps
-        self._solver.step(start, end, control, contacts, substep_dt)
+        self._step(start, end, control, contacts, substep_dt)
         inputs = [motion.vertices, motion.planes.start, motion.planes.end, self.substeps, dt, self._remaining]
         inputs += [self._detected, end.particle_q, end.particle_qd]
         outputs = [substep.vertices, response.constraints, response._progress]
@@ -346,7 +359,7 @@ class Coupling:
         constraints, progress = response.constraints, response._progress
         inputs = [substep.vertices, response.vertices, self._detected, constraints, progress]
         response._launch_over_constraints(_reset_constraints, inputs)
-        response.project(substep, substep_dt)
+        response.project(substep, substep_dt, 1.0 / self.substeps)  # creep adds up over substeps
         start.assign(self._start)
         outputs = [substep.vertices, particle_q, particle_qd]
         self._launch(_end_substep, mesh.model.particle_count, [response.vertices, self._remaining], outputs)

@@ -34,11 +34,15 @@ class SolverReport:
     Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver wanted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
     or frozen.
+
+    Attributes:
+        speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True):
+    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True, lifts: bool = False):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._motion, self._response, self._responds = motion, response, responds
+        self.speed_limit_lifted = lifts
         self._totals_values = wp.zeros(len(StepTotals.vars), dtype=int, device=response.device)
         self._totals = name_elements(StepTotals, self._totals_values)
         self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
@@ -227,6 +231,10 @@ class SolverReport:
             f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
             f"left standing, {self.uncertified_steps} not certified"
         )
+        if self.coupled_steps:
+            line += f", {self.coupled_steps} coupled"
+        if self.speed_limit_lifted:
+            line += ", without VBD's speed limit"
         if self.crossings:
             line += f", {self.crossings} crossings at the start"
         if self.lost_steps:

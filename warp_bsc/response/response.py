@@ -233,15 +233,16 @@ class Response:
             self._reserve(self._most_penetrations)
             self._collect_penetrations(ahead=True)
 
-    def project(self, motion: ModelMotion, dt: float) -> None:
+    def project(self, motion: ModelMotion, dt: float, tolerance: float) -> None:
         """Projects positions and velocities of a motion onto the constraints as they are, without detection.
 
         Args:
             motion: The motion that is wanted, of ``vertices``; it is only read.
             dt: Its length [s].
+            tolerance: Tolerance of positions as a share of that of a whole step.
         """
         self._motion = motion
-        self._project(self._sweep_positions)
+        self._project(self._sweep_positions, tolerance=tolerance * self._tolerance)
         self._change_velocities(dt)
 
     def inspect(self, motion: ModelMotion) -> Resolution:
@@ -326,12 +327,13 @@ class Response:
                 record_offsets, 1, inputs=[self.constraints, self._progress, self._record, after], device=self.device
             )
 
-    def _sweep_positions(self, first=True, last=True):
+    def _sweep_positions(self, first=True, last=True, tolerance=None):
         """Sweeps over the constraints on positions once; the first sweep fills the active set, the last empties it."""
         constraints = self.constraints
         inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
         if first:
-            self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
+            options = [self._tolerance if tolerance is None else tolerance]
+            self._launch_over_constraints(activate_position_constraints, [*inputs, *options])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, [*inputs, last])

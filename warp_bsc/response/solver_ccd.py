@@ -16,6 +16,7 @@ from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
 from .response import MAX_SWEEPS_PER_STEP, Response
+from .speed_limit import has_speed_limit, without_speed_limit
 from .step_record import RecordCounts, StepRecorder
 
 __all__ = ["CollisionMonitor", "SolverCCD"]
@@ -145,6 +146,7 @@ class SolverCCD(SolverBase):
         friction: float | None = None,
         restitution: float | None = None,
         coupling: int | None = None,
+        lift_speed_limit: bool = True,
         respond: bool = True,
     ):
         """Puts the stage behind a solver.
@@ -158,6 +160,9 @@ class SolverCCD(SolverBase):
                 ``soft_contact_restitution``.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls against
                 the contacts, see :mod:`.coupling`; None for none.
+            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, and the stage alone keeps
+                them apart. VBD else cuts the path of every particle, near something or not, see :mod:`.speed_limit`.
+                Has no effect on other solvers, nor without a response; ``report.speed_limit_lifted`` says whether it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
                 velocity; the four numbers then have no meaning, and must not be given.
 
@@ -205,12 +210,13 @@ class SolverCCD(SolverBase):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
         self._response.prepare(self._motion)
         self._recount_crossings()
+        self._lifts = respond and lift_speed_limit and has_speed_limit(solver)
         self._coupling = None
         if coupling is not None:
-            self._coupling = Coupling(solver, mesh, self._motion, self._response, coupling)
+            self._coupling = Coupling(self._step_inner, solver, mesh, self._motion, self._response, coupling)
         self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self.report = SolverReport(self._motion, self._response, responds=respond)
+        self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._lifts)
 
     def _friction(self, friction):
         """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
@@ -269,7 +275,7 @@ class SolverCCD(SolverBase):
             self._motion.set_start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
                 self._coupling.save(state_in)
-        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        self._step_inner(state_in, state_out, control, contacts, dt, **options)
         with _paused_tape() as tape:
             if self._coupling is not None:
                 run_on_host(lambda: self._couple(state_out, control, contacts, dt), self.mesh.device)
@@ -278,6 +284,12 @@ class SolverCCD(SolverBase):
             else:
                 arrays = state_out.particle_q, state_out.particle_qd, state_out.body_q
                 run_on_host(lambda: self._inspect(*arrays, dt), self.mesh.device)
+
+    def _step_inner(self, *arguments, **options):
+        """Steps the inner solver."""
+        lifted = without_speed_limit(self.solver) if self._lifts else contextlib.nullcontext()
+        with lifted:
+            self.solver.step(*arguments, **options)
 
     def _inspect(self, particle_q, particle_qd, body_q, dt):
         """Detects the collisions of the motion from the start of the step to these positions, and counts the step."""
