@@ -137,7 +137,7 @@ def _reset_constraints(
     i = wp.tid()
     if i == 0:
         progress.status.iteration[0] = 1
-        progress.status.projecting[0] = 1
+        progress.status.active[0] = 0  # positions and velocities are swept without regard to a detection
     if i >= constraints.count[0]:
         return
     constraints.position_multiplier[i] = wp.vec3d()
