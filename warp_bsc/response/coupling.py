@@ -26,7 +26,7 @@ from .response import Resolution, Response
 __all__ = ["Coupling"]
 
 _ALLOCATION_FREE = (SolverVBD, SolverStyle3D)
-"""Solvers whose steps allocate no memory, which the body of a condition in a CUDA graph cannot."""
+"""Solvers whose steps allocate no memory, which the body of a condition in a CUDA graph cannot; others may."""
 _UNCOUPLED = wp.constant(-2)
 """Iteration of the last contact of a world without constraints, so that no projection moves its vertices."""
 _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
@@ -235,8 +235,10 @@ class Coupling:
     the substeps, so that histories and clocks advance once a step.
 
     Limitations:
-        In a CUDA graph, a step of a solver that allocates memory (``SolverXPBD``) cannot be left out where nothing
-        touches, so that its substeps cost their time in each step.
+        In a CUDA graph, steps that allocate memory, as those of ``SolverXPBD`` do, cannot be left out where nothing
+        touches, so that the substeps cost their time in each step. ``SolverVBD`` and ``SolverStyle3D`` themselves are
+        known not to allocate; every other solver and derived class counts as one that does. Python attributes that the
+        inner solver changes in place, and not by assignment, are not restored.
     """
 
     def __init__(
@@ -269,6 +271,8 @@ class Coupling:
         self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
         self._remaining = wp.zeros(1, dtype=int, device=device)
         self._active = wp.zeros(1, dtype=int, device=device)
+        self._allocates = type(solver) not in _ALLOCATION_FREE or solver.collision_pipeline is not None
+        self._histories_of_solver()
 
     def save(self, state: newton.State) -> None:
         """Copies the state at the start of the step, before the inner solver changes it."""
@@ -281,7 +285,9 @@ class Coupling:
             if isinstance(array, wp.array) and array.size and array.device == self._mesh.device:
                 saved = self._histories.get(name)
                 if saved is None or saved.shape != array.shape or saved.dtype != array.dtype:
-                    self._histories[name] = saved = wp.empty_like(array, requires_grad=False)
+                    saved = wp.empty_like(array, requires_grad=False)
+                    if not self._mesh.device.is_capturing:  # memory of a graph is of no use outside it
+                        self._histories[name] = saved
                 pairs.append((array, saved))
         return pairs
 
@@ -308,7 +314,7 @@ class Coupling:
         wp.copy(self._active, response.status.unfinished)
         arguments = {"state": state, "control": control, "contacts": contacts, "dt": dt}
         arguments["histories"] = self._histories_of_solver()
-        if device.is_capturing and not isinstance(self._solver, _ALLOCATION_FREE):
+        if device.is_capturing and self._allocates:
             self._take_substeps(**arguments)
         else:
             wp.capture_if(self._active, self._take_substeps, **arguments)
@@ -330,9 +336,12 @@ class Coupling:
             wp.copy(saved, array)
         self._in.assign(self._start)
         wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
-        wp.capture_while(
-            self._remaining, self._take_substep, body_q=state.body_q, control=control, contacts=contacts, dt=dt
-        )
+        arguments = {"body_q": state.body_q, "control": control, "contacts": contacts, "dt": dt}
+        if mesh.device.is_capturing and self._allocates:
+            for _ in range(self.substeps):
+                self._take_substep(**arguments)
+        else:
+            wp.capture_while(self._remaining, self._take_substep, **arguments)
         vars(self._solver).update(attributes)
         for array, saved in histories:
             wp.copy(array, saved)

@@ -158,11 +158,12 @@ class SolverCCD(SolverBase):
                 material, contacts the geometric mean.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``.
-            coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls against
-                the contacts, see :mod:`.coupling`; None for none.
-            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, and the stage alone keeps
-                them apart. VBD else cuts the path of every particle, near something or not, see :mod:`.speed_limit`.
-                Has no effect on other solvers, nor without a response; ``report.speed_limit_lifted`` says whether it has.
+            coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
+                against the contacts, see :mod:`.coupling`; None for none.
+            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
+                keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
+                :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
+                ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
                 velocity; the four numbers then have no meaning, and must not be given.
 
