@@ -106,7 +106,7 @@ def _enqueue_contact(pair: wp.vec2i, status: int, stages: PairStages):
 def _write_impact(i: int, result: Impact, stages: PairStages):
     contacts = stages.contacts
     contacts.status[i] = wp.int8(result.status)
-    contacts.within_tolerance[i] = result.localized == 1
+    contacts.within_tolerance[i] = result.within_tolerance == 1
     contacts.toi[i] = result.toi
     contacts.coordinates[i] = result.coordinates
     contacts.normal[i] = result.normal

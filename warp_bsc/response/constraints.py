@@ -9,6 +9,7 @@ from .exclusion import Connectivity, crossed_at_start, is_movable
 __all__ = [
     "EDGE_EDGE_CONTACT",
     "EDGE_EDGE_PROXIMITY",
+    "LEAST_DISTANCE",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
@@ -74,7 +75,7 @@ _SLOW = wp.constant(wp.float64(0.5))
 _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
-_LEAST = wp.constant(wp.float64(0.1))
+LEAST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -91,7 +92,7 @@ class Contacts:
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
     status: wp.array[wp.int8]
-    localized: wp.array[wp.bool]
+    within_tolerance: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
@@ -212,7 +213,7 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 @wp.func
 def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    recovered = wp.max(start + _RECOVERY * path, _LEAST * separation)
+    recovered = wp.max(start + _RECOVERY * path, LEAST_DISTANCE * separation)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
@@ -281,7 +282,7 @@ def add_constraint(
     friction: float,
     slow: int,
     kind: int,
-    localized: bool,
+    within_tolerance: bool,
     toi: wp.float64,
     multiplier: wp.vec3d,
 ):
@@ -295,7 +296,7 @@ def add_constraint(
         constraints.friction[i] = friction
         constraints.slow[i] = slow
         constraints.kind[i] = kind
-        constraints.localized[i] = localized
+        constraints.within_tolerance[i] = within_tolerance
         constraints.toi[i] = toi
         constraints.approach[i] = approach_of(motion, vertices, corners, weights, normal, separation)
         constraints.position_multiplier[i] = multiplier

@@ -28,7 +28,7 @@ from .constraints import (
     update_first_contact,
     widened,
 )
-from .dividing_planes import DividingPlanes, add_dividing_planes, position_on_sides
+from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
 from .exclusion import crossed_at_start, is_movable
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
@@ -136,7 +136,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_planes(motion, vertices, corners, contacts.edges, dividing)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing)
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
@@ -157,7 +157,7 @@ def _collect_contact(
         friction,
         slow,
         kind,
-        contacts.localized[i],
+        contacts.within_tolerance[i],
         contacts.toi[i],
         multiplier,
     )
@@ -264,7 +264,7 @@ def _record_truncation(
     record.toi[entry] = time
     if kind != PLANE_CONTACT and kind != NO_CONTACT:
         record.contact[entry] = contact_vertices(contacts, i)
-        record.localized[entry] = contacts.localized[i]
+        record.within_tolerance[entry] = contacts.within_tolerance[i]
         record.toi[entry] = contacts.toi[i]
         record.coordinates[entry] = contacts.coordinates[i]
         record.normal[entry] = contacts.normal[i]
@@ -283,8 +283,8 @@ def truncate_vertices(
 ):
     """Moves each vertex of a contact that is left onto its side, or truncates its path before its first contact.
 
-    Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
-    ``max_truncations`` iterations vertices that still collide are frozen.
+    Paths are truncated where the step is recorded, and where contacts have no dividing planes. Vertices whose planes do
+    not all fit are frozen, and after ``max_truncations`` iterations all that still collide.
     """
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
@@ -303,6 +303,7 @@ def truncate_vertices(
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
     divides = bool(False)
     if dividing.first:
+        cuts = cuts and has_all_planes(dividing, vertex)
         divides = cuts and dividing.first[vertex] >= 0
     if divides:
         end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
