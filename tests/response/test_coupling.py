@@ -163,6 +163,42 @@ def test_a_pile_comes_to_rest(device):
     assert np.sqrt((rollout.velocities**2).sum(axis=1).mean()) < 0.1
 
 
+def test_style3d_is_coupled_too(device):
+    """Cloth on a fixed box stretches less at 1/60 s with coupling, and nothing passes through."""
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverStyle3D.register_custom_attributes(builder)
+    builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.05), wp.quat_identity()), hx=0.08, hy=0.3, hz=0.05)
+    newton.solvers.style3d.add_cloth_grid(
+        builder,
+        pos=wp.vec3(-0.24, -0.24, 0.005),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(),
+        dim_x=12,
+        dim_y=12,
+        cell_x=0.04,
+        cell_y=0.04,
+        mass=5e-4,
+        particle_radius=0.002,
+        tri_aniso_ke=wp.vec3(1e2, 1e2, 1e1),
+        edge_aniso_ke=wp.vec3(2e-5, 1e-5, 5e-6),
+    )
+    model = builder.finalize(device=device)
+    contacts = newton.CollisionPipeline(model).contacts()
+    stretch = []
+    for coupling in (None, 8):
+        inner = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
+        rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, coupling=coupling))
+        edges = rollout.mesh.edges[rollout.mesh.edges[:, 1] < model.particle_count]
+        rest = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
+        for _ in range(20):
+            rollout.step(1.0 / 60.0, contacts)
+        length = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
+        stretch.append((length / rest).max() - 1.0)
+        assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
+    assert rollout.solver.report.coupled_steps > 10
+    assert stretch[1] < 0.5 * stretch[0]
+
+
 class Clocked(newton.solvers.SolverVBD):
     """VBD with a clock on the device."""
 
@@ -317,6 +353,18 @@ def test_the_speed_limit_of_self_contact_is_lifted(lift, device):
     assert ("speed limit" in str(solver.report)) is lift
     speed = rollout.velocities[:, 2].mean()
     assert np.isclose(speed, 60.0, rtol=1e-5) if lift else speed < 2.0 * 0.5 * 0.85 * 0.0035 / DT
+
+
+def test_layers_in_reach_of_self_contact_fly_on_together(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for height in (0.0, 0.0025):
+        add_patch(builder, 3, 0.02, (0.0, 0.0, height), velocity=(3.0, 0.0, -10.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(vbd_with_self_contact(model)))
+    for _ in range(4):
+        rollout.step()
+    assert np.allclose(rollout.velocities, [3.0, 0.0, -10.0], atol=1e-3)
 
 
 def test_self_contact_without_its_limit_still_pushes(device):
