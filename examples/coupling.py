@@ -5,8 +5,8 @@
 
 Three scenes in which contact works against elasticity: a cloth drapes over a sphere; a cylinder moves into a sleeve a
 third narrower than itself; two plates press two soft blocks to half their height. The first row of each scene is the
-stage without coupling at a small step, the reference. The second, at twice that step, shows how far the reference can be
-trusted. The others have larger steps, without and with coupling. Distances are root mean squares.
+stage without coupling at a small step, the reference. The second has twice that step, and shows how far the reference
+can be trusted. The others have larger steps, without and with coupling. Distances are root mean squares.
 """
 
 import argparse

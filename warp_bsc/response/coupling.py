@@ -59,6 +59,7 @@ def _begin_substeps(
     if world == 0:
         detected[0] = constraints.count[0]
         detected[1] = progress.status.first_hits[0]
+        progress.status.recount[0] = 0  # the start remains where crossings are counted
         remaining[0] = substeps
     progress.contact_iteration[world] = wp.where(is_coupled[world] == 1, 0, _UNCOUPLED)
 
@@ -210,9 +211,13 @@ def _end_substeps(
     # out
     particle_q_out: wp.array[wp.vec3],
     particle_qd_out: wp.array[wp.vec3],
+    vertices: Vertices,
 ):
-    """Makes the substeps the wanted motion, in worlds that have constraints."""
+    """Makes the substeps the wanted motion, in worlds that have constraints, and puts vertices back to the start."""
     particle = wp.tid()
+    vertices.x1[particle] = motion.x0[particle]
+    if particle >= particle_q.shape[0]:
+        return
     if is_coupled[motion.world[particle]] == 0 or motion.is_lost[particle] != 0 or motion.inverse_mass[particle] == 0.0:
         return
     motion.x1[particle] = particle_q[particle]
@@ -232,7 +237,10 @@ class Coupling:
 
     Worlds without contacts keep what the inner solver made of the whole step, bit by bit. The bodies of all worlds do:
     in the substeps, they move evenly between their poses at both ends. Arrays of the inner solver are restored after
-    the substeps, so that histories and clocks advance once a step.
+    the substeps, so that histories and clocks advance once a step. Options of a step, such as observables, are those of
+    the whole step.
+
+    An explicit inner solver is coupled as well, though it needs it less: it is stable at small steps only.
 
     Limitations:
         In a CUDA graph, steps that allocate memory, as those of ``SolverXPBD`` do, cannot be left out where nothing
@@ -346,8 +354,8 @@ class Coupling:
         for array, saved in histories:
             wp.copy(array, saved)
         inputs = [self._is_coupled, self._in.particle_q, self._in.particle_qd]
-        outputs = [self._motion.vertices, state.particle_q, state.particle_qd]
-        self._launch(_end_substeps, mesh.model.particle_count, inputs, outputs)
+        outputs = [self._motion.vertices, state.particle_q, state.particle_qd, response.vertices]
+        self._launch(_end_substeps, mesh.vertex_count, inputs, outputs)
 
     def _take_substep(self, body_q, control, contacts, dt):
         """Steps the inner solver, and projects its motion onto the constraints."""
