@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box, rounded, write_box
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
@@ -42,6 +43,11 @@ _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 
 _WIDTH = wp.constant(WIDTH)
+
+_PAIRS_OF_THREAD = wp.constant(4)
+"""Pairs of faces whose elements a thread pairs."""
+_BITS_OF_PAIR = wp.constant(15)
+"""Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
 
 _UNGROUPED = 8
 """Number of groups up to which their boxes are not worth a launch, and all of them are traversed."""
@@ -368,37 +374,54 @@ def _pair_elements(
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """First finds all pairs, then takes slots for them, so that the threads of a warp can do so together."""
+    """First finds all pairs, then takes slots for them: one atomic of a warp for 128 pairs of faces.
+
+    Atomics on one address take turns, and one for each 32 pairs of faces took most of the time.
+    """
     i = wp.tid()
-    if not is_filled(i, face_pairs, face_pair_count, 0):
-        return
-    face = face_pairs[i][0]
-    other = face_pairs[i][1]
-    vertices = overlapping_vertices(mesh, face, other, keep_separated)
-    vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
-    edges = overlapping_edges(mesh, face, other, keep_separated)
-    raise_count(vertex_face_counts, _CANDIDATES, count_places(wp.uint32(vertices & 455)))
-    raise_count(edge_edge_counts, _CANDIDATES, count_places(wp.uint32(edges & 511)))
-    # of the rest only what no axis separates
-    vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
-    edges = edges >> 9
-    slot = take_slots(vertex_face_counts, _QUEUED, count_places(wp.uint32(vertices)))
-    while vertices != 0:
-        corner = lowest_place(wp.uint32(vertices))
-        vertices = vertices & (vertices - 1)
-        if corner < 3:
-            write(wp.vec2i(mesh.faces[face, corner], mesh.order[other]), vertex_face, slot)
+    first = (i / _WIDTH) * _PAIRS_OF_THREAD * _WIDTH + i % _WIDTH
+    found = wp.uint64(0)
+    candidates = wp.vec2i()  # vertex-face, edge-edge
+    queued = wp.vec2i()
+    turns = int(_PAIRS_OF_THREAD)  # not a constant, as the body would be repeated
+    for turn in range(turns):
+        at = first + turn * _WIDTH
+        if is_filled(at, face_pairs, face_pair_count, 0):
+            face = face_pairs[at][0]
+            other = face_pairs[at][1]
+            vertices = overlapping_vertices(mesh, face, other, keep_separated)
+            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
+            edges = overlapping_edges(mesh, face, other, keep_separated)
+            candidates[0] += count_places(wp.uint32(vertices & 455))
+            candidates[1] += count_places(wp.uint32(edges & 511))
+            # of the rest only what no axis separates
+            vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
+            edges = edges >> 9
+            queued[0] += count_places(wp.uint32(vertices))
+            queued[1] += count_places(wp.uint32(edges))
+            found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
+    raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
+    raise_count(edge_edge_counts, _CANDIDATES, candidates[1])
+    vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
+    edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
+    while found != wp.uint64(0):
+        bit = lowest_bit(found)
+        found = found & (found - wp.uint64(1))
+        at = first + (bit / _BITS_OF_PAIR) * _WIDTH
+        bit = bit % _BITS_OF_PAIR
+        face = face_pairs[at][0]
+        other = face_pairs[at][1]
+        if bit < 3:
+            write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
+        elif bit < 6:
+            write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
         else:
-            write(wp.vec2i(mesh.faces[other, corner - 3], mesh.order[face]), vertex_face, slot)
-        slot += wp.int64(1)
-    slot = take_slots(edge_edge_counts, _QUEUED, count_places(wp.uint32(edges)))
-    while edges != 0:
-        bit = lowest_place(wp.uint32(edges))
-        edges = edges & (edges - 1)
-        edge = mesh.face_edges[face, bit / 3]
-        other_edge = mesh.face_edges[other, bit % 3]
-        write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, slot)
-        slot += wp.int64(1)
+            edge = mesh.face_edges[face, (bit - 6) / 3]
+            other_edge = mesh.face_edges[other, (bit - 6) % 3]
+            write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
+            edge_edge_slot += wp.int64(1)
 
 
 @wp.func
@@ -569,18 +592,18 @@ class BroadPhaseHierarchy:
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
         self._pair_faces(x0, x1, changed)
-        self._launch_over_pairs(_pair_elements, False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_elements(False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
         """Enqueues all candidates of the last run."""
-        self._launch_over_pairs(_pair_elements, True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_elements(True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
         self._pair_faces(x, x)
-        self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
+        self._launch_over_pairs(_pair_edges_with_faces, self.capacity, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Boxes all elements of a motion, and all nodes.
@@ -610,7 +633,12 @@ class BroadPhaseHierarchy:
         queue.pairs, queue.count = self._face_pairs, self._count
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
-    def _launch_over_pairs(self, kernel, *arguments):
+    def _pair_elements(self, keep_separated, *queues):
+        """Enqueues the pairs of elements of all pairs of faces."""
+        threads = -(-self.capacity // (int(_PAIRS_OF_THREAD) * WIDTH)) * WIDTH
+        self._launch_over_pairs(_pair_elements, threads, keep_separated, *queues)
+
+    def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
         blocks = most_blocks(self._device, 256)
-        wp.launch(kernel, self.capacity, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)
+        wp.launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)

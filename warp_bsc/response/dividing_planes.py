@@ -11,7 +11,7 @@ import warp as wp
 
 from .buffers import Motion, Vertices
 from .constraints import LEAST_DISTANCE, to_double, to_single
-from .proximities import closest_vector
+from .proximities import closest_direction
 
 __all__ = [
     "DividingPlanes",
@@ -23,8 +23,8 @@ __all__ = [
 ]
 
 _NONE = wp.constant(-1)
-_NO_ROOM = wp.constant(-2)
-"""End of a list to which a plane did not fit."""
+_INCOMPLETE = wp.constant(-2)
+"""End of a list that lacks a plane."""
 _STEPS = wp.constant(64)
 """Most steps of the projection of a vertex onto its planes: it takes 4 on average, and 21 at most were seen."""
 _PARALLEL = wp.constant(wp.float64(1.0e-14))
@@ -70,10 +70,18 @@ def allocate_dividing_planes(vertices: int, capacity: int, device: wp.Device) ->
 
 
 @wp.func
+def _add_node(planes: DividingPlanes, vertex: int, node: int):
+    """Puts a node before the list of a vertex."""
+    after = wp.atomic_exch(planes.first, vertex, node)
+    if node >= 0:
+        planes.next[node] = after
+
+
+@wp.func
 def add_plane(
     planes: DividingPlanes, corners: wp.vec4i, split: int, normal: wp.vec3d, offset: wp.float64, margin: wp.float64
 ):
-    """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` tells.
+    """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` says so.
 
     Args:
         planes: The planes.
@@ -92,19 +100,16 @@ def add_plane(
         planes.split[plane] = wp.int8(split)
     for j in range(4):
         if corners[j] >= 0:
-            node = wp.where(fits, 4 * plane + j, _NO_ROOM)
-            after = wp.atomic_exch(planes.first, corners[j], node)
-            if fits:
-                planes.next[node] = after
+            _add_node(planes, corners[j], wp.where(fits, 4 * plane + j, _INCOMPLETE))
 
 
 @wp.func
 def has_all_planes(planes: DividingPlanes, vertex: int) -> bool:
-    """Returns whether all planes of a vertex fit."""
+    """Returns whether all contacts of a vertex have a plane: of those that touch at the start, there is none."""
     node = planes.first[vertex]
     while node >= 0:
         node = planes.next[node]
-    return node != _NO_ROOM
+    return node != _INCOMPLETE
 
 
 @wp.func
@@ -160,16 +165,19 @@ def add_dividing_plane(
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start have none.
     """
-    _weights, between = closest_vector(motion, corners, edges)
-    if wp.length(between) == _ZERO:
-        return
-    normal = wp.normalize(between)
+    normal = closest_direction(motion, corners, edges)
     origin = to_double(motion.x0[corners[3]])
     split = wp.where(edges == 1, 2, 1)
     above = _side(motion, vertices, corners, 0, split, origin, normal)
     below = _side(motion, vertices, corners, split, 4, origin, -normal)
     distance = above.start + below.start
+    movable = wp.vec4i()
+    for j in range(4):
+        movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)
     if distance <= _ZERO:
+        for j in range(4):
+            if movable[j] >= 0:
+                _add_node(planes, movable[j], _INCOMPLETE)
         return
     margin = wp.where(distance < LEAST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
     least = margin + _ROOM * distance
@@ -178,9 +186,6 @@ def add_dividing_plane(
     offset = wp.clamp(offset, least - below.start, above.start - least)
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
-    movable = wp.vec4i()
-    for j in range(4):
-        movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin)
 
 

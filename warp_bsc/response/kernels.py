@@ -283,8 +283,8 @@ def truncate_vertices(
 ):
     """Moves each vertex of a contact that is left onto its side, or truncates its path before its first contact.
 
-    Paths are truncated where the step is recorded, and where contacts have no dividing planes. Vertices whose planes do
-    not all fit are frozen, and after ``max_truncations`` iterations all that still collide.
+    Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
+    ``max_truncations`` iterations vertices that still collide are frozen.
     """
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
@@ -301,31 +301,35 @@ def truncate_vertices(
             _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
         else:
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
-    divides = bool(False)
-    if dividing.first:
-        cuts = cuts and has_all_planes(dividing, vertex)
-        divides = cuts and dividing.first[vertex] >= 0
-    if divides:
-        end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
-        outcome = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
-        if int(key & wp.int64(3)) == NO_CONSTRAINT:
-            vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
+    outcome = vertices.outcome[vertex]
+    if cuts:
+        x0 = motion.x0[vertex]
+        end = vertices.x1[vertex]
+        divides = bool(False)
+        complete = bool(False)
+        if dividing.first:
+            divides = dividing.first[vertex] >= 0
+            complete = divides and has_all_planes(dividing, vertex)
+        if divides:
+            end, truncated = position_on_sides(dividing, vertex, x0, end)
+            outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+        if not complete:
+            path = truncated_path(to_double(x0), to_double(end), time)
+            end = to_single(to_double(x0) + path)
+            outcome = outcome | TRUNCATED
+            if not divides:
+                vertices.velocity[vertex] = to_single(path / dt)
+        if divides and int(key & wp.int64(3)) == NO_CONSTRAINT:
+            vertices.velocity[vertex] = (end - x0) / float(dt)
             outcome = outcome | UNCONSTRAINED
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = outcome
-    elif cuts:
-        x0 = to_double(motion.x0[vertex])
-        path = truncated_path(x0, to_double(vertices.x1[vertex]), time)
-        vertices.x1[vertex] = to_single(x0 + path)
-        vertices.changed[vertex] = 1
-        vertices.velocity[vertex] = to_single(path / dt)
-        vertices.outcome[vertex] = vertices.outcome[vertex] | TRUNCATED
-    elif vertices.outcome[vertex] & FROZEN == 0:
+    elif outcome & FROZEN == 0:
         vertices.x1[vertex] = motion.x0[vertex]
         vertices.changed[vertex] = 1
         vertices.velocity[vertex] = wp.vec3()
-        vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+        vertices.outcome[vertex] = outcome | FROZEN
         wp.atomic_add(progress.status.newly_frozen, 0, 1)
 
 
