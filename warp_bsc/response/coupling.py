@@ -3,7 +3,7 @@
 A step that collides is taken again from its start in substeps: the inner solver steps, and a projection onto the
 contacts of the whole step follows. So the elastic solve of each substep begins with positions and velocities that have
 felt the contacts, and pulls against them for a fraction of the step only. The stretch between solver and contacts falls
-with the square of the substep. Contacts are detected once, before the substeps; the motion of the whole step is
+with the length of the substep. Contacts are detected once, before the substeps; the motion of the whole step is
 detected and certified after them.
 
 References:
