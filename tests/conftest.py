@@ -11,6 +11,8 @@ from chromium import CHROMIUM
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
+import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variables that it sets: no mapped files)
+
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)

@@ -56,7 +56,7 @@ LIBRARIES = {
     "argparse": {"cli"},
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
-    "trimesh": {"bench"},
+    "trimesh": {"bench", "usd"},
     "warp": {"kernels", "detection", "response", "bench", "cli"},
 }
 """Who may import a library: packages, or single files."""

@@ -33,11 +33,14 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.mesh import CollisionMesh
     from .detection.query import QueryResult, query_edge_edge, query_vertex_face
     from .detection.query_points import query_points
-    from .replay.intervals import replay
+    from .replay.intervals import IntervalResult, IntervalSummary, replay
+    from .replay.scene_contacts import SceneContacts
+    from .replay.scene_intersections import SceneIntersections
     from .response.captured_steps import CapturedSteps
     from .response.report import SolverReport
     from .response.solver_ccd import CollisionMonitor, SolverCCD
-    from .usd.scene import Scene
+    from .usd.scene import FrameRange, Scene
+    from .usd.selection import Selection
 
 _MODULES = {
     "CapturedCollisions": "detection.collisions",
@@ -48,8 +51,14 @@ _MODULES = {
     "CollisionMonitor": "response.solver_ccd",
     "Collisions": "detection.collisions",
     "DetectionStats": "detection.collisions",
+    "FrameRange": "usd.scene",
+    "IntervalResult": "replay.intervals",
+    "IntervalSummary": "replay.intervals",
     "QueryResult": "detection.query",
     "Scene": "usd.scene",
+    "SceneContacts": "replay.scene_contacts",
+    "SceneIntersections": "replay.scene_intersections",
+    "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
@@ -67,8 +76,14 @@ __all__ = [
     "CollisionMonitor",
     "Collisions",
     "DetectionStats",
+    "FrameRange",
+    "IntervalResult",
+    "IntervalSummary",
     "QueryResult",
     "Scene",
+    "SceneContacts",
+    "SceneIntersections",
+    "Selection",
     "SolverCCD",
     "SolverReport",
     "checker",

@@ -51,7 +51,7 @@ from numpy.typing import ArrayLike
 
 from ._arrays import checked_coordinates
 
-__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "vertex_face", "vertex_face_toi"]
+__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "edges_pass_faces", "vertex_face", "vertex_face_toi"]
 
 # The triangles of a query, each corner a difference of two of its four points (first minus second).
 _VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
@@ -136,12 +136,56 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
     Raises:
         ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
+    edges, faces = _checked_pairs(edges, faces)
+    points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
+    return _collides(points, _VERTEX_FACE)
+
+
+def edges_pass_faces(edges: ArrayLike, faces: ArrayLike, across: ArrayLike) -> np.ndarray:
+    """Returns which edges pass through which faces, pair by pair, at one moment.
+
+    The ends of such an edge are strictly on different sides of the face's plane, and it meets the inside of the face.
+    Or it meets the inside of a side that the face shares with a neighbour, and its ends are strictly on different sides
+    of the surface that both are. All other edges only touch their face: they end in it, or pass its border.
+
+    Args:
+        edges: End points, float32 or float64 array of shape (n, 2, 3).
+        faces: Corners a, b, c, float32 or float64 array of shape (n, 3, 3).
+        across: Third corners of the neighbours at the sides ab, bc and ca, array of the same type and shape; the face's
+            own opposite corner, c, a or b, where it has no neighbour.
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
+    """
+    edges, faces = _checked_pairs(edges, faces)
+    across = checked_coordinates(across, (3, 3), "across")
+    if len(across) != len(faces):
+        raise ValueError(f"faces and across must have the same length, got {len(faces)} and {len(across)}")
+    p, q, *corners = _integers(np.concatenate([edges, faces, across], axis=1)).transpose(1, 2, 0)
+    corners, across = corners[:3], corners[3:]
+
+    def side(x, y, z):
+        return np.sign((x * np.cross(y, z, axis=0)).sum(axis=0)).astype(int)
+
+    a, b, c = corners
+    start, end = side(p - a, b - a, c - a), side(q - a, b - a, c - a)
+    passed = np.stack([side(q - p, corners[i] - p, corners[i - 2] - p) for i in range(3)])
+    # Through a common side, the ends are in opposite directions from it: each is on one side of both faces, or none is.
+    beyond = [side(p - corners[i], corners[i] - corners[i - 2], across[i] - corners[i - 2]) for i in range(3)]
+    through_side = ((passed == 0) & (np.stack(beyond) == start)).any(axis=0) & (np.abs(passed.sum(axis=0)) == 2)
+    return (start * end < 0) & ((np.abs(passed.sum(axis=0)) == 3) | through_side)
+
+
+def _checked_pairs(edges, faces):
+    """Returns edges and faces as arrays; raises ValueError if they are none, or no pairs."""
     edges = checked_coordinates(edges, (2, 3), "edges")
     faces = checked_coordinates(faces, (3, 3), "faces")
     if len(edges) != len(faces):
         raise ValueError(f"edges and faces must have the same length, got {len(edges)} edges and {len(faces)} faces")
-    points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
-    return _collides(points, _VERTEX_FACE)
+    return edges, faces
 
 
 def _collides(points, pairs):

@@ -38,8 +38,8 @@ import warp as wp
     float low[3], high[3];
     for (int axis = 0; axis < 3; ++axis) {
         const float* at = box + 32 * axis;
-        lows[axis] = __builtin_elementwise_min(floats(at), floats(at + 16));
-        highs[axis] = __builtin_elementwise_max(floats(at + 8), floats(at + 24));
+        lows[axis] = at_end ? floats(at + 16) : __builtin_elementwise_min(floats(at), floats(at + 16));
+        highs[axis] = at_end ? floats(at + 24) : __builtin_elementwise_max(floats(at + 8), floats(at + 24));
         low[axis] = lows[axis][0];
         high[axis] = highs[axis][0];
         for (int lane = 1; lane < 8; ++lane) {
@@ -82,8 +82,10 @@ import warp as wp
             other_high0[axis] = floats(at + 8);
             other_low1[axis] = floats(at + 16);
             other_high1[axis] = floats(at + 24);
-            other_low[axis] = __builtin_elementwise_min(other_low0[axis], other_low1[axis]);
-            other_high[axis] = __builtin_elementwise_max(other_high0[axis], other_high1[axis]);
+            other_low[axis] =
+                at_end ? other_low1[axis] : __builtin_elementwise_min(other_low0[axis], other_low1[axis]);
+            other_high[axis] =
+                at_end ? other_high1[axis] : __builtin_elementwise_max(other_high0[axis], other_high1[axis]);
         }
         for (; lanes; lanes &= lanes - 1) {
             const int lane = __builtin_ctz(lanes);
@@ -103,7 +105,7 @@ import warp as wp
                     shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
             mask &= ~bits(shared);
             overlapping += __builtin_popcount(mask);
-            if (!keep_separated) {
+            if (!keep_separated && !at_end) {
                 Ints apart = 0;
                 for (int axis = 0; axis < 3; ++axis) {
                     const float* at = box + 32 * axis + lane;
@@ -169,6 +171,7 @@ def pair_packet(
     level_starts: wp.array[wp.int32],
     symmetric: int,
     keep_separated: int,
+    at_end: int,
     counts: wp.array[wp.int64],
     candidate_count: int,
     queued_count: int,
@@ -177,7 +180,8 @@ def pair_packet(
     """Enqueues the pairs of a packet's elements with those of a tree that share no corner and that no axis separates.
 
     A candidate, a pair whose swept boxes overlap, is counted, and enqueued unless an axis separates the two at the
-    start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. Pairs without a changed
+    start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. With ``at_end`` the
+    boxes at the end count instead of the swept ones, and all pairs that overlap are enqueued. Pairs without a changed
     element are excluded. With ``symmetric`` both are of one tree, and each pair is found once, the smaller number
     first.
     """

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -182,8 +183,16 @@ def test_recording_of_newton(capsys):
     assert found["mesh_pairs"] == [{"meshes": ["/root/model/triangles"] * 2, "hits": 33}]
 
 
+def test_progress_without_a_terminal(capsys, falling_scene, monkeypatch):
+    monkeypatch.setattr("warp_bsc.cli.replay._LOG_SECONDS", -1.0)
+    assert main(["replay", falling_scene, "--device", "cpu"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[0] for line in lines] == [f"Replaying: {done} of 4" for done in (1, 2, 3, 4)]
+    assert re.fullmatch(r"Replaying: 2 of 4, time \S+, \d+\.\d/s, about \d+ s left", lines[1])
+
+
 def test_fail_on_collision(capsys, falling_scene, safe_scene):
-    options = ["--fail-on-collision", "--device", "cpu"]
+    options = ["--fail-on", "collisions", "--device", "cpu"]
     assert main(["replay", falling_scene, *options]) == 1
     assert "Collisions in 1 of 4" in capsys.readouterr().out
     assert main(["replay", safe_scene, *options]) == 0
@@ -423,7 +432,7 @@ def test_output_that_cannot_encode_all(monkeypatch, scenes):
     write_scene(scenes / "näme.usda")
     output = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", output)
-    assert main(["replay", str(scenes / "näme.usda"), "--device", "cpu", "--fail-on-collision"]) == 1
+    assert main(["replay", str(scenes / "näme.usda"), "--device", "cpu", "--fail-on", "collisions"]) == 1
     text = output.buffer.getvalue().decode("ascii")
     assert "3 -> 4" in text and "n\\xe4me.usda: 2 meshes" in text
     assert output.errors == "strict"

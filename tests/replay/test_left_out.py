@@ -140,7 +140,7 @@ def test_nothing_is_left_out_that_must_not_be(stage, capfd, tmp_path, add, reaso
 
 def test_collisions_come_before_what_is_left_out(stage):
     add_bare_mesh(stage)
-    assert main(["replay", save(stage), "--device", "cpu", "--fail-on-collision"]) == 1
+    assert main(["replay", save(stage), "--device", "cpu", "--fail-on", "collisions"]) == 1
 
 
 def test_what_is_not_selected_need_not_be_whole(stage):
@@ -163,7 +163,7 @@ def test_nothing_readable_is_an_error(tmp_path, capsys):
     add_bare_mesh(stage)
     assert main(["replay", save(stage), "--device", "cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "nothing moves" in line
+    assert "/World/Odd: the mesh has no points" in line
     add_floor(stage)
     stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 0)], 0)
     stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 1)], 1)

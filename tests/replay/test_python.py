@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 
 import numpy as np
 import pytest
@@ -77,6 +78,24 @@ def test_a_replay_yields_results(stage):
         assert result.summary.hits == len(result.contacts) == len(result.contacts.position)
         assert result.contacts.interval.index == result.summary.index == interval.index
     assert sum(result.summary.hits for result in results) > 0
+
+
+def test_the_program_of_the_documentation(stage, capsys):
+    """It runs as it is printed, but for the scene's name."""
+    lines = bsc.replay.__doc__.split("::\n\n")[1].split("\n\n    Args:")[0]
+    program = (
+        textwrap.dedent(lines)
+        .replace("scene.usd", save(stage))
+        .replace("101.0, 150.0", "0.0, 1.0")
+        .replace("Hair", "N*")
+    )
+    add_mesh(stage, "/World/None", FALLING)
+    save(stage)
+    exec(program, {"__name__": "__main__"})
+    printed = capsys.readouterr().out
+    assert "0.0 ('/World/Falling', '/World/Floor') ('vertex 0', 'face 0')" in printed
+    for name in ("FrameRange", "IntervalResult", "IntervalSummary", "SceneContacts", "SceneIntersections", "Selection"):
+        assert getattr(bsc, name).__name__ == name and name in bsc.__all__
 
 
 @pytest.mark.parametrize("script", [

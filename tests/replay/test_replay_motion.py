@@ -278,7 +278,7 @@ def test_a_mesh_that_only_its_transform_moves_does_not_collide_with_itself(stage
     assert found["validation"]["hits"] == 0 and found["validation"]["disagreements"] == []
     assert found["intervals"][0]["stages"]["vertex_face"]["candidates"] > 0
     capsys.readouterr()
-    assert main(["replay", save(stage), "--device", "cpu", "--method", "conservative", "--fail-on-collision"]) == 0
+    assert main(["replay", save(stage), "--device", "cpu", "--method", "conservative", "--fail-on", "collisions"]) == 0
     assert "No collision in 2 intervals." in capsys.readouterr().out
 
 
@@ -427,7 +427,7 @@ def test_a_layer_without_a_clock_is_refused(stage, tmp_path, capsys, rate, above
         (["--prims", "/World/Leaves[1]", "/World/Floor"], ["/World/Floor", "/World/Leaves[1]/Leaf"]),
         (["--exclude", "/World/Leaves[1]/*"], ["/World/Floor", "/World/Leaves[0]/Leaf"]),
         (["--prims", "/World/Leaves*"], ["/World/Leaves[0]/Leaf", "/World/Leaves[1]/Leaf"]),
-        (["--exclude", "/World/[L]*"], None),
+        (["--exclude", "/World/[L]*"], ["/World/Floor"]),
     ],
 )
 def test_instances_are_selected_by_their_names(stage, options, meshes):
@@ -435,9 +435,6 @@ def test_instances_are_selected_by_their_names(stage, options, meshes):
     positions = {0: [(-1, 0, 0.25), (0, 0, 0.25)], 1: [(-1, 0, -0.25), (0, 0, -0.25)]}
     add_instancer(stage, "/World/Leaves", positions, ["/World/Leaves/Leaf"])
     add_mesh(stage, "/World/Leaves/Leaf", FALLING)
-    if meshes is None:
-        assert main(["replay", save(stage), "--device", "cpu", *options]) == 2  # nothing that moves is left
-        return
     found = find(stage, *options)
     assert found["meshes"] == meshes
 

@@ -6,18 +6,22 @@ import errno
 import importlib
 import math
 import os
+import shlex
+import time
 from collections.abc import Generator
 
 import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .._atomic_file import STDOUT, naming
+from ..replay.baseline import Baseline
 from ..replay.hit_files import HitsCsv, HitsJson
 from ..replay.html_report import ReportPage
 from ..replay.intervals import IntervalResult, replay
 from ..replay.outputs import ReplayOutput
 from ..replay.summary import Summary
-from ..replay.usd_overlay import Overlay
+from ..replay.threads import WriteBehind
+from ..replay.usd_overlay import SHOWN_BY, Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
@@ -29,10 +33,9 @@ from .options import (
     Commands,
     add_command,
     add_detection_options,
-    add_fail_on_collision,
     positive,
 )
-from .replay_tables import print_replay
+from .replay_tables import print_new, print_replay
 from .tables import Console, say
 
 __all__ = ["add_to", "open_scene", "run_replay"]
@@ -43,6 +46,8 @@ other, between each two consecutive time samples; vertices move straight from
 sample to sample. Meshes that never move are obstacles: contacts between
 obstacles are excluded, and so are contacts of a mesh with itself if only its
 transform moves it. Rotations are sampled at every whole time code as well.
+At the time samples themselves, find the edges that pass through faces, those
+of obstacles included; where nothing moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
 finished intervals, marked partial."""
@@ -55,7 +60,8 @@ examples:
   warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
   warp-bsc replay cloth.usd --device cpu --method conservative
   warp-bsc replay cloth.usd --json > collisions.json
-  warp-bsc replay cloth.usd --fail-on-collision || echo "it collides"
+  warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
+  warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
 
   a recording of one of Newton's examples:
   python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
@@ -64,7 +70,7 @@ examples:
 
 exit status:
   0  done, whether or not anything collides
-  1  collisions found, with --fail-on-collision
+  1  found what --fail-on names
 {ERROR_STATUS}
   3  --validate found a wrong answer
   4  done, but parts of the scene could not be read and were left out; --strict
@@ -72,7 +78,10 @@ exit status:
 {SIGNAL_STATUS}
 If several apply, a signal comes before 2, then 3, 1 and 4."""
 
-_COLLIDES = 1
+_LOG_SECONDS = 10.0
+"""Time between two lines on the progress, where there is no terminal."""
+
+_FAILS = 1
 _DISAGREES = 3
 _LEFT_OUT = 4
 
@@ -105,7 +114,32 @@ def add_to(commands: Commands) -> None:
         help="check each mesh with itself (default: yes, unless only its transform moves it)",
     )
     which.add_argument(
+        "--intersections",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="find the edges that pass through faces or touch them at the time samples themselves (default: yes)",
+    )
+    which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
+    )
+    which.add_argument(
+        "--ignore",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("A", "B"),
+        help="ignore pairs of a mesh of pattern A and one of pattern B, which are only counted; may be repeated",
+    )
+    which.add_argument(
+        "--ignore-from",
+        metavar="FILE",
+        help="pairs to ignore from a file: two patterns a line, in quotation marks if they contain blanks; # begins a "
+        "comment",
+    )
+    which.add_argument(
+        "--ignore-initial",
+        action="store_true",
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then",
     )
     which.add_argument(
         "--purpose",
@@ -143,14 +177,33 @@ def add_to(commands: Commands) -> None:
     )
 
     out = command.add_argument_group("output")
-    out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, which shows the collisions")
+    out.add_argument(
+        "--overlay",
+        metavar="FILE",
+        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
+    )
     file = {"type": _output, "metavar": "FILE"}
-    out.add_argument("--report", **file, help="a page with charts and the worst interval in 3D, .html")
+    out.add_argument(
+        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
+    )
     printed = {"nargs": "?", "const": STDOUT, **file}
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
+    out.add_argument(
+        "--baseline",
+        metavar="FILE",
+        help="compare with the JSON file of an earlier replay: print which meshes collide or cross at times at which "
+        "they did not",
+    )
+    out.add_argument(
+        "--fail-on",
+        type=_reasons,
+        default=frozenset(),
+        metavar="WHAT",
+        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces), "
+        "collisions, new (what --baseline does not have)",
+    )
     add_detection_options(command, method="exact")
-    add_fail_on_collision(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -176,6 +229,10 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
+    if "new" in arguments.fail_on and not arguments.baseline:
+        raise ValueError("--fail-on new needs --baseline")
+    if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
+        raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
     places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
@@ -188,18 +245,21 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         self_collisions=arguments.self_collisions,
         between=tuple(arguments.between) if arguments.between else None,
         purposes=tuple(arguments.purpose or Selection.purposes),
+        ignore=(*map(tuple, arguments.ignore), *(_read_pairs(arguments.ignore_from) if arguments.ignore_from else ())),
     )
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         importlib.import_module("warp_bsc.usd.meshes")
     INTERRUPTS.check()
     try:
-        scene = Scene(
-            arguments.scene,
-            selection=selection,
-            frames=arguments.frames,
-            subdivide=arguments.subdivide,
-            strict=arguments.strict,
-        )
+        with _Progress("Comparing vertices") as progress:
+            scene = Scene(
+                arguments.scene,
+                selection=selection,
+                frames=arguments.frames,
+                subdivide=arguments.subdivide,
+                strict=arguments.strict,
+                progress=progress.show,
+            )
     except (OSError, ValueError):
         raise
     except Exception as error:
@@ -223,23 +283,34 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
             disk, as far as it has space.
     """
     settings = {"method": arguments.method, "device": str(device)}
+    baseline = Baseline(arguments.baseline) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
         outputs = _open_outputs(stack, scene, arguments, settings)
         intervals, interrupt, problems = [], None, []
+
+        def write(result: IntervalResult) -> None:
+            scene.files.check()
+            for output in outputs:
+                with naming(output.file.name):
+                    output.add(result)
+            intervals.append(result.summary)
+
+        written = stack.enter_context(contextlib.closing(WriteBehind(write)))
         with INTERRUPTS.held():
             try:
                 with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
                     for result in found:
-                        scene.files.check()
-                        for output in outputs:
-                            with naming(output.file.name):
-                                output.add(result)
-                        intervals.append(result.summary)
+                        written.put(result)
                         INTERRUPTS.check()
+                    written.wait()
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
             except Exception as error:
                 interrupt = INTERRUPTS.came  # which a library may have turned into another error
+                problems += [] if interrupt else [_explain(error, scene)]
+            try:
+                written.wait()
+            except Exception as error:
                 problems += [] if interrupt else [_explain(error, scene)]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
@@ -260,14 +331,23 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
             with naming("standard output"):
                 console = Console()
                 print_replay(console, summary)
+                if baseline:
+                    print_new(console, baseline.new_in(summary))
                 for output in finished:
                     say(console, f"Wrote {output.file.path}.")
+                    if isinstance(output, Overlay):
+                        say(console, f"  {SHOWN_BY}")
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:
         return _DISAGREES
-    if arguments.fail_on_collision and summary.hits:
-        return _COLLIDES
+    fails = {
+        "intersections": any(sample.crossings for sample in summary.intersections),
+        "collisions": summary.hits > 0,
+        "new": baseline is not None and bool(baseline.new_in(summary)),
+    }
+    if any(fails[reason] for reason in arguments.fail_on):
+        return _FAILS
     return _LEFT_OUT if scene.left_out else 0
 
 
@@ -318,9 +398,9 @@ def _open_outputs(
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
         (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
-        (arguments.csv, HitsCsv),
+        (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
-        (arguments.report, ReportPage),
+        (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )
     outputs = []
     for path, make in makers:
@@ -330,25 +410,86 @@ def _open_outputs(
     return outputs
 
 
+class _Progress:
+    """Shows how far a run is: a bar on a terminal, else a line on standard error every few seconds."""
+
+    def __init__(self, what: str):
+        self._what = what
+        self._bar = Progress(
+            TextColumn(what),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self._bar.disable = not self._bar.console.is_terminal
+        self._task = self._bar.add_task("", total=None, note="")
+        self._started = self._said = time.monotonic()
+
+    def __enter__(self) -> "_Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, done: int, total: int, note: str = "") -> None:
+        """Shows how much is done of all, and a note on it."""
+        now = time.monotonic()
+        if done:
+            note += f"{', ' * bool(note)}{done / max(now - self._started, 1e-9):.1f}/s"
+        self._bar.update(self._task, completed=done, total=total, note=note)
+        if self._bar.disable and done and now - self._said > _LOG_SECONDS:
+            self._said = now
+            left = (now - self._started) / done * (total - done)
+            say(self._bar.console, f"{self._what}: {done} of {total}, {note}, about {left:,.0f} s left")
+
+
 def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Generator[IntervalResult, None, None]:
-    """Yields the intervals as they are found, and shows progress, rate and time left on a terminal."""
-    progress = Progress(
-        TextColumn("Replaying"),
-        BarColumn(bar_width=None),
-        MofNCompleteColumn(),
-        TextColumn("time {task.fields[time]:g}, {task.fields[rate]}"),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )
-    progress.disable = not progress.console.is_terminal
-    with progress:
-        task = progress.add_task("", total=len(scene.times) - 1, time=scene.times[0], rate="…/s")
-        for result in replay(scene, method=arguments.method, device=device, validate_most=arguments.validate):
+    """Yields the intervals as they are found, and shows progress, rate and time left."""
+    with _Progress("Replaying") as progress:
+        progress.show(0, len(scene))
+        for result in replay(
+            scene,
+            method=arguments.method,
+            device=device,
+            intersections=arguments.intersections,
+            ignore_initial=arguments.ignore_initial,
+            validate_most=arguments.validate,
+        ):
             yield result
-            speed = progress.tasks[task].speed
-            rate = f"{speed:.1f}/s" if speed else "…/s"
-            progress.update(task, advance=1, time=result.summary.end, rate=rate)
+            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
+
+
+def _reasons(text: str) -> frozenset[str]:
+    reasons = frozenset(text.split(","))
+    if unknown := reasons - {"intersections", "collisions", "new"}:
+        raise argparse.ArgumentTypeError(
+            f"must be of intersections, collisions, new, not {', '.join(sorted(unknown))!r}"
+        )
+    return reasons
+
+
+def _read_pairs(path: str) -> list[tuple[str, str]]:
+    """Reads pairs of patterns from a file.
+
+    Raises:
+        OSError: If it cannot be read.
+        ValueError: If a line has not two patterns.
+    """
+    pairs = []
+    with naming(path), open(path, encoding="utf-8") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                patterns = shlex.split(line, comments=True)
+            except ValueError as error:
+                raise ValueError(f"{path}: line {number}: {error}") from None
+            if len(patterns) not in (0, 2):
+                raise ValueError(f"{path}: line {number}: must be two patterns, not {len(patterns)}")
+            pairs += [(patterns[0], patterns[1])] if patterns else []
+    return pairs
 
 
 def _output(text: str) -> str:

@@ -1,13 +1,19 @@
 """Shows the results of a replay on the terminal."""
 
+from collections import defaultdict
+
 from rich.console import Console
 from rich.text import Text
 
 from ..replay.intervals import IntervalSummary
-from ..replay.summary import CERTIFIED_FOR, Summary, ValidationSummary
+from ..replay.scene_contacts import PHASES
+from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .tables import LONGEST, count, make_table, say
 
-__all__ = ["print_replay"]
+__all__ = ["print_new", "print_replay"]
+
+_RANGES = 4
+"""Most ranges of time in a line."""
 
 
 def print_replay(console: Console, summary: Summary) -> None:
@@ -46,9 +52,47 @@ def print_replay(console: Console, summary: Summary) -> None:
 
     if summary.colliding:
         _print_collisions(console, summary)
-    else:
+    elif not scene.is_still:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
+    if summary.intersections:
+        _print_intersections(console, summary)
+    if summary.ignored:
+        ignored = sum(hits for _, hits in summary.ignored)
+        say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
+        for meshes, hits in summary.ignored[:LONGEST]:
+            say(console, f"  {hits:,} of {_pair(meshes)}")
 
+    if not scene.is_still:
+        _print_certificate(console, summary)
+    if scene.left_out:
+        say(
+            console,
+            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
+        )
+    if summary.validation:
+        _print_validation(console, summary.validation)
+    if scene.is_still:
+        return
+    total = sum(summary.milliseconds.values())
+    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
+
+
+def print_new(console: Console, new: list[tuple[tuple[str, str], float, float]]) -> None:
+    """Prints what is new against a baseline: names of two meshes, start and end each."""
+    if not new:
+        say(console, "Nothing is new against the baseline.")
+        return
+    say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
+    for meshes, start, end in new[:LONGEST]:
+        says = f"crosses at {start:g}" if start == end else f"collides from {start:g} to {end:g}"
+        say(console, f"  {_pair(meshes)} {says}")
+    if len(new) > LONGEST:
+        say(console, f"  and {len(new) - LONGEST} more.")
+
+
+def _print_certificate(console: Console, summary: Summary) -> None:
+    """Prints whether a collision may be missing."""
+    intervals = summary.intervals
     if uncertain := sum(not interval.certified for interval in intervals):
         say(
             console,
@@ -64,24 +108,24 @@ def print_replay(console: Console, summary: Summary) -> None:
         )
     else:
         say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
-    if scene.left_out:
-        say(
-            console,
-            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
-        )
-    if summary.validation:
-        _print_validation(console, summary.validation)
-    total = sum(summary.milliseconds.values())
-    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
 
 
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
     """Prints the intervals, those with the most collisions first."""
     arrow = "->" if console.options.ascii_only else "→"
     stages = list(listed[0].stats.milliseconds)
+    at_rest = listed[0].intersections is not None
     while True:
-        headers = ["Pairs\ntested", "Hits", "Earliest", *("\n".join(stage.rsplit(" ", 1)) for stage in stages)]
-        caption = "The worst first" + ("; times of the stages in milliseconds." if stages else ".")
+        headers = [
+            "Pairs\ntested",
+            "Hits",
+            "Earliest",
+            *["Edges\nin faces"] * at_rest,
+            *("\n".join(stage.rsplit(" ", 1)) for stage in stages),
+        ]
+        notes = ["edges through faces and touching them are those at the start"] * at_rest
+        notes += ["times of the stages in milliseconds"] * bool(stages)
+        caption = "; ".join(["The worst first", *notes]) + "."
         table = make_table("Interval", *headers, caption=caption)
         table.columns[0].no_wrap = True
         for interval in listed:
@@ -91,6 +135,7 @@ def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
                 f"{interval.pairs_tested:,}",
                 f"{interval.hits:,}",
                 f"{round(interval.earliest.time, 6):.6g}",
+                *(f"{found.crossings + found.touches:,}" for found in (interval.intersections or ())[:1]),
                 *(f"{interval.stats.milliseconds[stage]:,.1f}" for stage in stages),
             )
         wide = console.options.update(width=1000)
@@ -110,8 +155,13 @@ def _print_collisions(console: Console, summary: Summary) -> None:
         f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
         f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
     )
-    for (first, second), hits in summary.mesh_pairs[:LONGEST]:
-        say(console, f"  {hits:,} of {first} with {'itself' if first == second else second}")
+    spans = defaultdict(list)
+    for span in summary.collision_spans:
+        spans[span.meshes].append(span)
+    for meshes, hits in summary.mesh_pairs[:LONGEST]:
+        ranges = [f"{span.since:g} to {span.until:g}" for span in spans[meshes]]
+        more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
+        say(console, f"  {hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
     if len(summary.mesh_pairs) > LONGEST:
         say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest
@@ -121,6 +171,63 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
     worst = summary.worst[0]
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} pairs.")
+
+
+def _print_intersections(console: Console, summary: Summary) -> None:
+    """Prints what intersects at the times themselves, since when and until when, and how collisions compare."""
+    samples, spans = summary.intersections, summary.intersection_spans
+    times = count(len(samples), "time")
+    if not spans:
+        say(console, f"No edge meets a face at rest, at {times}.")
+        return
+    first = samples[0]
+    if first.crossings or first.touches:
+        says = "Already crosses" if first.crossings else "Already touches"
+        say(console, f"{says} at {first.time:g}: {_edges(first.crossings, first.touches)}.")
+    worst = max(samples, key=lambda sample: (sample.crossings, sample.touches))
+    intersecting = sum(bool(sample.mesh_pairs) for sample in samples)
+    say(
+        console,
+        f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: "
+        f"{_edges(worst.crossings, worst.touches)}.",
+    )
+    for span in spans[:LONGEST]:
+        say(console, f"  {_pair(span.meshes)}: {_history(span)}")
+    if len(spans) > LONGEST:
+        say(console, f"  and {len(spans) - LONGEST} more; --json has all.")
+    if summary.colliding:
+        phases = [
+            sum(column) for column in zip(*(interval.phases or () for interval in summary.colliding), strict=True)
+        ]
+        separate = sum(interval.separate_hits or 0 for interval in summary.colliding)
+        say(
+            console,
+            f"Of the collisions, {separate:,} are of meshes that were separate before. The surfaces around them: "
+            f"{', '.join(f'{phase} {number:,}' for phase, number in zip(PHASES, phases, strict=True))}.",
+        )
+
+
+def _edges(crossings: int, touches: int) -> str:
+    """Returns in words how many edges pass through faces and touch them."""
+    through = f"{count(crossings, 'edge')} through faces"
+    touching = f"{count(touches, 'edge')} touching faces"
+    return f"{through}, {touching}" if crossings and touches else touching if touches else through
+
+
+def _pair(meshes: tuple[str, str]) -> str:
+    first, second = meshes
+    return f"{first} with {'itself' if first == second else second}"
+
+
+def _history(span: IntersectionSpan) -> str:
+    """Returns in words since when and until when two meshes intersect."""
+    says = "touches only" if not span.crossings else span.trend
+    if span.since == span.until:
+        return f"at {span.since:g}, {count(span.first, 'edge')}, {says}"
+    numbers = f"{count(span.first, 'edge')} at first, {span.last:,} at last"
+    if span.most > max(span.first, span.last):
+        numbers += f", {span.most:,} at {span.most_at:g}"
+    return f"from {span.since:g} to {span.until:g}, {numbers}: {says}"
 
 
 def _print_validation(console: Console, found: ValidationSummary) -> None:

@@ -55,8 +55,8 @@ class BroadPhase(Protocol):
             vertex_face: Queue for (vertex, face), array of vec2i.
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
-            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, nothing
-                is allocated, but the traversal is slower if much has moved.
+            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, and
+                nothing is allocated on a GPU. A CPU sorts the tree anew where its boxes have become much larger.
             changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all. More pairs may be
                 found than wanted.
         """
@@ -68,13 +68,18 @@ class BroadPhase(Protocol):
         """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
         ...
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+    def pair_edges_with_faces(
+        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
+    ) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
 
         Args:
             x: Positions, array of vec3 or vec3d.
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
+            refit: As of :meth:`pair_elements`.
+            is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
+                boxes a CPU uses again.
         """
         ...
 

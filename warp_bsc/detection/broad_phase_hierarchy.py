@@ -600,8 +600,10 @@ class BroadPhaseHierarchy:
         """Enqueues all candidates of the last run."""
         self._pair_elements(True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
-        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
+    def pair_edges_with_faces(
+        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
+    ) -> None:
+        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap; always only refits."""
         self._pair_faces(x, x)
         self._launch_over_pairs(_pair_edges_with_faces, self.capacity, counts, pairs)
 

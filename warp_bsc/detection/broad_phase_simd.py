@@ -22,6 +22,8 @@ _CODE_BITS = 10
 """Bits of a Morton code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
+_LOOSE = 1.5
+"""Trees are sorted anew where their packets are so many times larger, in sum, than when they were sorted."""
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
@@ -140,6 +142,7 @@ def _pair_packets(
     # options
     symmetric: int,
     keep_separated: int,
+    at_end: int,
     # out
     counts: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
@@ -158,6 +161,7 @@ def _pair_packets(
         level_starts,
         symmetric,
         keep_separated,
+        at_end,
         counts,
         _CANDIDATES,
         _QUEUED,
@@ -199,6 +203,12 @@ class _Tree:
         self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
+        self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether the boxes fitted last are so much larger than those after sorting that sorting is worth its time."""
+        return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
         """Sorts the elements along a Morton curve of a motion's grid.
@@ -214,6 +224,7 @@ class _Tree:
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
+        self._sorted_size = 0.0
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Computes the boxes of all packets and nodes for a motion, without sorting.
@@ -229,13 +240,19 @@ class _Tree:
         device = self._corners.device
         launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
+        with np.errstate(over="ignore"):
+            sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
+        self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
+        self._sorted_size = self._sorted_size or self._size
         for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
             _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
             _join(nodes[start:end, 1::2].max(axis=2), nodes[end:above, 1::2])
             _join(worlds[start:end, :1, 0], worlds[end:above, :1])
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
-    def pair(self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False) -> None:
+    def pair(
+        self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False, at_end: bool = False
+    ) -> None:
         """Enqueues the candidates between this tree and another, or within this tree.
 
         See :func:`warp_bsc.kernels.pipeline.wide_bvh.pair_packet`.
@@ -245,6 +262,7 @@ class _Tree:
             counts: By :class:`Count`, array of int64.
             pairs: Queue of the candidates, array of vec2i.
             keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
+            at_end: Whether to enqueue the pairs that overlap at the end of the motion.
         """
         inputs = [
             self._boxes.flatten(),
@@ -258,6 +276,7 @@ class _Tree:
             other._level_starts,
             other is self,
             keep_separated,
+            at_end,
             counts,
         ]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
@@ -265,9 +284,10 @@ class _Tree:
 
 def _join(children: np.ndarray, parents: np.ndarray) -> None:
     """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
-    for lane in range(8):
-        lanes = children[lane::8]
-        parents[: len(lanes), :, lane] = lanes
+    whole = len(children) // 8
+    parents[:whole] = children[: 8 * whole].reshape(whole, 8, children.shape[1]).transpose(0, 2, 1)
+    if 8 * whole < len(children):
+        parents[whole, :, : len(children) - 8 * whole] = children[8 * whole :].T
 
 
 class BroadPhaseSimd:
@@ -313,17 +333,24 @@ class BroadPhaseSimd:
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=True)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=True)
 
-    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array) -> None:
+    def pair_edges_with_faces(
+        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
+    ) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
-        self._build([self._edges, self._faces], x, x, False)
-        self._edges.pair(self._faces, counts, pairs)
+        if not is_end:
+            self._build([self._edges, self._faces], x, x, refit)
+        self._edges.pair(self._faces, counts, pairs, at_end=True)
 
     def _build(
         self, trees: Sequence[_Tree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
     ) -> None:
-        """Builds trees for a motion, or refits their boxes without sorting."""
-        if not refit:
-            _sort(trees, x0, x1, self._used)
+        """Builds trees for a motion; or refits their boxes, and sorts only if they have become loose."""
+        if refit:
+            for tree in trees:
+                tree.fit(x0, x1, changed)
+            if not any(tree.is_loose for tree in trees):
+                return
+        _sort(trees, x0, x1, self._used)
         for tree in trees:
             tree.fit(x0, x1, changed)
 

@@ -9,7 +9,7 @@ from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays
 from .host_function import run_on_host
-from .intersections import find_intersections
+from .intersections import IntersectionFinder, find_intersections
 from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, decide_on_host
@@ -77,7 +77,7 @@ class CollisionDetector:
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
-            self._pipeline.find_contacts(x0, x1, sort=True, timer=timer)
+            self._pipeline.find_contacts(x0, x1, refit=self._has_run, sort=True, timer=timer)
             return timer
 
         timer = retry_until_fits(launch, self._pipeline, self.mesh.device)
@@ -116,6 +116,10 @@ class CollisionDetector:
             ValueError: If the positions have another shape or type, or are not finite.
         """
         return find_intersections(self.mesh, x)
+
+    def intersection_finder(self) -> IntersectionFinder:
+        """Returns a finder of intersections that shares trees with this detector on a CPU."""
+        return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
     def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> list[ContactRows]:
         """Returns the sorted contacts of both kinds of pair, as far as the buffers held them.

@@ -1,45 +1,67 @@
 """Intersections of a mesh with itself in one configuration: edges that meet faces, exactly."""
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from .. import checker
 from .._arrays import check_finite
-from ..kernels.crossing import edge_crosses_face
-from ..kernels.signs import HIT, UNSURE
-from .broad_phase import make_broad_phase
-from .launch import retry_until_fits
+from ..kernels.crossing import edge_beside_face, edge_crosses_face
+from ..kernels.pipeline.queues import is_filled, take_slot
+from ..kernels.signs import FREE, HIT, UNSURE
+from .broad_phase import BroadPhase, make_broad_phase
+from .launch import launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
-from .settings import NO_GRADIENTS, Counters, capacity_for
+from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["CrossingCandidates", "find_intersections"]
+__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections"]
+
+_FOUND = wp.constant(int(Count.FOUND))
+_QUEUED = wp.constant(int(Count.QUEUED))
 
 
 @functools.cache
-def _classify_crossings(dtype: type) -> wp.Kernel:
-    """The kernel that classifies pairs, for one type of position."""
+def _keep_crossings(dtype: type) -> wp.Kernel:
+    """The kernel that keeps the pairs that are not certified apart, for one type of position."""
 
     @wp.kernel(**NO_GRADIENTS)
-    def classify_crossings(
+    def keep_crossings(
+        first: int,
         # mesh
         x: wp.array[dtype],
         edges: wp.array2d[int],
         faces: wp.array2d[int],
         # in
         pairs: wp.array[wp.vec2i],
+        # in and out
+        counts: wp.array[wp.int64],
         # out
-        status: wp.array[int],
+        kept: wp.array[wp.vec2i],
+        status: wp.array[wp.int8],
     ):
-        i = wp.tid()
+        i = first + wp.tid()
+        if not is_filled(i, pairs, counts, _QUEUED):
+            return
         edge = pairs[i][0]
         face = pairs[i][1]
-        status[i] = edge_crosses_face(
-            x[edges[edge, 0]], x[edges[edge, 1]], x[faces[face, 0]], x[faces[face, 1]], x[faces[face, 2]]
-        )
+        p = x[edges[edge, 0]]
+        q = x[edges[edge, 1]]
+        a = x[faces[face, 0]]
+        b = x[faces[face, 1]]
+        c = x[faces[face, 2]]
+        answer = edge_crosses_face(p, q, a, b, c)
+        if answer == UNSURE:
+            if edge_beside_face(p, q, a, b, c):
+                answer = FREE
+        if answer != FREE:
+            slot = take_slot(counts, _FOUND)
+            if slot < wp.int64(kept.shape[0]):
+                kept[wp.int32(slot)] = pairs[i]
+                status[wp.int32(slot)] = wp.int8(answer)
 
-    return classify_crossings
+    return keep_crossings
 
 
 class CrossingCandidates:
@@ -51,18 +73,26 @@ class CrossingCandidates:
         count: Number of pairs that the last :meth:`grow` has read.
     """
 
-    def __init__(self, mesh: CollisionMesh):
+    def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            broad_phase: A broad phase that is shared if it has no queue of its own; otherwise a new one is made.
+        """
         self._counters = Counters(mesh.device)
-        self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        if broad_phase is None or broad_phase.capacity < UNLIMITED:
+            broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._broad_phase = broad_phase
         # the counts of the edges' pairs with faces take the place of those with edges
         self.counts = self._counters.edge_edge
         self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self.count = 0
 
-    def find(self, x: wp.array) -> None:
-        """Launches the broad phase."""
+    def find(self, x: wp.array, *, refit: bool = False, is_end: bool = False) -> None:
+        """Launches the broad phase; options are those of :meth:`.BroadPhase.pair_edges_with_faces`."""
         self._counters.array.zero_()
-        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs)
+        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, refit=refit, is_end=is_end)
 
     def grow(self) -> bool:
         """Enlarges the queues that were too small, and returns whether any was; synchronizes with the device."""
@@ -77,33 +107,112 @@ class CrossingCandidates:
         return True
 
 
-def find_intersections(mesh: CollisionMesh, x: np.ndarray | wp.array) -> np.ndarray:
-    """Returns the edges that meet faces in one configuration, exactly.
+@dataclass(frozen=True, eq=False)
+class Intersections:
+    """The edges that meet faces in one configuration, exactly.
 
-    Args:
-        mesh: The mesh.
-        x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
-            vertices that no face uses may be anything.
-
-    Returns:
-        (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in
-        ``mesh.edges``, sorted, int32, shape [n, 2].
-
-    Raises:
-        ValueError: If the positions have another shape or type, or are not finite.
+    Attributes:
+        pairs: (edge, face) for every closed edge that meets a closed face it shares no vertex with, edges as in
+            ``mesh.edges``, sorted, int32, shape [n, 2].
+        crosses: Whether the edge passes through the face, as :func:`warp_bsc.checker.edges_pass_faces` defines it. All
+            other edges only touch their face. Bool, shape [n].
     """
-    x = mesh.device_positions(x, "x")
-    positions = x.numpy()
-    check_finite(positions, "x", mesh.vertices)
-    candidates = CrossingCandidates(mesh)
-    retry_until_fits(lambda: candidates.find(x), candidates, mesh.device)
-    status = wp.empty(candidates.count, dtype=int, device=mesh.device)
-    inputs = [x, mesh.device_edges, mesh.device_faces, candidates.pairs]
-    kernel = _classify_crossings(x.dtype)
-    wp.launch(kernel, candidates.count, inputs=inputs, outputs=[status], device=mesh.device, record_tape=False)
-    status = status.numpy()
-    pairs = candidates.pairs.numpy()[: candidates.count]
-    unsure = pairs[status == UNSURE]
-    crossing = checker.edge_face_crossings(positions[mesh.edges[unsure[:, 0]]], positions[mesh.faces[unsure[:, 1]]])
-    pairs = np.concatenate([pairs[status == HIT], unsure[crossing]])
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+    pairs: np.ndarray
+    crosses: np.ndarray
+
+
+class IntersectionFinder:
+    """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses."""
+
+    def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            broad_phase: As of :class:`CrossingCandidates`.
+        """
+        self._mesh = mesh
+        self._candidates = CrossingCandidates(mesh, broad_phase)
+        self._has_run = False
+        self._allocate(len(mesh.faces))
+
+    def find(self, x: np.ndarray | wp.array, *, is_end: bool = False) -> Intersections:
+        """Returns the intersections of one configuration.
+
+        Args:
+            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
+                vertices that no face uses may be anything.
+            is_end: Whether they are those at the end of the last motion that the given broad phase has seen.
+
+        Raises:
+            ValueError: If the positions have another shape or type, or are not finite.
+        """
+        mesh = self._mesh
+        x = mesh.device_positions(x, "x")
+        positions = x.numpy()
+        check_finite(positions, "x", mesh.vertices)
+        retry_until_fits(lambda: self._launch(x, is_end), self, mesh.device)
+        self._has_run = True
+        status = self._status.numpy()[: self._count]
+        pairs = self._kept.numpy()[: self._count]
+        meets, crosses = np.ones(len(pairs), dtype=bool), status == HIT
+        (unsure,) = np.nonzero(status == UNSURE)
+        if len(unsure):
+            edges, faces = pairs[unsure].T
+            edges, across, faces = (
+                positions[mesh.edges[edges]],
+                positions[self._across[faces]],
+                positions[mesh.faces[faces]],
+            )
+            meets[unsure] = checker.edge_face_crossings(edges, faces)
+            crosses[unsure] = checker.edges_pass_faces(edges, faces, across)
+        pairs, crosses = pairs[meets], crosses[meets]
+        order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+        return Intersections(pairs[order], crosses[order])
+
+    def grow(self) -> bool:
+        """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
+        grown = self._candidates.grow()
+        self._count = int(self._candidates.counts.numpy()[Count.FOUND])
+        if self._count > len(self._kept):
+            self._allocate(capacity_for(self._count, "intersections"))
+            return True
+        return grown
+
+    @functools.cached_property
+    def _across(self) -> np.ndarray:
+        """Third vertex of the only neighbour at each side of each face; of the face itself where there is none."""
+        sides = self._mesh.face_edges.ravel()
+        opposite = np.roll(self._mesh.faces, 1, axis=1).ravel()  # side i goes from corner i to the next
+        order = np.argsort(sides, kind="stable")
+        of_edge = sides[order]
+        first = np.flatnonzero((of_edge[1:] == of_edge[:-1]) & (np.bincount(sides + 1)[of_edge[1:] + 1] == 2))
+        one, other = order[first], order[first + 1]
+        across = opposite.copy()
+        across[one], across[other] = opposite[other], opposite[one]
+        return across.reshape(-1, 3)
+
+    def _allocate(self, capacity: int) -> None:
+        self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)
+        self._status = wp.empty(capacity, dtype=wp.int8, device=self._mesh.device)
+
+    def _launch(self, x: wp.array, is_end: bool) -> None:
+        candidates, mesh = self._candidates, self._mesh
+        candidates.find(x, refit=self._has_run, is_end=is_end)
+        launch_over_queue(
+            _keep_crossings(x.dtype),
+            candidates.pairs,
+            candidates.counts,
+            Count.QUEUED,
+            inputs=[x, mesh.device_edges, mesh.device_faces, candidates.pairs],
+            outputs=[candidates.counts, self._kept, self._status],
+        )
+
+
+def find_intersections(mesh: CollisionMesh, x: np.ndarray | wp.array) -> np.ndarray:
+    """Returns the edges that meet faces in one configuration, exactly: :attr:`Intersections.pairs`.
+
+    Arguments and errors are those of :meth:`IntersectionFinder.find`.
+    """
+    return IntersectionFinder(mesh).find(x).pairs

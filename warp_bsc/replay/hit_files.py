@@ -1,25 +1,31 @@
-"""Writes every collision of a replay as JSON or CSV, for programs."""
+"""Writes every collision and every intersection of a replay as JSON or CSV, for programs."""
 
 import csv
 import io
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
+from typing import TypeVar
+
+import orjson
 
 from ..usd.scene import Scene
-from .intervals import IntervalResult
+from .intervals import IntersectionSummary, IntervalResult
 from .outputs import RecordFile
-from .scene_contacts import KINDS
+from .scene_contacts import KINDS, PHASES, SceneContacts
+from .scene_intersections import SceneIntersections
+from .scene_pairs import ScenePairs
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["HitsCsv", "HitsJson"]
 
-_FIELDS = ("kind", "meshes", "prims", "elements", "indices", "time", "toi", "position", "normal")
-
 
 class HitsJson(RecordFile):
-    """A JSON file: facts of the scene, every interval with its contacts, then the sums."""
+    """A JSON file: facts of the scene, every interval with its contacts and intersections, then the sums.
+
+    An interval lists the intersections at its start; the last one lists those at its end as well.
+    """
 
     def __init__(self, path: str | os.PathLike, *, scene: Scene, method: str, device: str):
         """Opens the file.
@@ -34,6 +40,7 @@ class HitsJson(RecordFile):
             OSError: If it cannot be written.
         """
         super().__init__(path)
+        self._last_index = len(scene) - 1
         self._facts = {
             "scene": scene.path,
             "method": method,
@@ -50,7 +57,7 @@ class HitsJson(RecordFile):
         """Returns the text before the first interval."""
         return json.dumps(self._facts)[:-1] + ', "intervals": ['
 
-    def record(self, result: IntervalResult) -> Iterator[str]:
+    def record(self, result: IntervalResult) -> Iterator[str | bytes]:
         """Yields the text of an interval with all of its contacts."""
         interval, contacts = result.summary, result.contacts
         fields = {
@@ -67,12 +74,19 @@ class HitsJson(RecordFile):
             "stages": asdict(interval.stats),
             "validation": asdict(interval.validation) if interval.validation else None,
         }
-        separator = "," if self.record_count else ""
-        yield separator + "\n" + json.dumps(fields, allow_nan=False)[:-1] + ', "contacts": ['
-        for number, rows in enumerate(contacts.chunks()):
-            chunk = json.dumps([dict(zip(_FIELDS, row, strict=True)) for row in _rows(contacts, rows)], allow_nan=False)
-            yield (", " if number else "") + chunk[1:-1]
-        yield "]}"
+        if interval.intersections:
+            start, end = interval.intersections
+            fields["separate_hits"] = interval.separate_hits
+            fields["phases"] = dict(zip(PHASES, interval.phases or (), strict=True))
+            fields["intersections"] = {"start": _numbers(start), "end": _numbers(end)}
+        yield ("," if self.record_count else "") + "\n" + json.dumps(fields, allow_nan=False)[:-1]
+        yield from _list("contacts", contacts, _contact_rows)
+        if result.intersections:
+            start, end = result.intersections
+            yield from _list("edges_through_faces", start, _intersection_rows)
+            if interval.index == self._last_index:
+                yield from _list("edges_through_faces_at_end", end, _intersection_rows)
+        yield "}"
 
     def tail(self, summary: Summary) -> str:
         """Returns the text after the last interval."""
@@ -86,39 +100,51 @@ class HitsJson(RecordFile):
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
             "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
+            "collision_spans": [asdict(span) for span in summary.collision_spans],
+            "ignored": _mesh_pairs_to_list(summary.ignored),
+            "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
         return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact, and a last line that begins with # if some are missing."""
+    """A CSV file: a row for each contact and each intersection, and a last line beginning with # if some are missing.
+
+    Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
+    start, in the last interval its end too.
+    """
 
     _COLUMNS = (
         "interval", "start", "end", "kind",
         "first_mesh", "first_prim", "first_element", "first_index", "first_index_2",
         "second_mesh", "second_prim", "second_element", "second_index", "second_index_2",
-        "time", "toi", "x", "y", "z", "normal_x", "normal_y", "normal_z",
+        "time", "toi", "x", "y", "z", "normal_x", "normal_y", "normal_z", "phase", "separate",
     )  # fmt: skip
+
+    def __init__(self, path: str | os.PathLike, *, scene: Scene):
+        """Opens the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        super().__init__(path)
+        self._last_index = len(scene) - 1
 
     def head(self) -> str:
         """Returns the names of the columns."""
-        return _to_csv([self._COLUMNS])
+        return _to_csv([list(self._COLUMNS)])
 
     def record(self, result: IntervalResult) -> Iterator[str]:
         """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
         for rows in contacts.chunks():
-            yield _to_csv(
-                [
-                    *where, kind,
-                    names[0], prims[0], elements[0], *indices[0], *[""] * (2 - len(indices[0])),
-                    names[1], prims[1], elements[1], *indices[1], *[""] * (2 - len(indices[1])),
-                    time, toi, *position, *normal,
-                ]
-                for kind, names, prims, elements, indices, time, toi, position, normal in _rows(contacts, rows)
-            )  # fmt: skip
+            yield _to_csv([*where, *_csv_values(row)] for row in _contact_rows(contacts, rows))
+        if result.intersections:
+            for intersections in result.intersections[: 2 if interval.index == self._last_index else 1]:
+                for rows in intersections.chunks():
+                    yield _to_csv([*where, *_csv_values(row)] for row in _intersection_rows(intersections, rows))
 
     def tail(self, summary: Summary) -> str:
         """Returns a line on the missing intervals, empty if there are none."""
@@ -127,23 +153,91 @@ class HitsCsv(RecordFile):
         return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
 
 
-def _rows(contacts, rows):
-    """Yields the values of :data:`_FIELDS` for some contacts."""
-    paths = [mesh.path for mesh in contacts.interval.segment.meshes]
-    columns = (contacts.kind, contacts.meshes, contacts.indices, contacts.time, contacts.toi)
-    columns = [column[rows].tolist() for column in (*columns, contacts.position, contacts.normal)]
-    for names, elements, kind, pair, indices, *measures in zip(
-        contacts.mesh_names(rows), contacts.element_names(rows), *columns, strict=True
+_Pairs = TypeVar("_Pairs", bound=ScenePairs)
+
+
+def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], Iterable[dict]]) -> Iterator[str | bytes]:
+    """Yields a member of a JSON object: the list of all pairs."""
+    yield f', "{name}": ['
+    for number, rows in enumerate(pairs.chunks()):
+        yield (b", " if number else b"") + orjson.dumps(list(to_rows(pairs, rows)))[1:-1]
+    yield "]"
+
+
+def _contact_rows(contacts: SceneContacts, rows: slice) -> Iterator[dict]:
+    """Yields the fields of some contacts."""
+    measures = contacts.kind, contacts.time, contacts.toi, contacts.position, contacts.normal
+    columns = [*_names(contacts, rows), *(column[rows].tolist() for column in measures)]
+    compared = [{}] * len(columns[0])
+    if contacts.phase is not None and contacts.separate is not None:
+        phases, separate = contacts.phase[rows].tolist(), contacts.separate[rows].tolist()
+        compared = [{"phase": PHASES[p], "separate": s} for p, s in zip(phases, separate, strict=True)]
+    for meshes, prims, elements, indices, kind, time, toi, position, normal, more in zip(
+        *columns, compared, strict=True
     ):
-        prims = [paths[mesh] for mesh in pair]
-        numbers = [both[:1] if both[1] < 0 else both for both in indices]
-        yield KINDS[kind], names, prims, elements, numbers, *measures
+        yield {
+            "kind": KINDS[kind],
+            "meshes": meshes,
+            "prims": prims,
+            "elements": elements,
+            "indices": indices,
+            "time": time,
+            "toi": toi,
+            "position": position,
+            "normal": normal,
+            **more,
+        }
 
 
-def _to_csv(rows) -> str:
+def _intersection_rows(intersections: SceneIntersections, rows: slice) -> Iterator[dict]:
+    """Yields the fields of some intersections."""
+    columns = *_names(intersections, rows), intersections.position[rows].tolist(), intersections.crosses[rows].tolist()
+    for meshes, prims, elements, indices, position, crosses in zip(*columns, strict=True):
+        yield {
+            "kind": "edge-face",
+            "meshes": meshes,
+            "prims": prims,
+            "elements": elements,
+            "indices": indices,
+            "time": intersections.time,
+            "position": position,
+            "phase": "crosses" if crosses else "touches",
+        }
+
+
+def _names(pairs: ScenePairs, rows: slice) -> tuple[list, list, list, list]:
+    """Returns names of meshes, paths of prims, names of elements and their indices for some pairs."""
+    paths = [mesh.path for mesh in pairs.segment.meshes]
+    prims = [(paths[first], paths[second]) for first, second in pairs.meshes[rows].tolist()]
+    indices = [
+        (first if first[1] >= 0 else first[:1], second if second[1] >= 0 else second[:1])
+        for first, second in pairs.indices[rows].tolist()
+    ]
+    return pairs.mesh_names(rows), prims, pairs.element_names(rows), indices
+
+
+def _csv_values(row: dict) -> list:
+    """Returns the values of a contact or an intersection in the order of the columns after the interval's."""
+    sides = zip(row["meshes"], row["prims"], row["elements"], row["indices"], strict=True)
+    pair = [value for mesh, prim, element, of in sides for value in (mesh, prim, element, of[0], [*of, ""][1])]
+    normal = row.get("normal", ("", "", ""))
+    measures = row["time"], row.get("toi", ""), *row["position"], *normal
+    return [row["kind"], *pair, *measures, row.get("phase", ""), row.get("separate", "")]
+
+
+def _to_csv(rows: Iterable[list]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
+
+
+def _numbers(found: IntersectionSummary) -> dict:
+    """Returns the numbers of the intersections at one time."""
+    pairs = [
+        {"meshes": meshes, "crossings": crossings, "touches": touches}
+        for meshes, (crossings, touches) in found.mesh_pairs.items()
+    ]
+    return asdict(found) | {"mesh_pairs": pairs}
 
 
 def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:

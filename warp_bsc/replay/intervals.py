@@ -1,7 +1,7 @@
 """Replays a USD scene: finds the collisions between each two consecutive times, holding one interval at a time."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,11 +9,17 @@ import numpy as np
 from ..detection.collisions import Collisions, DetectionStats
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..usd.interval import Interval
 from ..usd.scene import Scene
-from .scene_contacts import SceneContacts, find_contacts
+from ..usd.segment import Segment
+from ..usd.selection import Selection
+from .scene_contacts import PHASES, SceneContacts, find_contacts
+from .scene_intersections import SceneIntersections, name_intersections
+from .scene_pairs import count_by_meshes
+from .threads import read_ahead
 from .validation import Validation, validate
 
-__all__ = ["TOI_BINS", "Contact", "IntervalResult", "IntervalSummary", "replay"]
+__all__ = ["TOI_BINS", "Contact", "IntersectionSummary", "IntervalResult", "IntervalSummary", "replay"]
 
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
@@ -37,6 +43,24 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class IntersectionSummary:
+    """The edges that meet faces at one time of a scene, in numbers.
+
+    Attributes:
+        time: Time code.
+        crossings: Number of edges that pass through faces: pairs of an edge and a face.
+        touches: Number of edges that only touch faces.
+        mesh_pairs: Both numbers for each two meshes that intersect, by their names, in order; a mesh that intersects
+            itself is there twice.
+    """
+
+    time: float
+    crossings: int
+    touches: int
+    mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+
+
+@dataclass(frozen=True)
 class IntervalSummary:
     """The collisions between two consecutive times of a scene, in numbers.
 
@@ -54,6 +78,11 @@ class IntervalSummary:
             move straight from the start to the end.
         stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None if none was asked for.
+        intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
+            moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
+        separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
+        ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
+        phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
     """
 
     index: int
@@ -67,6 +96,10 @@ class IntervalSummary:
     certified: bool
     stats: DetectionStats
     validation: Validation | None
+    intersections: tuple[IntersectionSummary, IntersectionSummary] | None
+    ignored: dict[tuple[str, str], int]
+    separate_hits: int | None
+    phases: tuple[int, ...] | None
 
     @property
     def hits(self) -> int:
@@ -91,48 +124,101 @@ class IntervalResult:
     Attributes:
         summary: The numbers, which are small and can be kept for all intervals.
         contacts: Every pair that collides, and the positions of all vertices.
+        intersections: Every edge that meets a face, at the start of the interval and at its end; None if they were not
+            looked for. Where nothing jumps, those at the end are the next interval's at its start, the same object.
     """
 
     summary: IntervalSummary
     contacts: SceneContacts
+    intersections: tuple[SceneIntersections, SceneIntersections] | None
 
 
 def replay(
-    scene: Scene, *, method: str = "exact", device: Any = None, validate_most: int | None = 0
+    scene: Scene,
+    *,
+    method: str = "exact",
+    device: Any = None,
+    intersections: bool = True,
+    ignore_initial: bool = False,
+    validate_most: int | None = 0,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
     Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
-    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end::
+    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end. The
+    edges that pass through faces at the times themselves are found as well, between obstacles too::
 
         import warp_bsc as bsc
 
-        for interval in bsc.replay(bsc.Scene("scene.usd")):
-            print(interval.summary.start, interval.summary.hits, interval.contacts.position)
+        selection = bsc.Selection(exclude=("/World/Hair",))
+        scene = bsc.Scene("scene.usd", frames=bsc.FrameRange(101.0, 150.0), selection=selection)
+        for interval in bsc.replay(scene, ignore_initial=True):
+            contacts = interval.contacts
+            for rows in contacts.chunks():  # 4,096 pairs at a time, as text takes memory
+                for meshes, elements in zip(contacts.mesh_names(rows), contacts.element_names(rows)):
+                    print(interval.summary.start, meshes, elements)
+            print(contacts.toi, contacts.position, contacts.separate)
+            start, end = interval.intersections
+            print(start.crossings, start.position[start.crosses], start.cuts.points)
 
     Args:
         scene: The scene; its selection says which pairs count.
-        method: ``"float"``, ``"conservative"`` or ``"exact"``.
+        method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default.
+        intersections: Whether to find the intersections at each time.
+        ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
+            themselves then: their collisions and intersections are only counted.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
     Yields:
-        IntervalResult: The collisions of one interval. Only what the caller keeps stays in memory.
+        IntervalResult: The collisions of one interval. Only what the caller keeps stays in memory. A thread reads the
+        next interval meanwhile.
 
     Raises:
-        ValueError: If the positions at some time are broken, or there is no such method.
+        ValueError: If the positions at some time are broken, there is no such method, or initial intersections are to
+            be ignored and none are to be found.
     """
-    detector = segment = None
-    for interval in scene:
-        if detector is None or interval.segment is not segment:
-            detector = None  # before the next is made, to free its memory
-            segment = interval.segment
-            mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
-            detector = CollisionDetector(mesh, method=method)
-        collisions = detector.detect(interval.x0, interval.x1)
+    if ignore_initial and not intersections:
+        raise ValueError("what crosses at first can be ignored only if intersections are found")
+    selection, segment_replay = scene.selection, None
+    for interval in read_ahead(scene):
+        if segment_replay is None or interval.segment is not segment_replay.segment:
+            is_first, segment_replay = segment_replay is None, None  # before the next is made, to free its memory
+            segment_replay = _SegmentReplay(interval.segment, scene.is_still, method, device, intersections)
+            if is_first and ignore_initial:
+                at_first = _summarize_intersections(segment_replay.find(interval.x0, interval.start, selection))
+                crossing = {tuple(sorted(names)) for names, (crossings, _) in at_first.mesh_pairs.items() if crossings}
+                selection = replace(selection, ignored_names=selection.ignored_names | crossing)
+                segment_replay.forget()
+        yield segment_replay.check(interval, selection, validate_most)
+
+
+class _SegmentReplay:
+    """Checks the intervals of one segment."""
+
+    def __init__(self, segment: Segment, is_still: bool, method: str, device: Any, intersections: bool):
+        self.segment = segment
+        self._is_still = is_still
+        self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
+        self._detector = CollisionDetector(self._mesh, method=method)
+        self._finder = self._detector.intersection_finder() if intersections else None
+        self._last: SceneIntersections | None = None  # those found last
+
+    def check(self, interval: Interval, selection: Selection, validate_most: int | None) -> IntervalResult:
+        """Returns the collisions of an interval."""
+        detector = self._detector
+        start = self.find(interval.x0, interval.start, selection) if self._finder else None
+        if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
+            detector = CollisionDetector(CollisionMesh([], 0, device=self._mesh.device), method=detector.method)
+            collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
+        else:
+            collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        contacts = find_contacts(interval, detector.mesh, collisions, scene.selection)
+        intersections = None
+        if start is not None:
+            intersections = start, self.find(interval.x1, interval.end, selection, is_end=not self._is_still)
+        contacts = find_contacts(interval, self._mesh, collisions, selection, intersections)
         validation = None
         if validate_most != 0:
             validation = validate(
@@ -144,10 +230,31 @@ def replay(
                 seed=interval.index,
                 counted=contacts.counted,
             )
-        yield IntervalResult(_summarize(contacts, collisions, validation), contacts)
+        summary = _summarize(contacts, collisions, intersections, validation)
+        return IntervalResult(summary, contacts, intersections)
+
+    def find(self, x: np.ndarray, time: float, selection: Selection, *, is_end: bool = False) -> SceneIntersections:
+        """Returns the intersections at a time, those found last if these are the ones.
+
+        Args:
+            x: Positions at that time, shape [vertex_count, 3].
+            time: Time code.
+            selection: Which pairs of meshes count.
+            is_end: Whether a motion that ends there has just been detected.
+        """
+        last = self._last
+        if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
+            assert self._finder
+            found = self._finder.find(x, is_end=is_end)
+            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, selection)
+        return last
+
+    def forget(self) -> None:
+        """Forgets what was found last: another selection counts."""
+        self._last = None
 
 
-def _summarize(contacts, collisions, validation) -> IntervalSummary:
+def _summarize(contacts, collisions, intersections, validation) -> IntervalSummary:
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
@@ -158,8 +265,11 @@ def _summarize(contacts, collisions, validation) -> IntervalSummary:
             float(contacts.toi[first]),
             float(contacts.time[first]),
         )
-    pairs, counts = np.unique(np.sort(contacts.meshes, axis=1), axis=0, return_counts=True)
-    names = [mesh.name for mesh in interval.segment.meshes]
+    at_rest = None
+    if intersections:
+        start, end = map(_summarize_intersections, intersections)
+        at_rest = start, end
+    hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
         index=interval.index,
@@ -168,9 +278,20 @@ def _summarize(contacts, collisions, validation) -> IntervalSummary:
         vertex_face_hits=len(contacts) - edge_edge,
         edge_edge_hits=edge_edge,
         toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
-        mesh_pairs={(names[a], names[b]): count for (a, b), count in zip(pairs, counts.tolist(), strict=True)},
+        mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
         certified=collisions.certified,
         stats=collisions.stats,
         validation=validation,
+        intersections=at_rest,
+        ignored=contacts.ignored,
+        separate_hits=int(contacts.separate.sum()) if intersections else None,
+        phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
+    )
+
+
+def _summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
+    by_meshes = count_by_meshes(found.segment, found.meshes, np.stack([found.crosses, ~found.crosses], axis=1))
+    return IntersectionSummary(
+        found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
     )

@@ -74,8 +74,8 @@ class RecordFile(ABC):
         """Returns the text before the first record."""
 
     @abstractmethod
-    def record(self, result: IntervalResult) -> Iterator[str]:
-        """Yields the text of an interval in parts."""
+    def record(self, result: IntervalResult) -> Iterator[str | bytes]:
+        """Yields the text of an interval in parts, bytes in UTF-8."""
 
     @abstractmethod
     def tail(self, summary: Summary) -> str:
@@ -114,7 +114,7 @@ class RecordFile(ABC):
         """Removes the temporary file."""
         self.file.discard()
 
-    def _append(self, texts: Iterable[str]) -> None:
+    def _append(self, texts: Iterable[str | bytes]) -> None:
         for text in texts:
             self.file.write(text)
         self._ends.append(self.file.tell())

@@ -1,6 +1,6 @@
 """Names the collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -8,100 +8,73 @@ from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
+from .scene_intersections import SceneIntersections
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, count_by_meshes
 
-__all__ = ["DIAGONAL", "EDGE", "FACE", "KINDS", "VERTEX", "SceneContacts", "find_contacts"]
+__all__ = ["KINDS", "PHASES", "SceneContacts", "find_contacts"]
 
 KINDS = ("vertex-face", "edge-edge")
 """Labels of the kinds of contact, by their numbers."""
 
-VERTEX, FACE, EDGE, DIAGONAL = range(4)
-"""The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
+PHASES = ("passes", "enters", "leaves", "stays")
+"""Whether the surfaces at two elements cross at the end of the interval, plus twice whether they do at its start.
 
-_CHUNK = 4096
-_WORDS = ("vertex", "face", "edge", "diagonal")
+Surfaces that cross at neither only touch in the interval, or pass through each other and out again.
+"""
 
 
 @dataclass(frozen=True)
-class SceneContacts:
+class SceneContacts(ScenePairs):
     """The pairs that collide in one interval, where and when: arrays with a row for each pair.
 
     Attributes:
         interval: The interval.
         kind: Index in :data:`KINDS`, shape [n].
-        elements: Kinds of the two elements: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape
-            [n, 2].
-        meshes: The two meshes, indices in ``interval.segment.meshes``, shape [n, 2].
-        indices: Indices of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the polygon
-            and -1 for a face, the points at both ends for an edge or a diagonal.
-        vertices: Vertices of the segment at the two elements, shape [n, 2, 2]: the vertex and -1 for a vertex, both
-            ends for an edge or a diagonal, -1 twice for a face.
-        faces: Face of the segment for a face, else -1, shape [n, 2].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
-        position: Points of contact, in world space and the scene's unit of length, shape [n, 3].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
         counted: Which of the pairs that the detector found are among these, vertex-face before edge-edge, bool.
+        ignored: Number of pairs that collide and are to be ignored, by the names of their meshes, in order.
+        separate: Whether the two meshes did not intersect at the start of the interval, nor touch, shape [n]; for a
+            mesh with itself, whether no part of it did. None if intersections were not looked for.
+        phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it.
+            None if intersections were not looked for.
     """
 
     interval: Interval = field(repr=False)
     kind: np.ndarray
-    elements: np.ndarray
-    meshes: np.ndarray
-    indices: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
     toi: np.ndarray
     time: np.ndarray
-    position: np.ndarray
     normal: np.ndarray
     counted: np.ndarray = field(repr=False)
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def chunks(self) -> list[slice]:
-        """Returns all rows as slices of limited length: their text takes many times their memory."""
-        return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
-
-    def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
-        """Returns the names of the two meshes of some pairs."""
-        names = [mesh.name for mesh in self.interval.segment.meshes]
-        return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
-
-    def element_names(self, rows: slice) -> list[tuple[str, str]]:
-        """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
-
-        def name(element, indices):
-            first, second = indices
-            return f"{_WORDS[element]} {first}" if second < 0 else f"{_WORDS[element]} {first}-{second}"
-
-        return [
-            (name(first, first_indices), name(second, second_indices))
-            for (first, second), (first_indices, second_indices) in zip(
-                self.elements[rows].tolist(), self.indices[rows].tolist(), strict=True
-            )
-        ]
+    ignored: dict[tuple[str, str], int]
+    separate: np.ndarray | None = None
+    phase: np.ndarray | None = None
 
     @property
     def colliding_faces(self) -> np.ndarray:
         """Faces of the segment that collide or have an edge that collides, ascending."""
         ends = self.vertices[self.elements >= EDGE]
-        return np.union1d(self.faces[self.faces >= 0], self.interval.segment.faces_at_edges(np.unique(ends, axis=0)))
+        return np.union1d(self.faces[self.faces >= 0], self.segment.faces_at_edges(np.unique(ends, axis=0)))
 
     def colliding_polygons(self) -> dict[int, np.ndarray]:
         """Returns the polygons that collide, or have an edge or a vertex that collides, ascending, by mesh."""
-        around = self.interval.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
-        meshes, polygons = self.interval.segment.locate_faces(np.union1d(self.colliding_faces, around))
+        around = self.segment.faces_around(self.vertices[self.elements == VERTEX][:, 0])
+        meshes, polygons = self.segment.locate_faces(np.union1d(self.colliding_faces, around))
         return {int(mesh): np.unique(polygons[meshes == mesh]) for mesh in np.unique(meshes)}
 
 
 def find_contacts(
-    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
+    interval: Interval,
+    mesh: CollisionMesh,
+    collisions: Collisions,
+    selection: Selection,
+    intersections: tuple[SceneIntersections, SceneIntersections] | None = None,
 ) -> SceneContacts:
     """Names the pairs that a detection found and that count.
 
-    Excluded are pairs of meshes that never move, pairs that the selection excludes, and pairs of a mesh with itself if
-    only its transform moves it. Elements that are apart in such a mesh stay apart, and elements that touch, at
+    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
+    itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
     T-junctions or in coplanar faces, would collide by rounding alone. (If a transform turns by half a circle from one
     sample to the next, or scales by zero, the straight ways of the vertices meet although the mesh does not.)
 
@@ -110,12 +83,28 @@ def find_contacts(
         mesh: The detector's mesh, made of the interval's segment.
         collisions: Collisions of that mesh in the interval.
         selection: Which pairs of meshes count.
+        intersections: Those at the start and at the end of the interval; None if they were not looked for.
     """
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     n_vertex_face, n_edge_edge = len(vertices), len(ends)
     n = n_vertex_face + n_edge_edge
+    if not n:
+        none = np.zeros(0, dtype=np.int64)
+        return SceneContacts(
+            segment,
+            **NO_PAIRS,
+            interval=interval,
+            kind=none,
+            toi=np.zeros(0),
+            time=np.zeros(0),
+            normal=np.zeros((0, 3)),
+            counted=none.astype(bool),
+            ignored={},
+            separate=none.astype(bool) if intersections else None,
+            phase=none if intersections else None,
+        )
 
     kind = np.repeat([0, 1], [n_vertex_face, n_edge_edge])
     elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])
@@ -150,6 +139,8 @@ def find_contacts(
     moves = np.array([part.moves for part in segment.meshes])
     counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
     counted &= ~_are_stiff(segment, vertices, meshes[:n_vertex_face, 1], ends)
+    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~ignored
     arrays = {
         "kind": kind,
         "elements": elements,
@@ -162,24 +153,38 @@ def find_contacts(
         "position": position,
         "normal": normal,
     }
-    return SceneContacts(interval, **{name: array[counted] for name, array in arrays.items()}, counted=counted)
+    contacts = SceneContacts(
+        segment,
+        **{name: array[counted] for name, array in arrays.items()},
+        interval=interval,
+        counted=counted,
+        ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
+    )
+    return _compare(contacts, *intersections) if intersections else contacts
+
+
+def _compare(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
+    """Returns contacts compared with the intersections at both ends of their interval."""
+    of_faces = contacts.segment.faces[contacts.faces[:, 1]]
+    firsts = contacts.vertices[:, 0]
+    seconds = np.where((contacts.kind == 0)[:, None], of_faces, contacts.vertices[:, 1][:, [0, 1, 1]])
+    pairs = [
+        np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
+        for first in firsts.T
+        for second in seconds.T
+    ]
+    phase = np.zeros(len(contacts), dtype=np.int64)
+    for weight, intersections in ((2, start), (1, end)):
+        if len(contacts) and len(tangled := intersections.tangled_vertices()):
+            crosses = [np.isin(intersections.pair_keys(pair), tangled) for pair in pairs]
+            phase += weight * np.any(crosses, axis=0)
+    return replace(contacts, separate=~np.isin(contacts.mesh_keys(), start.mesh_keys()), phase=phase)
 
 
 def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:
-    """Returns which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges.
-
-    Vertices and edges may be welded to those of other meshes: they belong to all of these.
-    """
-    are_stiff = np.zeros(len(vertices) + len(ends), dtype=bool)
-    stiff = np.array([mesh.moves and not mesh.deforms for mesh in segment.meshes], dtype=bool)
-    if not stiff.any():
-        return are_stiff
-    rows, meshes = segment.meshes_at_vertices(vertices)
-    found = [rows[stiff[meshes] & (meshes == face_meshes[rows])]]
-    keys = []
-    for side in range(2):
-        rows, meshes = segment.meshes_at_edges(ends[:, side])
-        keys.append((rows * len(stiff) + meshes)[stiff[meshes]])
-    found.append(len(vertices) + np.intersect1d(*keys) // len(stiff))
-    are_stiff[np.concatenate(found)] = True
-    return are_stiff
+    """Returns which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges."""
+    rows, meshes = segment.meshes_at_edges(ends[:, 1])
+    of_edges = segment.are_stiff(ends[rows, 0], meshes)
+    edges = np.zeros(len(ends), dtype=bool)
+    edges[rows[of_edges]] = True
+    return np.concatenate([segment.are_stiff(vertices, face_meshes), edges])

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, Contact, IntervalSummary
+from .intervals import TOI_BINS, Contact, IntersectionSummary, IntervalSummary
 
-__all__ = ["CERTIFIED_FOR", "Summary", "ValidationSummary"]
+__all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "Summary", "ValidationSummary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
 """The motion that a certificate holds for."""
@@ -32,6 +32,57 @@ class ValidationSummary:
     certified: int
     false_hits: int
     disagreements: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class CollisionSpan:
+    """Consecutive intervals of a scene in all of which two meshes collide, or a mesh collides with itself.
+
+    Attributes:
+        meshes: Names of the two.
+        since: Start of the first interval, as a time code.
+        until: End of the last interval.
+        hits: Number of their pairs that collide.
+    """
+
+    meshes: tuple[str, str]
+    since: float
+    until: float
+    hits: int
+
+
+@dataclass(frozen=True)
+class IntersectionSpan:
+    """Consecutive times of a scene at all of which two meshes intersect, or a mesh intersects itself.
+
+    Attributes:
+        meshes: Names of the two.
+        since: The first of the times, as a time code.
+        until: The last of the times.
+        is_open: Whether no time after the last one was checked, so that the intersection may go on.
+        first: Number of edges that pass through faces or touch them at the first time.
+        last: The same at the last time.
+        most: The same at the time at which there are the most.
+        most_at: That time.
+        crossings: The most edges that pass through faces at one time; 0 if the meshes only touch.
+    """
+
+    meshes: tuple[str, str]
+    since: float
+    until: float
+    is_open: bool
+    first: int
+    last: int
+    most: int
+    most_at: float
+    crossings: int
+
+    @property
+    def trend(self) -> str:
+        """What becomes of the intersection: "heals" if it ends, else "grows", "shrinks" or "stays" by the numbers."""
+        if not self.is_open:
+            return "heals"
+        return "grows" if self.last > self.first else "shrinks" if self.last < self.first else "stays"
 
 
 @dataclass(frozen=True)
@@ -82,6 +133,44 @@ class Summary:
         """Number of pairs that collide in some interval."""
         return sum(interval.hits for interval in self.intervals)
 
+    @cached_property
+    def ignored(self) -> list[tuple[tuple[str, str], int]]:
+        """Names of two meshes and their number of colliding pairs that were ignored, the largest first."""
+        total: Counter[tuple[str, str]] = Counter()
+        for interval in self.intervals:
+            total.update(interval.ignored)
+        return total.most_common()
+
+    @cached_property
+    def collision_spans(self) -> list[CollisionSpan]:
+        """Which meshes collide from when to when, in order of time; then those with the most hits first."""
+        spans, running = [], {}
+        for interval in self.intervals:
+            for meshes in [meshes for meshes in running if meshes not in interval.mesh_pairs]:
+                spans.append(running.pop(meshes))
+            for meshes, hits in interval.mesh_pairs.items():
+                before = running.get(meshes, CollisionSpan(meshes, interval.start, interval.end, 0))
+                running[meshes] = replace(before, until=interval.end, hits=before.hits + hits)
+        return sorted([*spans, *running.values()], key=lambda span: (span.since, -span.hits))
+
+    @cached_property
+    def intersections(self) -> list[IntersectionSummary]:
+        """The intersections at all times of the finished intervals, in order; empty if they were not looked for."""
+        found = [interval.intersections for interval in self.intervals if interval.intersections]
+        return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+    @cached_property
+    def intersection_spans(self) -> list[IntersectionSpan]:
+        """Which meshes intersect since when and until when, in order of time; then those with the most edges first."""
+        spans, running = [], {}
+        for sample in self.intersections:
+            for meshes in [meshes for meshes in running if meshes not in sample.mesh_pairs]:
+                spans.append(_span(meshes, running.pop(meshes), False))
+            for meshes, numbers in sample.mesh_pairs.items():
+                running.setdefault(meshes, []).append((sample.time, *numbers))
+        spans += [_span(meshes, samples, True) for meshes, samples in running.items()]
+        return sorted(spans, key=lambda span: (span.since, -span.most))
+
     @property
     def certified(self) -> bool:
         """Whether no collision of vertices that move straight is missing in the finished intervals."""
@@ -131,6 +220,8 @@ class Summary:
     @property
     def motion(self) -> str:
         """A sentence on the motion that is assumed between samples."""
+        if self.scene.is_still:
+            return "Nothing moves: there are no collisions, only intersections at rest."
         sentence = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
@@ -145,3 +236,20 @@ class Summary:
         if count == len(self.intervals):
             return self
         return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "no room for more")
+
+
+def _span(meshes, samples, is_open) -> IntersectionSpan:
+    """Returns a span of samples: time, crossings and touches each."""
+    numbers = [crossings + touches for _, crossings, touches in samples]
+    most = max(numbers)
+    return IntersectionSpan(
+        meshes=meshes,
+        since=samples[0][0],
+        until=samples[-1][0],
+        is_open=is_open,
+        first=numbers[0],
+        last=numbers[-1],
+        most=most,
+        most_at=samples[numbers.index(most)][0],
+        crossings=max(crossings for _, crossings, _ in samples),
+    )

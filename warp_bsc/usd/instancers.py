@@ -6,11 +6,20 @@
 import os
 from collections.abc import Iterator
 
-from pxr import Gf, Sdf, Usd, UsdGeom
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
 
-from .stage import LeftOut, UnreadableError, reading, sample_times
+from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
 
-__all__ = ["Instance", "find_instances", "is_shown", "transform_attributes", "transform_times", "visibility_times"]
+__all__ = [
+    "Instance",
+    "Instancer",
+    "find_instances",
+    "is_shown",
+    "transform_attributes",
+    "transform_times",
+    "visibility_times",
+]
 
 # Prototypes are often kept under a class or an over, so that they are not drawn where they stand.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -20,23 +29,19 @@ class Instance:
     """An instance of a prototype: a place where the prims of the prototype stand.
 
     Attributes:
+        instancer: The point instancer, the same object for all of its instances.
+        index: Number of the instance.
         name: The instancer and the number of the instance, such as ``"/World/Leaves[3]"``.
         root: The prototype's topmost prim.
-        times: Time codes at which its transform to the world has a sample.
-        break_times: Time codes at which it may appear or vanish.
     """
 
-    def __init__(self, instancer: "_Instancer", index: int, prototype: int, root: Usd.Prim, parent: "Instance | None"):
-        """Takes the numbers of the instance and of its prototype, and the instance that the instancer stands in."""
-        self._instancer = instancer
-        self._index = index
+    def __init__(self, instancer: "Instancer", index: int, prototype: int, root: Usd.Prim):
+        """Takes the instancer, and the numbers of the instance and of its prototype."""
+        self.instancer = instancer
+        self.index = index
         self._prototype = prototype
-        self._parent = parent
-        path = instancer.prim.GetPath()
-        self.name = f"{parent.name_of(path) if parent else path}[{index}]"
+        self.name = f"{instancer.name}[{index}]"
         self.root = root
-        self.times = instancer.times | (parent.times if parent else set())
-        self.break_times = instancer.break_times | (parent.break_times if parent else set())
 
     def name_of(self, path: Sdf.Path) -> str:
         """Returns the name in this instance of a prim of the prototype, given its path."""
@@ -46,82 +51,136 @@ class Instance:
         """Returns an iterator over the prims of the prototype, the topmost first."""
         return iter(Usd.PrimRange(self.root, _PROTOTYPES))
 
-    def is_present(self, time: Usd.TimeCode) -> bool:
-        """Returns whether the instance is there and visible."""
-        numbers, mask = self._instancer.read_presence(time)
-        return (
-            self._index < len(numbers)
-            and numbers[self._index] == self._prototype
-            and (not mask or mask[self._index])
-            and is_shown(self._instancer.prim, self._parent.root if self._parent else None, time)
-            and (self._parent is None or self._parent.is_present(time))
-        )
+    def are_present(self, times: tuple[Usd.TimeCode, ...]) -> np.ndarray:
+        """Returns at which times the instance is there and visible, bool."""
+        return self.instancer.prototypes(times)[:, self.index] == self._prototype
 
-    def transform(self, prim: Usd.Prim, time: Usd.TimeCode) -> Gf.Matrix4d | None:
-        """Returns the matrix that takes points of a prim of the prototype to world space.
+    def transform(self, prim: Usd.Prim, time: Usd.TimeCode) -> np.ndarray | None:
+        """Returns the matrix that takes points of a prim of the prototype, as rows, to world space, shape [4, 4].
 
         None where the instance is not there, or the lengths of the instancer's arrays differ.
         """
-        placed = self._instancer.read_transform(self._index, time)
-        cache = UsdGeom.XformCache(time)
-        instancer = self._instancer.prim
-        above = self._parent.transform(instancer, time) if self._parent else cache.GetLocalToWorldTransform(instancer)
-        if placed is None or above is None:
-            return None
-        local, _ = cache.ComputeRelativeTransform(prim, self.root)
-        if root := UsdGeom.Xformable(self.root):
-            local *= root.GetLocalTransformation(time)
-        return local * placed * above
+        transform = self.instancer.transforms(prim, self.root, time)[self.index]
+        return None if np.isnan(transform[0, 0]) else transform
 
     def contains(self, prim: Usd.Prim) -> bool:
         """Returns whether an instancer made this instance or one around it: an instancer may not contain itself."""
-        return self._instancer.prim == prim or (self._parent is not None and self._parent.contains(prim))
+        parent = self.instancer.parent
+        return self.instancer.prim == prim or (parent is not None and parent.contains(prim))
 
 
-class _Instancer:
-    """A point instancer, and its transforms at the time that was read last."""
+class Instancer:
+    """A point instancer, or one instance of it, and what it has read last.
 
-    def __init__(self, prim, root):
+    Attributes:
+        prim: The instancer.
+        parent: The instance that it stands in, None if it stands in the scene.
+        name: Its path, with the number of the instance that it stands in.
+        count: Largest number of instances at any time.
+        times: Time codes at which transforms of its instances to the world have a sample.
+        break_times: Time codes at which instances may appear or vanish.
+        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
+    """
+
+    count: int = 0
+
+    def __init__(self, prim: Usd.Prim, parent: Instance | None):
+        """Finds the times at which the instances move, appear or vanish."""
         self.prim = prim
-        self._instancer = UsdGeom.PointInstancer(prim)
-        self._last: tuple[Usd.TimeCode | None, tuple] = None, ()
-        self._last_presence: tuple[Usd.TimeCode | None, tuple] = None, ()
-        self.times = transform_times(prim, root) | sample_times(
-            self._instancer.GetPositionsAttr(),
-            self._instancer.GetOrientationsAttr(),
-            self._instancer.GetOrientationsfAttr(),
-            self._instancer.GetScalesAttr(),
+        self.parent = parent
+        self.name = parent.name_of(prim.GetPath()) if parent else str(prim.GetPath())
+        self._instancer = instancer = UsdGeom.PointInstancer(prim)
+        self._last_placed: tuple[Usd.TimeCode | None, np.ndarray] = None, np.zeros((0, 4, 4))
+        self._last_transforms: dict[Sdf.Path, tuple[Usd.TimeCode, np.ndarray]] = {}
+        self._last_prototypes: tuple[tuple, np.ndarray] = (), np.zeros((0, 0), dtype=int)
+        root = parent.root if parent else None
+        placing = (
+            instancer.GetPositionsAttr(),
+            instancer.GetOrientationsAttr(),
+            instancer.GetOrientationsfAttr(),
+            instancer.GetScalesAttr(),
         )
+        self.times = transform_times(prim, root) | sample_times(*placing)
         self.break_times = visibility_times(prim, root) | sample_times(
-            self._instancer.GetProtoIndicesAttr(), self._instancer.GetInvisibleIdsAttr(), self._instancer.GetIdsAttr()
+            instancer.GetProtoIndicesAttr(), instancer.GetInvisibleIdsAttr(), instancer.GetIdsAttr()
         )
+        self.may_jump: bool = may_jump([*transform_attributes(prim, root), *placing])
+        if parent:
+            self.times |= parent.instancer.times
+            self.break_times |= parent.instancer.break_times
+            self.may_jump |= parent.instancer.may_jump
 
-    def read_transform(self, index, time):
-        """Returns the matrix of an instance, None if it has none.
+    def transforms(self, prim: Usd.Prim, root: Usd.Prim, time: Usd.TimeCode) -> np.ndarray:
+        """Returns the matrices that take points of a prim of a prototype, as rows, to world space, by all instances.
+
+        Args:
+            prim: The prim.
+            root: The prototype's topmost prim.
+            time: Time code.
+
+        Returns:
+            Matrices, shape [count, 4, 4]; NaN where an instance has none.
+        """
+        last = self._last_transforms.get(prim.GetPath())
+        if last and last[0] == time:
+            return last[1]
+        cache = UsdGeom.XformCache(time)
+        above = self.parent.transform(self.prim, time) if self.parent else cache.GetLocalToWorldTransform(self.prim)
+        local, _ = cache.ComputeRelativeTransform(prim, root)
+        if xformable := UsdGeom.Xformable(root):
+            local *= xformable.GetLocalTransformation(time)
+        transforms = np.full((self.count, 4, 4), np.nan)
+        if above is not None:
+            placed = self._read_placed(time)[: self.count]
+            transforms[: len(placed)] = np.array(local) @ placed @ np.array(above)
+        self._last_transforms[prim.GetPath()] = time, transforms
+        return transforms
+
+    def prototypes(self, times: tuple[Usd.TimeCode, ...]) -> np.ndarray:
+        """Returns the prototype of each instance at each time, shape [len(times), count]; -1 where none is visible."""
+        if self._last_prototypes[0] != times:
+            prototypes = np.full((len(times), self.count), -1)
+            parent = self.parent
+            shown = parent.are_present(times) if parent else np.ones(len(times), dtype=bool)
+            for row, time in enumerate(times):
+                if shown[row] and is_shown(self.prim, parent.root if parent else None, time):
+                    numbers = np.array(self._instancer.GetProtoIndicesAttr().Get(time) or (), dtype=int)[: self.count]
+                    mask = np.array(self._instancer.ComputeMaskAtTime(time), dtype=bool)[: len(numbers)]
+                    prototypes[row, : len(numbers)] = np.where(mask, numbers, -1) if len(mask) else numbers
+            self._last_prototypes = times, prototypes
+        return self._last_prototypes[1]
+
+    def _read_placed(self, time) -> np.ndarray:
+        """Returns the matrices of the instances in the instancer, shape [n, 4, 4], as far as its lists reach.
 
         ``PointInstancer.ComputeInstanceTransformsAtTime`` cannot evaluate the moment just before a time.
         """
-        if self._last[0] != time:
+        if self._last_placed[0] != time:
             instancer = self._instancer
+            positions = instancer.GetPositionsAttr().Get(time)
             orientations = instancer.GetOrientationsfAttr().Get(time) or instancer.GetOrientationsAttr().Get(time)
-            arrays = instancer.GetPositionsAttr().Get(time), orientations, instancer.GetScalesAttr().Get(time)
-            self._last = time, arrays
-        positions, orientations, scales = self._last[1]
-        if not positions or any(index >= len(values) for values in self._last[1] if values):
-            return None
-        matrix = Gf.Matrix4d().SetTranslate(Gf.Vec3d(positions[index]))
-        if orientations:
-            matrix = Gf.Matrix4d().SetRotate(Gf.Quatd(orientations[index])) * matrix
-        if scales:
-            matrix = Gf.Matrix4d().SetScale(Gf.Vec3d(scales[index])) * matrix
-        return matrix
+            scales = instancer.GetScalesAttr().Get(time)
+            count = min(map(len, [positions or (), *filter(None, (orientations, scales))]))
+            placed = np.tile(np.eye(4), (count, 1, 1))
+            if orientations:
+                placed[:, :3, :3] = _rotations(np.array(orientations, dtype=np.float64)[:count])
+            if scales:
+                placed[:, :3, :3] *= np.array(scales, dtype=np.float64)[:count, :, None]
+            if count:
+                placed[:, 3, :3] = np.array(positions)[:count]
+            self._last_placed = time, placed
+        return self._last_placed[1]
 
-    def read_presence(self, time) -> tuple:
-        """Returns the prototypes of the instances, and the mask of those that are not hidden."""
-        if self._last_presence[0] != time:
-            numbers = self._instancer.GetProtoIndicesAttr().Get(time) or ()
-            self._last_presence = time, (numbers, list(self._instancer.ComputeMaskAtTime(time)))
-        return self._last_presence[1]
+
+def _rotations(quaternions: np.ndarray) -> np.ndarray:
+    """Returns matrices for rows, shape [n, 3, 3], as ``Gf.Matrix4d.SetRotate``; imaginary parts first, shape [n, 4]."""
+    x, y, z, w = quaternions.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (z * x - y * w)),
+        (2 * (x * y - z * w), 1 - 2 * (z * z + x * x), 2 * (y * z + x * w)),
+        (2 * (z * x + y * w), 2 * (y * z - x * w), 1 - 2 * (y * y + x * x)),
+    )
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def find_instances(
@@ -143,7 +202,7 @@ def find_instances(
         with reading(where):
             if parent and parent.contains(prim):
                 raise UnreadableError(f"{where}: the point instancer contains itself")
-            instancer = _Instancer(prim, parent.root if parent else None)
+            instancer = Instancer(prim, parent)
             stage, schema = prim.GetStage(), UsdGeom.PointInstancer(prim)
             roots = [stage.GetPrimAtPath(path) for path in schema.GetPrototypesRel().GetForwardedTargets()]
             numbers = schema.GetProtoIndicesAttr()
@@ -157,7 +216,8 @@ def find_instances(
         (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
         left_out.add(UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}"))
     present = sorted({*pairs} - {*lost})
-    return [Instance(instancer, index, number, roots[number], parent) for index, number in present]
+    instancer.count = 1 + max((index for index, _ in present), default=-1)
+    return [Instance(instancer, index, number, roots[number]) for index, number in present]
 
 
 def transform_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[Usd.Attribute]:

@@ -3,10 +3,12 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import copy
 import hashlib
 import math
 import os
 from collections import Counter
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -21,8 +23,9 @@ from .instancers import (
     visibility_times,
 )
 from .selection import Selection
+from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
 from .skinning import Skin, find_bindings
-from .stage import LeftOut, UnreadableError, as_time_code, reading, sample_times
+from .stage import LeftOut, UnreadableError, as_time_code, may_jump, reading, sample_times
 from .triangulation import triangulate
 
 __all__ = ["UsdMesh", "find_meshes"]
@@ -52,6 +55,11 @@ def find_meshes(
     selection.check_patterns(finder.places)
 
     meshes, invisible, passed_over, warnings = [], [], Counter(), finder.warnings
+    if unmatched := selection.unmatched(finder.places):
+        warnings.append(
+            f"pairs to ignore that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
+        )
+    first_instances: dict[tuple, UsdMesh] = {}
     for place in finder.places:
         if not selection.includes(place):
             continue
@@ -60,7 +68,12 @@ def find_meshes(
                 if place.purpose not in selection.purposes:
                     passed_over[place.purpose] += 1
                     continue
-                mesh = UsdMesh(place, file)
+                if place.instance is None:
+                    mesh = UsdMesh(place, file)
+                elif first := first_instances.get(place.group):
+                    mesh = first.again(place)
+                else:
+                    mesh = first_instances[place.group] = UsdMesh(place, file)
         except UnreadableError as error:
             left_out.add(error)
             continue
@@ -75,9 +88,14 @@ def find_meshes(
     for purpose, count in sorted(passed_over.items()):
         warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
     if finder.other:
-        shapes = ", ".join(f"{count} {name}" for name, count in sorted(finder.other.items()))
-        warnings.append(f"shapes that are not meshes are not checked: {shapes}")
+        warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
+    if shapes := Counter(mesh.shape for mesh in meshes if mesh.shape):
+        warnings.append(f"shapes are checked as polyhedra, round ones as inscribed ones: {_listed(shapes)}")
     return meshes, warnings
+
+
+def _listed(counts) -> str:
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 
 class _Place:
@@ -89,6 +107,7 @@ class _Place:
         name: The same, with the number of the instance if a point instancer places it.
         instance: That instance, else None.
         binding: Its binding, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
+        group: The same for all instances of a prim that one instancer places.
     """
 
     def __init__(self, prim, instance: Instance | None, binding: tuple | None):
@@ -97,10 +116,11 @@ class _Place:
         self.name = instance.name_of(prim.GetPath()) if instance else self.path
         self.instance = instance
         self.binding = binding
+        self.group = (id(instance.instancer), self.path) if instance else ()
 
-    @property
+    @cached_property
     def purpose(self) -> str:
-        return str(UsdGeom.Mesh(self.prim).ComputePurpose())
+        return str(UsdGeom.Imageable(self.prim).ComputePurpose())
 
     @property
     def is_bound_in_vain(self) -> bool:
@@ -128,7 +148,7 @@ class _Finder:
             elif prim.IsA(UsdSkel.Root):
                 if not self._find_bindings(prim):
                     prims.PruneChildren()
-            elif prim.IsA(UsdGeom.Mesh):
+            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim):
                 self.places.append(_Place(prim, instance, self._bindings.get(prim.GetPath())))
             elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
                 self.other[prim.GetTypeName()] += 1
@@ -153,7 +173,9 @@ class UsdMesh:
     Attributes:
         path: The prim's path.
         name: The same, with the number of the instance if a point instancer places it.
+        group: The same for all instances of a prim that one instancer places; empty if none places it.
         display_name: Display name in the file, empty if there is none.
+        shape: Type of the prim if it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`; empty for a mesh.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
             is invisible, not there or empty, else a digest of its topology.
@@ -174,41 +196,85 @@ class UsdMesh:
             UnreadableError: If an attribute has a value that a mesh cannot have.
         """
         prim, instance = place.prim, place.instance
-        self.path, self.name = place.path, place.name
+        self._file = file
+        self.path = place.path
         self.display_name = prim.GetDisplayName()
-        self._where = f"{file}: {self.name}"
-        self._mesh = mesh = UsdGeom.Mesh(prim)
-        self._instance = instance
+        self.shape = "" if prim.IsA(UsdGeom.Mesh) else str(prim.GetTypeName())
+        self._prim = prim
+        self._polygons: Polygons = MeshPolygons(prim) if prim.IsA(UsdGeom.Mesh) else ShapePolygons(prim)
         self._skin = skin = Skin(*place.binding, where=f"{file}: {self.path}") if place.binding else None
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
-        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that count as that one
+        self._where = f"{file}: {place.name}"
+        instancer = instance.instancer if instance else None
+        self.group = (id(instancer), self.path) if instancer else ()
+        self._last_points: dict[tuple, np.ndarray] = {}  # shared by all instances, as are the next ones
+        self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
-        breaks = visibility_times(prim, self._root) | sample_times(
-            mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
+        breaks = visibility_times(prim, self._root) | sample_times(*self._polygons.topology_attributes)
+        if instancer:
+            breaks |= instancer.break_times
+        self._breaks = (-math.inf, *sorted(breaks))
+        self._break_codes = tuple(
+            Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
-        self.states = self._find_states(breaks | (instance.break_times if instance else set()))
-        self.times = sample_times(mesh.GetPointsAttr()) | (skin.times if skin else set())
-        self.deforms = bool(self.times)
-        self.turns = bool(skin and skin.times)
-        self.may_jump = any(attribute.HasSpline() for attribute in transform_attributes(self._frame, self._root))
+        self._states = [self._topology_digest(code) if self._is_present(code) else None for code in self._break_codes]
+        self._deformed_times = frozenset(
+            sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
+        )
+        self.deforms = bool(self._deformed_times)
+        self.may_jump = (
+            may_jump(transform_attributes(self._frame, self._root))
+            or self._polygons.may_jump
+            or bool(instancer and instancer.may_jump)
+            or bool(skin and skin.may_jump)
+        )
 
-        placed = sorted(transform_times(self._frame, self._root) | (instance.times if instance else set()))
+        self._transform_times = sorted(
+            transform_times(self._frame, self._root) | (instancer.times if instancer else set())
+        )
         # Between samples as well, because a whole turn ends where it began.
-        between = [start + _BETWEEN * (end - start) for start, end in pairwise(placed)]
-        codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*placed, *between]))]
-        # None where an instance is not there.
-        transforms = (transform for code in codes if (transform := self._find_transform(code)) is not None)
-        first = next(transforms, np.eye(4))
-        self.is_placed = np.array_equal(first, np.eye(4))
+        between = [start + _BETWEEN * (end - start) for start, end in pairwise(self._transform_times)]
+        codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*self._transform_times, *between]))]
+        first = self._read_transforms(instance, codes[0]).copy()
         # Some writers sample a transform at every time although it never changes.
-        self._placed_times = []
-        if any(not np.array_equal(transform, first) for transform in transforms):
-            self._placed_times = placed
-            self.times.update(placed)
-            self.turns = True
-            self.is_placed = False
+        self._moved = np.zeros(len(first), dtype=bool)
+        for code in codes[1:]:
+            transforms = self._read_transforms(instance, code)
+            there = ~np.isnan(transforms[:, 0, 0])  # other instances are not there
+            seen = ~np.isnan(first[:, 0, 0])
+            self._moved |= there & seen & (transforms != first).any(axis=(1, 2))
+            first[there & ~seen] = transforms[there & ~seen]
+        self._stays = np.isnan(first[:, 0, 0]) | (first == np.eye(4)).all(axis=(1, 2))
+        self._bent: dict[tuple[float, float], np.ndarray] = {}
+        self._place(place)
+
+    def again(self, place: _Place) -> "UsdMesh":
+        """Returns another instance of the same prim, placed by the same instancer."""
+        mesh = copy.copy(self)
+        mesh._place(place)
+        return mesh
+
+    def _place(self, place: _Place) -> None:
+        """Sets what differs between instances."""
+        self.name = place.name
+        self._where = f"{self._file}: {self.name}"
+        self._instance = instance = place.instance
+        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that count as that one
+        states = self._states
+        if instance:
+            present = instance.are_present(self._break_codes)
+            states = [state if here else None for state, here in zip(states, present.tolist(), strict=True)]
+        self.states: dict[float, bytes | None] = {}
+        last = b""
+        for time, state in zip(self._breaks, states, strict=True):
+            if state != last:
+                self.states[time] = last = state
+        self.is_placed = bool(self._stays[self.index]) and not self._moved[self.index]
+        self._placed_times = self._transform_times if self._moved[self.index] else []
+        self.times = self._deformed_times | set(self._placed_times)
+        self.turns = bool(self._placed_times) or bool(self._skin and self._skin.times)
 
     def turning_times(self, start: float, end: float) -> set[float]:
         """Returns the whole time codes between samples at which the mesh is off the straight way between them.
@@ -242,6 +308,8 @@ class UsdMesh:
         Args:
             scene_times: The scene's time for each time found in any mesh.
         """
+        if all(time == merged for time, merged in scene_times.items()):
+            return
         for time in sorted({*self.times, *self.states} - {-math.inf}):
             first, _ = self._own_times.get(scene_times[time], (time, time))
             self._own_times[scene_times[time]] = first, time
@@ -265,9 +333,12 @@ class UsdMesh:
         """
         with reading(self._where, self, time):
             code = self._time_code(time, before)
-            attribute = self._mesh.GetPointsAttr()
+            key = code.GetValue(), code.IsPreTime(), before and time not in self.states
+            if key in self._last_points:
+                return self._last_points[key]
             # Where the topology stays, a changed number of points is an error, which the moment before would hide.
-            points = attribute.Get(Usd.TimeCode(code.GetValue()) if before and time not in self.states else code)
+            at_time = before and time not in self.states
+            points = self._polygons.read_points(Usd.TimeCode(code.GetValue()) if at_time else code)
             if _is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
             if self._skin:
@@ -275,6 +346,9 @@ class UsdMesh:
             array = np.array(points)
             if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
                 raise UnreadableError(f"{self._where}: its points are no points, but {type(points).__name__}")
+            if self.group:
+                self._last_points.clear()
+                self._last_points[key] = array
             return array
 
     def read_positions(
@@ -313,6 +387,30 @@ class UsdMesh:
                 )
             return positions
 
+    def read_instances(self, time: float, instances: np.ndarray, *, before: bool = False) -> np.ndarray:
+        """Reads the positions of all points in several instances of the same :attr:`group` in world space, float64.
+
+        Args:
+            time: Time code.
+            instances: Numbers of the instances, shape [n].
+            before: As of :meth:`read_positions`.
+
+        Returns:
+            Positions, shape [n, point_count, 3]; not finite where an instance is broken or not there.
+
+        Raises:
+            UnreadableError: If the points cannot be read.
+        """
+        points = self.read_points(time, before=before).astype(np.float64)
+        with reading(self._where, self, time):
+            transforms = self._read_transforms(self._instance, self._time_code(time, before))[instances]
+            return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
+
+    @property
+    def index(self) -> int:
+        """Number of the instance, 0 for a mesh that no instancer places."""
+        return self._instance.index if self._instance else 0
+
     def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """Reads the polygons that are no holes, as triangles that turn counterclockwise seen from outside.
 
@@ -328,40 +426,51 @@ class UsdMesh:
             UnreadableError: If the faces are broken, or there are none.
         """
         with reading(self._where, self, time):
-            counts, indices, holes = self._read_topology(self._time_code(time, False))
-            if counts.size == 0:
-                raise UnreadableError(f"{self._where}: the mesh has no faces")
-            if counts.min() < 3:
-                face = int(np.argmin(counts))
-                raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
-            if counts.sum() != indices.size:
-                raise UnreadableError(
-                    f"{self._where}: faceVertexCounts add up to {counts.sum()}, "
-                    f"but there are {indices.size} faceVertexIndices"
-                )
-            outside = (indices < 0) | (indices >= len(points))
-            if outside.any():
-                corner = int(np.argmax(outside))
-                face = int(np.searchsorted(np.cumsum(counts), corner, side="right"))
-                raise UnreadableError(
-                    f"{self._where}: face {face} refers to vertex {indices[corner]}, "
-                    f"but the mesh has {len(points)} points"
-                )
+            is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
+            code = self._time_code(time, False)
+            if not self.group:
+                return self._find_triangles(code, points, is_mirrored)
+            if any(value != code.GetValue() for value, _ in self._last_triangles):
+                self._last_triangles.clear()
+            key = code.GetValue(), is_mirrored
+            if key not in self._last_triangles:
+                self._last_triangles[key] = self._find_triangles(code, points, is_mirrored)
+            return self._last_triangles[key]
 
-            triangles, polygons = triangulate(counts, indices, points)
-            solid = ~np.isin(polygons, holes)
-            if not solid.any():
-                raise UnreadableError(f"{self._where}: all faces of the mesh are holes")
-            is_left_handed = self._mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-            is_mirrored = np.linalg.det(self._transform(time)[:3, :3]) < 0
-            if is_left_handed != is_mirrored:
-                triangles = triangles[:, ::-1]
-            return triangles[solid], polygons[solid], len(counts)
+    def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
+        counts, indices, holes = self._read_topology(code)
+        if counts.size == 0:
+            raise UnreadableError(f"{self._where}: the mesh has no faces")
+        if counts.min() < 3:
+            face = int(np.argmin(counts))
+            raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
+        if counts.sum() != indices.size:
+            raise UnreadableError(
+                f"{self._where}: faceVertexCounts add up to {counts.sum()}, "
+                f"but there are {indices.size} faceVertexIndices"
+            )
+        outside = (indices < 0) | (indices >= len(points))
+        if outside.any():
+            corner = int(np.argmax(outside))
+            face = int(np.searchsorted(np.cumsum(counts), corner, side="right"))
+            raise UnreadableError(
+                f"{self._where}: face {face} refers to vertex {indices[corner]}, but the mesh has {len(points)} points"
+            )
+
+        triangles, polygons = triangulate(counts, indices, points)
+        solid = ~np.isin(polygons, holes)
+        if not solid.any():
+            raise UnreadableError(f"{self._where}: all faces of the mesh are holes")
+        is_left_handed = UsdGeom.Gprim(self._prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        if is_left_handed != is_mirrored:
+            triangles = triangles[:, ::-1]
+        return triangles[solid], polygons[solid], len(counts)
 
     def _time_code(self, time, before) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
-        return as_time_code(first if before else last, before=before)
+        # Reading the moment before a time takes twice as long: USD interpolates from the sample before.
+        return as_time_code(first if before else last, before=before and (self.may_jump or time in self.states))
 
     def _transform(self, time, *, before=False) -> np.ndarray:
         """Returns the matrix that takes points, as rows, to world space, shape [4, 4]."""
@@ -372,54 +481,45 @@ class UsdMesh:
 
     def _bends(self, start, end) -> bool:
         """Returns whether the transform leaves the straight way from one sample to the next."""
-        codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
-        first, between, last = (self._find_transform(code) for code in codes)
-        if first is None or between is None or last is None:
-            return False
-        straight = first + _BETWEEN * (last - first)
-        return any(
-            np.abs(between[rows] - straight[rows]).max() > _ROUNDING * np.abs([first[rows], last[rows]]).max()
-            for rows in (slice(0, 3), slice(3, 4))
-        )
+        if (start, end) not in self._bent:
+            codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
+            first, between, last = (self._read_transforms(self._instance, code) for code in codes)
+            off = np.abs(between - (first + _BETWEEN * (last - first)))
+            size = np.maximum(np.abs(first), np.abs(last))
+            self._bent[start, end] = np.zeros(len(first), dtype=bool)
+            for rows in (slice(0, 3), slice(3, 4)):
+                self._bent[start, end] |= off[:, rows].max(axis=(1, 2)) > _ROUNDING * size[:, rows].max(axis=(1, 2))
+        return bool(self._bent[start, end][self.index])
 
     def _find_transform(self, time) -> np.ndarray | None:
         if not self._instance:
-            return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
-        transform = self._instance.transform(self._frame, time)
-        return None if transform is None else np.array(transform)
+            return self._read_transforms(None, time)[0]
+        return self._instance.transform(self._frame, time)
+
+    def _read_transforms(self, instance, time) -> np.ndarray:
+        """Returns the matrices of all instances that one instancer places, or of the only mesh, shape [n, 4, 4]."""
+        if instance:
+            return instance.instancer.transforms(self._frame, instance.root, time)
+        return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))[None]
 
     def _read_topology(self, time) -> list[np.ndarray]:
         """Reads counts, indices and holes at a time."""
-        mesh = self._mesh
-        attributes = mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetHoleIndicesAttr()
-        return [self._read_integers(attribute, time) for attribute in attributes]
+        names = "faceVertexCounts", "faceVertexIndices", "holeIndices"
+        values = self._polygons.read_topology(time)
+        return [self._as_integers(name, value) for name, value in zip(names, values, strict=True)]
 
-    def _read_integers(self, attribute, time) -> np.ndarray:
-        value = attribute.Get(time)
+    def _as_integers(self, name, value) -> np.ndarray:
         array = np.array(Vt.IntArray() if value is None else value)
         if array.ndim != 1 or array.dtype.kind not in "iu":
-            raise UnreadableError(f"{self._where}: {attribute.GetName()} is no list of integers")
+            raise UnreadableError(f"{self._where}: {name} is no list of integers")
         return array.astype(np.int64)
 
-    def _find_states(self, times) -> dict[float, bytes | None]:
-        states, last = {}, b""
-        for time in [-math.inf, *sorted(times)]:
-            code = Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time)
-            state = self._topology_digest(code) if self._is_present(code) else None
-            if state != last:
-                states[time] = last = state
-        return states
-
     def _is_present(self, time) -> bool:
-        """Returns whether the mesh is there, visible and not empty."""
-        if not is_shown(self._mesh.GetPrim(), self._root, time):
-            return False
-        if self._instance and not self._instance.is_present(time):
+        """Returns whether the prim is visible and not empty, wherever it is placed."""
+        if not is_shown(self._prim, self._root, time):
             return False
         # A mesh may be empty for some time, as where a fluid has not begun to flow.
-        values = [
-            attribute.Get(time) for attribute in (self._mesh.GetPointsAttr(), self._mesh.GetFaceVertexCountsAttr())
-        ]
+        values = self._polygons.read_points(time), self._polygons.read_topology(time)[0]
         return not all(value is not None and _is_empty(value) for value in values)
 
     def _topology_digest(self, time) -> bytes:

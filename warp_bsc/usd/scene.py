@@ -3,10 +3,10 @@
 What is read
 ------------
 Every ``UsdGeom.Mesh`` that is loaded and selected is read, wherever references, payloads, variants, native instances
-and point instancers put it. All meshes are merged to one list of vertices and one of faces, so that collisions of a
-mesh with itself and with others are found alike. A mesh with a subdivision scheme is read as its control cage. Polygons
-are cut into triangles once; holes and points that no face refers to are left out. Blend shapes and joints move the
-points as UsdSkel computes them.
+and point instancers put it. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra. All meshes are
+merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
+alike. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once; holes and
+points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel computes them.
 
 Vertices that are in one place at every time are welded to one. The two sides of a seam are an example, or a cloth that
 was written as one mesh for each of its colours: unwelded, they would touch all the time.
@@ -35,9 +35,10 @@ stored ones, in single precision; otherwise all are computed and returned in dou
 What cannot be read
 -------------------
 Broken meshes and instances, and files that cannot be opened, are left out from the time on at which they are broken,
-and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves.
+and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
+moves is read at one time.
 
-:attr:`Scene.warnings` names the contents that this module does not read (spheres and other shapes that are not meshes,
+:attr:`Scene.warnings` names the contents that this module does not read (curves and other shapes without polygons,
 unselected meshes) and the changes that it makes to the motion.
 """
 
@@ -46,7 +47,7 @@ unselected meshes) and the changes that it makes to the motion.
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -129,7 +130,8 @@ class Scene:
         selection: Which of its meshes are checked.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
-        times: Time codes between which motion is straight, ascending, at least two.
+        times: Time codes between which motion is straight, ascending, at least two. If nothing moves, appears or
+            vanishes, it is one time code, twice: one interval without motion.
         time_codes_per_second: Number of time codes in a second.
         meters_per_unit: The scene's unit of length [m].
         up_axis: "Y" or "Z".
@@ -153,6 +155,7 @@ class Scene:
         subdivide: int = 1,
         sample_turns: bool = True,
         strict: bool = False,
+        progress: Callable[[int, int], None] | None = None,
     ):
         """Opens the file and finds its meshes.
 
@@ -164,12 +167,13 @@ class Scene:
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
+            progress: Called while vertices are welded, which reads the scene once: with the number of its times that
+                have been compared, and of all.
 
         Raises:
             FileNotFoundError: If there is no such file.
-            ValueError: If the file is not USD, has no mesh that can be read or none that moves, or a selection selects
-                nothing; if ``strict``, also if a part cannot be read. The message names the file, the prim and the
-                time.
+            ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
+                ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
@@ -203,7 +207,7 @@ class Scene:
             self._last = None  # index, segment and positions of the last interval that was read
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
-            segment = self._segment_at(0)
+            segment = self._segment_at(0, progress)
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
         self.names = [mesh.name for mesh in read]
@@ -227,6 +231,11 @@ class Scene:
         if self._welded:
             warnings.append(f"vertices in one place at all times were welded: {self._welded}")
         return warnings
+
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing moves, appears or vanishes."""
+        return self.times[0] == self.times[-1]
 
     def __len__(self) -> int:
         """Returns the number of intervals, at least 1."""
@@ -254,7 +263,10 @@ class Scene:
             while True:
                 segment = self._segment_at(index)
                 try:
-                    x0, x1 = segment.positions(start), segment.positions(end, before=True)
+                    last = self._last
+                    known = last[3] if last and last[:2] == (index - 1, segment) else None
+                    x0 = segment.positions(start, last=known)
+                    x1 = segment.positions(end, before=True)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
@@ -269,19 +281,21 @@ class Scene:
         return Interval(index, start, end, segment, x0, x1, jumps, tuple(warnings))
 
     def _check_meshes(self, is_selection):
-        """Raises a ValueError if there are no meshes, or none moves."""
+        """Raises a ValueError if there are no meshes."""
         reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
         if not self._usd_meshes:
             none_selected = ", or none is selected" * is_selection
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
-        if not any(mesh.times for mesh in self._usd_meshes):
-            raise ValueError(
-                f"{self.path}: nothing moves: no mesh has points or a transform that change with time{reason}"
-            )
 
     def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
         """Sets :attr:`times`. Returns those at which meshes change their topology, appear or vanish."""
         own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
+        if not any(mesh.times for mesh in self._usd_meshes):
+            own.add(self.stage.GetStartTimeCode())  # what appears and vanishes does so between moments at rest
+        if len(own) == 1:
+            self.times = [*own, *own]
+            self._warnings.append(f"nothing moves: checked at rest, at time {self.times[0]:g}")
+            return set()
         whole = set()
         if sample_turns and frames.step is None:
             low, high = frames.bounds(sorted(own))
@@ -302,7 +316,7 @@ class Scene:
             ] + self.times[-1:]
         return changes
 
-    def _segment_at(self, index) -> Segment:
+    def _segment_at(self, index, progress=None) -> Segment:
         """Returns the segment that an interval is in: the one in memory if possible."""
         while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
             span = next(span for span in self._spans if span[0] <= index < span[1])
@@ -310,7 +324,7 @@ class Scene:
             present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
             self._segment = self._span = self._last = None  # before the next is read, to free memory
             try:
-                self._segment = Segment(present, self.times[start : stop + 1], self.dtype)
+                self._segment = Segment(present, self.times[start : stop + 1], self.dtype, progress)
             except self._unreadable as error:
                 self._leave_out(error, start)
             else:
@@ -335,7 +349,7 @@ class Scene:
     def _find_jumps(self, index, segment, start, end) -> tuple[str, ...]:
         """Returns the names of the meshes that do not start an interval where they ended the one before."""
         last, self._last = self._last, (index, segment, start, end)
-        if last is None or last[:2] != (index - 1, segment) or np.array_equal(start, last[3]):
+        if last is None or last[:2] != (index - 1, segment) or start is last[3] or np.array_equal(start, last[3]):
             return ()
         _, _, last_start, last_end = last
         gaps = np.abs(start - last_end).max(axis=1)

@@ -1,5 +1,6 @@
 """A stretch of a scene's time over which the same meshes are there and keep their topology."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -57,13 +58,20 @@ class Segment:
     meshes: list[SceneMesh]
     faces: np.ndarray
 
-    def __init__(self, usd_meshes: "list[UsdMesh]", times: list[float], dtype: np.dtype):
+    def __init__(
+        self,
+        usd_meshes: "list[UsdMesh]",
+        times: list[float],
+        dtype: np.dtype,
+        progress: Callable[[int, int], None] | None = None,
+    ):
         """Reads the topology and welds vertices.
 
         Args:
             usd_meshes: The meshes.
             times: The segment's times, its first and its last included.
             dtype: Type of the positions.
+            progress: Called with the number of times at which vertices have been compared, and of all.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -72,11 +80,17 @@ class Segment:
         self.dtype = dtype
         self.meshes, faces = [], []
         vertex_count = face_count = 0
+        compact: dict[int, tuple] = {}  # triangles that instances share, and what is made of them, by their identity
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
             triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
-            used, corners = np.unique(triangles, return_inverse=True)
-            faces.append(corners.reshape(-1, 3) + vertex_count)
+            if id(triangles) not in compact:
+                used, corners = np.unique(triangles, return_inverse=True)
+                compact[id(triangles)] = used, corners.reshape(-1, 3), triangles
+            used, corners, _ = compact[id(triangles)]
+            if not mesh.group:
+                compact.clear()
+            faces.append(corners + vertex_count)
             self.meshes.append(
                 SceneMesh(
                     path=mesh.path,
@@ -99,32 +113,41 @@ class Segment:
         self._corners = np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64)
 
         self._start = np.zeros((vertex_count, 3), dtype)
-        for number, mesh in enumerate(self.meshes):
-            self._start[mesh.vertices] = self._read_positions(number, times[0], False)
-        self._welded_to = self._find_welds(times)
+        everything = np.arange(vertex_count)
+        self._reader(everything, range(len(self.meshes))).read(self._start, times[0], False)
+        self._welded_to = self._find_welds(times, progress)
         self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
         self.faces = corners.reshape(-1, 3).astype(np.int32)
         self.vertex_count = len(self._kept)
         self.welded = vertex_count - self.vertex_count
+        self._start = self._start[self._kept]
+        moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
+        jumping = [number for number in moving if usd_meshes[number].may_jump]
+        self._moving = self._reader(self._kept, moving)
+        self._jumping = self._reader(self._kept, jumping) if jumping else None
 
-    def positions(self, time: float, *, before: bool = False) -> np.ndarray:
+    def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
         """Reads the positions of all vertices in world space.
 
         Args:
             time: Time code.
             before: Whether to read the moment just before that time, which differs where a mesh jumps at it.
+            last: Positions just before that time, if they are known: only meshes that may jump are read again.
 
         Returns:
-            Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`.
+            Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`; ``last`` itself if
+            no mesh may jump.
 
         Raises:
             UnreadableError: If a mesh has another number of points than at first, or a coordinate is not finite.
         """
-        positions = self._start.copy()
-        for number, mesh in enumerate(self.meshes):
-            if mesh.moves:
-                positions[mesh.vertices] = self._read_positions(number, time, before)
-        return positions[self._kept]
+        if last is not None and not self._jumping:
+            return last
+        reader = self._moving if last is None else self._jumping
+        assert reader
+        positions = (self._start if last is None else last).copy()
+        reader.read(positions, time, before)
+        return positions
 
     @property
     def vertex_meshes(self) -> np.ndarray:
@@ -145,10 +168,8 @@ class Segment:
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all meshes that have each edge, shape [n, 2], smaller vertex first: rows, and the meshes."""
-        keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
-        return rows, np.searchsorted(self._face_ends, sides[places] // 3, side="right")
+        rows, faces = self.faces_of_edges(ends)
+        return rows, np.searchsorted(self._face_ends, faces, side="right")
 
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
@@ -191,6 +212,32 @@ class Segment:
         marked[vertices] = True
         return np.flatnonzero(marked[self.faces].any(axis=1))
 
+    def faces_of_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all faces that have each edge, shape [n, 2], smaller vertex first, as a side: rows, and the faces."""
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
+        return rows, sides[places] // 3
+
+    def are_stiff(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+        """Returns which elements are paired with their own mesh, and that mesh moves and does not deform.
+
+        Vertices and edges may be welded to those of other meshes: they belong to all of these.
+
+        Args:
+            elements: Vertices, shape [n], or edges, shape [n, 2], smaller vertex first.
+            meshes: The other element's mesh, shape [n].
+
+        Returns:
+            Whether the other mesh is one of the element's, and stiff, bool, shape [n].
+        """
+        stiff = np.array([mesh.moves and not mesh.deforms for mesh in self.meshes], dtype=bool)
+        are_stiff = np.zeros(len(elements), dtype=bool)
+        if stiff.any():
+            rows, own = self.meshes_at_vertices(elements) if elements.ndim == 1 else self.meshes_at_edges(elements)
+            are_stiff[rows[stiff[own] & (own == meshes[rows])]] = True
+        return are_stiff
+
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
@@ -226,34 +273,102 @@ class Segment:
             points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
         return meshes, points
 
-    def _read_positions(self, number, time, before) -> np.ndarray:
-        mesh = self.meshes[number]
-        return self._usd_meshes[number].read_positions(
-            time, before=before, used=mesh.points, point_count=mesh.point_count, dtype=self.dtype
-        )
+    def _reader(self, vertices, numbers) -> "_Reader":
+        """Returns a reader of some vertices, ascending among the unwelded ones, in the meshes of some numbers."""
+        ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
+        parts = []
+        for number in numbers:
+            mesh, rows = self.meshes[number], slice(ends[number], ends[number + 1])
+            points = mesh.points[vertices[rows] - mesh.vertices.start]
+            parts.append((self._usd_meshes[number], mesh.point_count, rows, points))
+        return _Reader(parts, self.dtype)
 
-    def _find_welds(self, times) -> np.ndarray:
+    def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
-        _, places, counts = np.unique(self._start, axis=0, return_inverse=True, return_counts=True)
-        places = places.reshape(-1)  # NumPy 2.0 shapes it otherwise
-        (crowded,) = np.nonzero(counts[places] > 1)
-        welded_to = np.arange(len(places))
-        if len(crowded):
-            groups = places[crowded]
-            owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right"))
-            moving = [number for number in owners if self.meshes[number].moves]
-            jumping = {number for number in moving if self._usd_meshes[number].may_jump}
-            moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
-            positions = self._start.copy()
-            for time, before in [*moments, (times[-1], True)] if moving else ():
-                for number in moving:
-                    vertices = self.meshes[number].vertices
-                    positions[vertices] = self._read_positions(number, time, before)
-                motion = np.column_stack([groups, positions[crowded]])
-                groups = np.unique(motion, axis=0, return_inverse=True)[1].reshape(-1)
-            _, firsts, groups = np.unique(groups, return_index=True, return_inverse=True)
-            welded_to[crowded] = crowded[firsts[groups]]
+        welded_to = _split(_group(self._start), self._start)
+        (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
+        owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
+        moving = [number for number in owners if self.meshes[number].moves]
+        if not moving:
+            return welded_to
+        jumping = any(self._usd_meshes[number].may_jump for number in moving)
+        moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
+        moments.append((times[-1], True))
+        reader = self._reader(crowded, moving)
+        positions = self._start[crowded]
+        groups = np.searchsorted(crowded, welded_to[crowded])
+        for done, (time, before) in enumerate(moments):
+            if progress:
+                progress(done, len(moments))
+            reader.read(positions, time, before)
+            groups = _split(groups, positions)
+        welded_to[crowded] = crowded[groups]
         return welded_to
+
+
+class _Reader:
+    """Reads positions of some vertices; those of instances of one prim together."""
+
+    def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
+        """Takes for each mesh the number of its points, the rows of its vertices in the result, and their points."""
+        self._dtype = dtype
+        groups: dict[tuple, list] = {}
+        self._single = []
+        for part in parts:
+            (groups.setdefault(part[0].group, []) if part[0].group else self._single).append(part)
+        self._groups = []
+        for members in groups.values():
+            instances = np.array([mesh.index for mesh, *_ in members])
+            rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
+            taken = np.concatenate([place * count + points for place, (_, count, _, points) in enumerate(members)])
+            self._groups.append((members, instances, rows, taken))
+
+    def read(self, positions: np.ndarray, time: float, before: bool) -> None:
+        """Writes the positions at a time, or just before it, to the rows of the meshes.
+
+        Raises:
+            UnreadableError: If a mesh is broken at that time.
+        """
+        singles = list(self._single)
+        for members, instances, rows, taken in self._groups:
+            first, count, *_ = members[0]
+            together = first.read_instances(time, instances, before=before)
+            found = together.reshape(-1, 3)[taken] if together.shape[1] == count else np.full((1, 3), np.nan)
+            if np.isfinite(found).all():
+                positions[rows] = found
+            else:
+                singles += members  # one of them is broken, and says so
+        for mesh, count, rows, points in singles:
+            positions[rows] = mesh.read_positions(
+                time, before=before, used=points, point_count=count, dtype=self._dtype
+            )
+
+
+def _group(positions) -> np.ndarray:
+    """Returns for each position the first one with the same hash, shape [n]."""
+    bits = (positions + positions.dtype.type(0.0)).view(f"u{positions.itemsize}").astype(np.uint64)  # no -0.0
+    hashes = np.zeros(len(positions), dtype=np.uint64)
+    for column in bits.T:
+        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        hashes ^= hashes >> np.uint64(29)
+    _, firsts, numbers = np.unique(hashes, return_index=True, return_inverse=True)
+    return firsts[numbers]
+
+
+def _split(groups, positions) -> np.ndarray:
+    """Splits groups by position: returns for each vertex the first of its group that is in the same place, shape [n].
+
+    Args:
+        groups: The first vertex of each vertex's group, shape [n].
+        positions: Positions of the vertices, shape [n, 3].
+    """
+    (rows,) = np.nonzero((positions != positions[groups]).any(axis=1))
+    if len(rows):
+        keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
+        _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        groups = groups.copy()
+        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
+    return groups
 
 
 def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:

@@ -38,6 +38,8 @@ class Selection:
         self_collisions: Whether a mesh is checked with itself.
         between: Two patterns: only pairs of a mesh of the first and a mesh of the second are checked.
         purposes: Purposes of the meshes that are checked.
+        ignore: Pairs of patterns: pairs of a mesh of the first and a mesh of the second are not checked.
+        ignored_names: Pairs of names of meshes that are not checked with each other, each pair sorted.
     """
 
     prims: tuple[str, ...] = ()
@@ -45,6 +47,8 @@ class Selection:
     self_collisions: bool = True
     between: tuple[str, str] | None = None
     purposes: tuple[str, ...] = ("default", "render")
+    ignore: tuple[tuple[str, str], ...] = ()
+    ignored_names: frozenset[tuple[str, str]] = frozenset()
 
     def includes(self, mesh: NamedMesh) -> bool:
         """Returns whether a mesh is checked at all, whatever its purpose."""
@@ -66,8 +70,25 @@ class Selection:
                 if not any(_matches(mesh, pattern) for mesh in meshes):
                     raise ValueError(f"{option} {pattern}: there is no such mesh")
 
+    def unmatched(self, meshes: Sequence[NamedMesh]) -> list[tuple[str, str]]:
+        """Returns the pairs to ignore of which a pattern matches none of all meshes."""
+        return [pair for pair in self.ignore if not all(any(_matches(m, pattern) for m in meshes) for pattern in pair)]
+
+    def ignored_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
+        """Returns which pairs of meshes are to be ignored, with arguments as of :meth:`counted_pairs`."""
+        if not (self.ignore or self.ignored_names) or not len(pairs):
+            return np.zeros(len(pairs), dtype=bool)
+        keys, rows = np.unique(np.sort(pairs, axis=1) @ np.array([len(meshes), 1]), return_inverse=True)
+        return np.array([self._ignores(meshes[key // len(meshes)], meshes[key % len(meshes)]) for key in keys])[rows]
+
+    def _ignores(self, a: NamedMesh, b: NamedMesh) -> bool:
+        return tuple(sorted([a.name, b.name])) in self.ignored_names or any(
+            (_matches(a, first) and _matches(b, second)) or (_matches(b, first) and _matches(a, second))
+            for first, second in self.ignore
+        )
+
     def counted_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
-        """Returns which pairs of meshes are checked.
+        """Returns which pairs of meshes are checked, those to be ignored included.
 
         Args:
             meshes: The meshes.

@@ -5,7 +5,7 @@
 
 from pxr import Sdf, Usd, UsdSkel, Vt
 
-from .stage import UnreadableError, sample_times
+from .stage import UnreadableError, may_jump, sample_times
 
 __all__ = ["Skin", "find_bindings"]
 
@@ -16,6 +16,7 @@ class Skin:
     Attributes:
         skeleton: The prim in whose space the joints put the points, None if only blend shapes deform the mesh.
         times: Time codes at which the animation has a sample.
+        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class Skin:
         # The query's own prim is that of the prototype if the skeleton is in an instance.
         self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
         self.times = set()
+        animated = list(self._animation.GetPrim().GetAttributes()) if self._animation else []
         if self._animation:
             if self.skeleton:
                 self._add_times(self._animation.GetJointTransformTimeSamples())
@@ -44,9 +46,10 @@ class Skin:
                 self._add_times(self._animation.GetBlendShapeWeightTimeSamples())
         if self.skeleton:
             binding = UsdSkel.BindingAPI(prim)
-            self.times |= sample_times(
-                binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr(), binding.GetGeomBindTransformAttr()
-            )
+            bound = binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr(), binding.GetGeomBindTransformAttr()
+            self.times |= sample_times(*bound)
+            animated += bound
+        self.may_jump = may_jump(animated)
 
     def deform(self, points: Vt.Vec3fArray, time: Usd.TimeCode) -> None:
         """Deforms points in place.

@@ -6,7 +6,7 @@
 import contextlib
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,16 @@ from pxr import Ar, Gf, Tf, Ts, Usd, UsdUtils
 if TYPE_CHECKING:
     from .meshes import UsdMesh
 
-__all__ = ["LeftOut", "UnreadableError", "as_time_code", "collecting", "open_stage", "reading", "sample_times"]
+__all__ = [
+    "LeftOut",
+    "UnreadableError",
+    "as_time_code",
+    "collecting",
+    "may_jump",
+    "open_stage",
+    "reading",
+    "sample_times",
+]
 
 _DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
 _STILL = (Ts.ExtrapHeld, Ts.ExtrapValueBlock)
@@ -158,6 +167,24 @@ def sample_times(*attributes: Usd.Attribute) -> set[float]:
         if len(own) > 1:
             times.update(own)
     return times
+
+
+def may_jump(attributes: Iterable[Usd.Attribute]) -> bool:
+    """Returns whether attributes may have another value just before a time than at that time.
+
+    Between samples USD interpolates numbers and vectors, which joins the two. It does not interpolate splines that say
+    so, values from one clip to the next, and lists of which the lengths differ.
+    """
+    for attribute in attributes:
+        if not attribute or not attribute.ValueMightBeTimeVarying():
+            continue
+        if attribute.HasSpline() or attribute.GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips:
+            return True
+        if attribute.GetTypeName().isArray:
+            values = (attribute.Get(time) for time in attribute.GetTimeSamples())
+            if len({None if value is None else len(value) for value in values}) > 1:
+                return True
+    return False
 
 
 def as_time_code(time: float, *, before: bool) -> Usd.TimeCode:

@@ -1,0 +1,165 @@
+"""The edges that meet faces at one time of a scene, and the curves along which its surfaces cut each other."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ..detection.intersections import Intersections
+from ..detection.mesh import CollisionMesh
+from ..usd.segment import Segment
+from ..usd.selection import Selection
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, ScenePairs
+
+__all__ = ["Cuts", "SceneIntersections", "name_intersections"]
+
+
+class Cuts(NamedTuple):
+    """The segments in which two triangles meet each other, each once: together the curves where surfaces cut.
+
+    Attributes:
+        points: Their ends, in world space and the scene's unit of length, shape [m, 2, 3].
+        meshes: The two meshes, indices in ``segment.meshes``, shape [m, 2].
+        faces: The two triangles, faces of the segment, the smaller first, shape [m, 2].
+    """
+
+    points: np.ndarray
+    meshes: np.ndarray
+    faces: np.ndarray
+
+
+@dataclass(frozen=True)
+class SceneIntersections(ScenePairs):
+    """The edges that meet faces at one time of a scene: the first element is the edge, the second the face.
+
+    Attributes:
+        time: Time code.
+        crosses: Whether the edge passes through the face; other edges only touch theirs. Bool, shape [n].
+        x: Positions of all vertices at that time, shape [vertex_count, 3].
+    """
+
+    time: float
+    crosses: np.ndarray
+    x: np.ndarray = field(repr=False)
+
+    @property
+    def crossings(self) -> int:
+        """Number of edges that pass through faces."""
+        return int(self.crosses.sum())
+
+    @property
+    def touches(self) -> int:
+        """Number of edges that only touch faces."""
+        return len(self) - self.crossings
+
+    @cached_property
+    def cuts(self) -> Cuts:
+        """The segments in which triangles cut each other, computed in floating point from the exact pairs.
+
+        Two triangles of which an edge passes through the other meet in a segment. Its ends are where edges of one meet
+        the other, or the corner that both share.
+        """
+        segment = self.segment
+        rows, sides = segment.faces_of_edges(self.vertices[:, 0])
+        faces = np.sort(np.stack([sides, self.faces[rows, 1]], axis=1), axis=1)
+        first, second = faces.T
+        of_pair = segment.faces[faces]
+        shared = np.argwhere(of_pair[:, 0, :, None] == of_pair[:, 1, None, :])
+        corners = of_pair[shared[:, 0], 0, shared[:, 1]]
+        points = np.concatenate([self.position[rows], self.x[corners].astype(np.float64)])
+        keys = first.astype(np.int64) * len(segment.faces) + second
+        crossed = np.unique(keys[self.crosses[rows]])
+        keys = np.concatenate([keys, keys[shared[:, 0]]])
+        kept = np.isin(keys, crossed)
+        ends = _farthest(keys[kept], points[kept])
+        lasting = (ends[:, 0] != ends[:, 1]).any(axis=1)
+        faces = np.stack(np.divmod(crossed, len(segment.faces)), axis=1)[lasting]
+        return Cuts(ends[lasting], segment.locate_faces(faces)[0], faces)
+
+    def tangled_vertices(self) -> np.ndarray:
+        """Returns the pairs of vertices of which a face of one crosses a face of the other, as :meth:`pair_keys`."""
+        rows, sides = self.segment.faces_of_edges(self.vertices[self.crosses, 0])
+        others = self.faces[self.crosses, 1][rows]
+        first, second = self.segment.faces[sides], self.segment.faces[others]
+        pairs = np.stack(np.broadcast_arrays(first[:, :, None], second[:, None, :]), axis=-1).reshape(-1, 2)
+        return np.unique(self.pair_keys(pairs))
+
+    def pair_keys(self, vertices: np.ndarray) -> np.ndarray:
+        """Returns a number for each pair of vertices, whatever their order, for shape [n, 2]."""
+        first, second = np.sort(vertices, axis=1).astype(np.int64).T
+        return first * self.segment.vertex_count + second
+
+
+def name_intersections(
+    segment: Segment, mesh: CollisionMesh, found: Intersections, x: np.ndarray, time: float, selection: Selection
+) -> SceneIntersections:
+    """Names the intersections that count.
+
+    Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
+    moves it: where its parts touch, rounding of its positions makes them cross. Meshes that never move are checked.
+
+    Args:
+        segment: The segment.
+        mesh: The detector's mesh, made of the segment.
+        found: Its intersections.
+        x: Positions of the segment's vertices, shape [vertex_count, 3].
+        time: Time code.
+        selection: Which pairs of meshes count.
+    """
+    if not len(found.pairs):
+        return SceneIntersections(segment, **NO_PAIRS, time=time, crosses=found.crosses, x=x)
+    ends = mesh.edges[found.pairs[:, 0]].astype(np.int64)
+    faces = found.pairs[:, 1].astype(np.int64)
+    edge_meshes, points, diagonal = segment.locate_edges(ends)
+    face_meshes, polygons = segment.locate_faces(faces)
+    meshes = np.stack([edge_meshes, face_meshes], axis=1)
+    counted = selection.counted_pairs(segment.meshes, meshes) & ~selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~segment.are_stiff(ends, face_meshes)
+    nowhere = np.full_like(faces, -1)
+    arrays = {
+        "elements": np.stack([np.where(diagonal, DIAGONAL, EDGE), np.full(len(faces), FACE)], axis=1),
+        "meshes": meshes,
+        "indices": np.stack([points, np.stack([polygons, nowhere], axis=1)], axis=1),
+        "vertices": np.stack([ends, np.full_like(ends, -1)], axis=1),
+        "faces": np.stack([nowhere, faces], axis=1),
+        "position": _meeting_points(x[ends].astype(np.float64), x[mesh.faces[faces]].astype(np.float64)),
+        "crosses": found.crosses,
+    }
+    return SceneIntersections(segment, **{name: array[counted] for name, array in arrays.items()}, time=time, x=x)
+
+
+def _meeting_points(edges: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Returns where edges, shape [n, 2, 3], meet faces, shape [n, 3, 3]; halfway along the part of one in its face."""
+    (p, q), (a, b, c) = edges.transpose(1, 0, 2), faces.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+
+    def dot(x, y):
+        return np.einsum("ni,ni->n", x, y)
+
+    side_p, side_q = dot(p - a, normal), dot(q - a, normal)
+    low, high = np.zeros(len(p)), np.ones(len(p))
+    for x, y in ((a, b), (b, c), (c, a)):
+        inward = np.cross(normal, y - x)
+        at_p, at_q = dot(p - x, inward), dot(q - x, inward)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            passes = at_p / (at_p - at_q)
+        low = np.where(at_p < at_q, np.fmax(low, passes), low)
+        high = np.where(at_p > at_q, np.fmin(high, passes), high)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.where(side_p != side_q, side_p / (side_p - side_q), 0.5 * (low + high))
+    share = np.clip(np.nan_to_num(share, nan=0.5), 0.0, 1.0)[:, None]
+    return (1.0 - share) * p + share * q
+
+
+def _farthest(keys: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns for each key, ascending, two of its points that are far apart, shape [m, 2, 3]: both if there are two."""
+    order = np.argsort(keys, kind="stable")
+    keys, points = keys[order], points[order]
+    _, starts, groups = np.unique(keys, return_index=True, return_inverse=True)
+    ends = [points[starts]]
+    for _ in range(2):  # from any point to the farthest, and from there to the farthest
+        distance = np.square(points - ends[-1][groups]).sum(axis=1)
+        last = np.append(starts[1:], len(keys))[: len(starts)] - 1
+        ends.append(points[np.lexsort((distance, groups))[last]])
+    return np.stack(ends[1:], axis=1)

@@ -1,0 +1,106 @@
+"""Pairs of elements of a scene's meshes, in the prims' own numbers."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..usd.segment import Segment
+
+__all__ = ["DIAGONAL", "EDGE", "FACE", "NO_PAIRS", "VERTEX", "ScenePairs", "count_by_meshes"]
+
+VERTEX, FACE, EDGE, DIAGONAL = range(4)
+"""The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
+
+NO_PAIRS = {
+    "elements": np.zeros((0, 2), dtype=np.int64),
+    "meshes": np.zeros((0, 2), dtype=np.int64),
+    "indices": np.zeros((0, 2, 2), dtype=np.int64),
+    "vertices": np.zeros((0, 2, 2), dtype=np.int64),
+    "faces": np.zeros((0, 2), dtype=np.int64),
+    "position": np.zeros((0, 3)),
+}
+"""The arrays of :class:`ScenePairs` without pairs. Most intervals have none, and naming these would take half of the
+fixed time of an interval."""
+
+_CHUNK = 4096
+_WORDS = ("vertex", "face", "edge", "diagonal")
+
+
+@dataclass(frozen=True)
+class ScenePairs:
+    """Pairs of elements of a segment: arrays with a row for each pair.
+
+    Attributes:
+        segment: The segment.
+        elements: Kinds of the two elements: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape
+            [n, 2].
+        meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
+        indices: Indices of the two elements in their prims, shape [n, 2, 2]: the point and -1 for a vertex, the polygon
+            and -1 for a face, the points at both ends for an edge or a diagonal.
+        vertices: Vertices of the segment at the two elements, shape [n, 2, 2]: the vertex and -1 for a vertex, both
+            ends for an edge or a diagonal, -1 twice for a face.
+        faces: Face of the segment for a face, else -1, shape [n, 2].
+        position: Points at which the two meet, in world space and the scene's unit of length, shape [n, 3].
+    """
+
+    segment: Segment = field(repr=False)
+    elements: np.ndarray
+    meshes: np.ndarray
+    indices: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    position: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.meshes)
+
+    def chunks(self) -> list[slice]:
+        """Returns all rows as slices of limited length: their text takes many times their memory."""
+        return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
+
+    def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
+        """Returns the names of the two meshes of some pairs."""
+        names = [mesh.name for mesh in self.segment.meshes]
+        return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
+
+    def element_names(self, rows: slice) -> list[tuple[str, str]]:
+        """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
+
+        def name(element, indices):
+            first, second = indices
+            return f"{_WORDS[element]} {first}" if second < 0 else f"{_WORDS[element]} {first}-{second}"
+
+        return [
+            (name(first, first_indices), name(second, second_indices))
+            for (first, second), (first_indices, second_indices) in zip(
+                self.elements[rows].tolist(), self.indices[rows].tolist(), strict=True
+            )
+        ]
+
+    def mesh_keys(self) -> np.ndarray:
+        """Returns a number for the two meshes of each pair, whatever their order, shape [n]."""
+        first, second = np.sort(self.meshes, axis=1).T
+        return first * len(self.segment.meshes) + second
+
+
+def count_by_meshes(
+    segment: Segment, meshes: np.ndarray, weights: np.ndarray | None = None
+) -> dict[tuple[str, str], tuple[int, ...]]:
+    """Returns the number of pairs for each two meshes, by their names, in order.
+
+    Args:
+        segment: The segment.
+        meshes: The two meshes of each pair, indices in ``segment.meshes``, shape [n, 2].
+        weights: What is added up instead of the number 1, bool or integers, shape [n, k].
+    """
+    if not len(meshes):
+        return {}
+    numbers: np.ndarray = np.ones((len(meshes), 1), dtype=int) if weights is None else weights
+    pairs, groups = np.unique(np.sort(meshes, axis=1) @ np.array([len(segment.meshes), 1]), return_inverse=True)
+    sums = np.zeros((len(pairs), numbers.shape[1]), dtype=np.int64)
+    np.add.at(sums, groups, numbers)
+    names = [mesh.name for mesh in segment.meshes]
+    return {
+        (names[pair // len(names)], names[pair % len(names)]): tuple(row)
+        for pair, row in zip(pairs.tolist(), sums.tolist(), strict=True)
+    }
