@@ -4,7 +4,7 @@
 
 Nothing is near the patch and no force acts on it, so it should keep its speed. With self-contact, VBD cuts the path of
 every particle to ``0.5 * dat_conservative_bound_relaxation * (margin + gap)`` after a detection, near something or not.
-``SolverCCD`` cuts only paths that end in a contact.
+``SolverCCD`` cuts only paths that end in a contact, and lifts the limit of VBD behind which it is put.
 """
 
 import argparse
@@ -43,6 +43,7 @@ SOLVERS = {
     "VBD with self-contact": lambda model: vbd(model, self_contact=True),
     "VBD without self-contact": vbd,
     "SolverCCD(VBD without self-contact)": lambda model: bsc.SolverCCD(vbd(model)),
+    "SolverCCD(VBD with self-contact)": lambda model: bsc.SolverCCD(vbd(model, self_contact=True)),
 }
 
 

@@ -203,9 +203,20 @@ def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch,
     program = load_module(FOLDER / "speed_limit.py")
     monkeypatch.setattr(sys, "argv", ["speed_limit.py", "--device", str(wp.get_device())])
     program.main()
-    rows = re.findall(r"│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│ +([\d.]+) +│", capsys.readouterr().out)
-    assert [tuple(map(float, row)) for row in rows] == [(v, 0.89, v, v) for v in (1.0, 10.0, 60.0)]
+    rows = re.findall("│" + r" +([\d.]+) +│" * 5, capsys.readouterr().out)
+    assert [tuple(map(float, row)) for row in rows] == [(v, 0.89, v, v, v) for v in (1.0, 10.0, 60.0)]
     assert pytest.approx(0.8925) == program.LIMIT
+
+
+def test_the_coupling_of_three_scenes_is_measured(monkeypatch, capsys):
+    program = load_module(FOLDER / "coupling.py")
+    for scene in program.SCENES.values():
+        monkeypatch.setattr(scene, "duration", 1.0 / 60.0)
+    monkeypatch.setattr(sys, "argv", ["coupling.py", "--coupling", "2", "--device", str(wp.get_device())])
+    program.main()
+    rows = re.findall(r"│ (1/\d+) +│ (\d+|-) +│(?: [\d.e+-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
+    steps = [("1/1920", "-"), ("1/960", "-"), ("1/240", "-"), ("1/240", "2"), ("1/60", "-"), ("1/60", "8")]
+    assert rows == [(*step, "0") for step in 3 * steps]  # all certified
 
 
 def path_of(name):

@@ -18,6 +18,7 @@ class StepTotals:
     """Totals over all steps so far; each field is an array of one element."""
 
     steps: wp.array[int]
+    coupled_steps: wp.array[int]
     uncertified_steps: wp.array[int]
     undetected_steps: wp.array[int]
     truncated_steps: wp.array[int]
@@ -33,11 +34,15 @@ class SolverReport:
     Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver wanted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
     or frozen.
+
+    Attributes:
+        speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True):
+    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True, lifts: bool = False):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._motion, self._response, self._responds = motion, response, responds
+        self.speed_limit_lifted = lifts
         self._totals_values = wp.zeros(len(StepTotals.vars), dtype=int, device=response.device)
         self._totals = name_elements(StepTotals, self._totals_values)
         self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
@@ -157,7 +162,10 @@ class SolverReport:
 
     @property
     def milliseconds(self) -> float | None:
-        """Time of the last step that was not captured, without the inner solver [ms]; None if there was none."""
+        """Time of the last step that was not captured [ms]; None if there was none.
+
+        Without the inner solver, but for its substeps in a coupled step.
+        """
         if self._start is None:
             return None
         assert self._end is not None
@@ -169,6 +177,11 @@ class SolverReport:
     def steps(self) -> int:
         """Steps taken so far."""
         return _read(self._totals.steps)
+
+    @property
+    def coupled_steps(self) -> int:
+        """Steps so far that were taken in substeps, see :mod:`.coupling`."""
+        return _read(self._totals.coupled_steps)
 
     @property
     def uncertified_steps(self) -> int:
@@ -218,6 +231,10 @@ class SolverReport:
             f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
             f"left standing, {self.uncertified_steps} not certified"
         )
+        if self.coupled_steps:
+            line += f", {self.coupled_steps} coupled"
+        if self.speed_limit_lifted:
+            line += ", without VBD's speed limit"
         if self.crossings:
             line += f", {self.crossings} crossings at the start"
         if self.lost_steps:

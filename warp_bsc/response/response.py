@@ -188,6 +188,19 @@ class Response:
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
+        self.find_contacts(motion, record)
+        return self.finish(dt)
+
+    def find_contacts(self, motion: ModelMotion, record: StepRecorder | None = None) -> None:
+        """Detects the contacts of a motion, as the first half of :meth:`resolve`; ``status`` says whether any are left.
+
+        Args:
+            motion: The motion that is wanted; it is only read.
+            record: As for :meth:`resolve`.
+
+        Raises:
+            RuntimeError: As for :meth:`resolve`.
+        """
         self._begin(motion, record)
         if self._most_penetrations:  # cloth that only lies on a plane then needs one detection
             self._reserve(self._most_contacts)
@@ -196,8 +209,39 @@ class Response:
             wp.capture_if(self.constraints.count, self._leave_planes)
         self._detect(refit=False)
         self._record_offsets(after=1)
+
+    def finish(self, dt: float) -> Resolution:
+        """Resolves the contacts that :meth:`find_contacts` found, as the second half of :meth:`resolve`."""
         wp.capture_if(self.status.unfinished, self._finish, dt=dt)
+        return self.resolution
+
+    @property
+    def resolution(self) -> Resolution:
+        """The motion as it was resolved last."""
         return Resolution(self.vertices, self.constraints, self.status, self._status_values)
+
+    def collect_near_pairs(self) -> None:
+        """Adds constraints for proximities after :meth:`find_contacts`, in worlds that have contacts."""
+        wp.capture_if(self.status.active, self._collect_near_pairs)
+
+    def collect_penetrations(self, motion: ModelMotion) -> None:
+        """Adds constraints for vertices that a motion takes into solids of planes."""
+        if self._most_penetrations:
+            self._motion = motion
+            self._reserve(self._most_penetrations)
+            self._collect_penetrations(ahead=True)
+
+    def project(self, motion: ModelMotion, dt: float, tolerance: float) -> None:
+        """Projects positions and velocities of a motion onto the constraints as they are, without detection.
+
+        Args:
+            motion: The motion that is wanted, of ``vertices``; it is only read.
+            dt: Its length [s].
+            tolerance: Tolerance of positions as a share of that of a whole step.
+        """
+        self._motion = motion
+        self._project(self._sweep_positions, tolerance=tolerance * self._tolerance)
+        self._change_velocities(dt)
 
     def inspect(self, motion: ModelMotion) -> Resolution:
         """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
@@ -207,7 +251,7 @@ class Response:
         """
         self._begin(motion, None)
         self._detect(refit=False)
-        return Resolution(self.vertices, self.constraints, self.status, self._status_values)
+        return self.resolution
 
     def _begin(self, motion, recorder):
         """Initializes everything for a step, and counts crossings at its start."""
@@ -281,12 +325,13 @@ class Response:
                 record_offsets, 1, inputs=[self.constraints, self._progress, self._record, after], device=self.device
             )
 
-    def _sweep_positions(self, first=True, last=True):
+    def _sweep_positions(self, first=True, last=True, tolerance=None):
         """Sweeps over the constraints on positions once; the first sweep fills the active set, the last empties it."""
         constraints = self.constraints
         inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
         if first:
-            self._launch_over_constraints(activate_position_constraints, [*inputs, self._tolerance])
+            options = [self._tolerance if tolerance is None else tolerance]
+            self._launch_over_constraints(activate_position_constraints, [*inputs, *options])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, [*inputs, last])

@@ -11,10 +11,12 @@ from newton.solvers import SolverBase
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, SolveStatus
+from .coupling import Coupling
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
 from .response import MAX_SWEEPS_PER_STEP, Response
+from .speed_limit import has_speed_limit, without_speed_limit
 from .step_record import RecordCounts, StepRecorder
 
 __all__ = ["CollisionMonitor", "SolverCCD"]
@@ -74,12 +76,13 @@ def _finish_inspection(
 
 
 @wp.kernel(enable_backward=False)
-def _count_step(status: SolveStatus, totals: StepTotals):
+def _count_step(status: SolveStatus, is_coupled: wp.array[int], totals: StepTotals):
     """Adds a step to the totals."""
     # a certified motion of elements that did not cross makes no crossings
     unchanged = status.certified[0] == 1 and status.crossings[0] == 0 and status.excluded[0] == 0
     status.recount[0] = wp.where(unchanged, 0, 1)
     totals.steps[0] = totals.steps[0] + 1
+    totals.coupled_steps[0] = totals.coupled_steps[0] + is_coupled[0]
     totals.uncertified_steps[0] = totals.uncertified_steps[0] + 1 - status.certified[0]
     totals.undetected_steps[0] = totals.undetected_steps[0] + status.undetected[0]
     totals.truncated_steps[0] = totals.truncated_steps[0] + status.truncated[0]
@@ -142,6 +145,8 @@ class SolverCCD(SolverBase):
         separation: float | None = None,
         friction: float | None = None,
         restitution: float | None = None,
+        coupling: int | None = None,
+        lift_speed_limit: bool = True,
         respond: bool = True,
     ):
         """Puts the stage behind a solver.
@@ -153,13 +158,20 @@ class SolverCCD(SolverBase):
                 material, contacts the geometric mean.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``.
+            coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
+                against the contacts, see :mod:`.coupling`; None for none.
+            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
+                keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
+                :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
+                ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
-                velocity; the three numbers then have no meaning, and must not be given.
+                velocity; the four numbers then have no meaning, and must not be given.
 
         Raises:
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or a number
                 is given without a response.
-            NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
+                solver is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -169,7 +181,8 @@ class SolverCCD(SolverBase):
         model = solver.model
         self.respond = respond
         if not respond:
-            for name, value in (("separation", separation), ("friction", friction), ("restitution", restitution)):
+            numbers = {"separation": separation, "friction": friction, "restitution": restitution, "coupling": coupling}
+            for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
         friction = model.particle_mu if friction is None else friction
@@ -178,6 +191,10 @@ class SolverCCD(SolverBase):
             raise ValueError(f"friction must be at least 0, and finite in single precision, not {friction!r}")
         if respond and not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
+        if coupling is not None and coupling < 2:
+            raise ValueError(f"coupling takes at least 2 substeps, not {coupling!r}")
+        if coupling is not None and model.requires_grad:
+            raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
         self.mesh = mesh = ModelMesh(model)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
@@ -194,8 +211,13 @@ class SolverCCD(SolverBase):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
         self._response.prepare(self._motion)
         self._recount_crossings()
+        self._lifts = respond and lift_speed_limit and has_speed_limit(solver)
+        self._coupling = None
+        if coupling is not None:
+            self._coupling = Coupling(self._step_inner, solver, mesh, self._motion, self._response, coupling)
+        self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self.report = SolverReport(self._motion, self._response, responds=respond)
+        self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._lifts)
 
     def _friction(self, friction):
         """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
@@ -252,13 +274,23 @@ class SolverCCD(SolverBase):
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
             self._motion.set_start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
-        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+            if self._coupling is not None:
+                self._coupling.save(state_in)
+        self._step_inner(state_in, state_out, control, contacts, dt, **options)
         with _paused_tape() as tape:
-            if self.respond:
+            if self._coupling is not None:
+                run_on_host(lambda: self._couple(state_out, control, contacts, dt), self.mesh.device)
+            elif self.respond:
                 self._respond(state_in, state_out, dt, tape)
             else:
                 arrays = state_out.particle_q, state_out.particle_qd, state_out.body_q
                 run_on_host(lambda: self._inspect(*arrays, dt), self.mesh.device)
+
+    def _step_inner(self, *arguments, **options):
+        """Steps the inner solver."""
+        lifted = without_speed_limit(self.solver) if self._lifts else contextlib.nullcontext()
+        with lifted:
+            self.solver.step(*arguments, **options)
 
     def _inspect(self, particle_q, particle_qd, body_q, dt):
         """Detects the collisions of the motion from the start of the step to these positions, and counts the step."""
@@ -267,7 +299,7 @@ class SolverCCD(SolverBase):
             resolution = self._response.inspect(self._motion)
             inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
             self._launch(_finish_inspection, self.mesh.vertex_count, inputs, outputs)
-            self._launch(_count_step, 1, [resolution.status], [self.report._totals])
+            self._count_step(resolution)
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
@@ -303,12 +335,27 @@ class SolverCCD(SolverBase):
         with self._timed():
             self._motion.set_end(particle_q, particle_qd, body_q, dt)
             resolution = self._response.resolve(self._motion, dt, record)
-            vertices = resolution.vertices
-            inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-            outputs = [particle_q, particle_qd, resolution.status]
-            self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
-            self._launch(_count_step, 1, [resolution.status], [self.report._totals])
+            self._finish(resolution, particle_q, particle_qd)
         return resolution
+
+    def _couple(self, state, control, contacts, dt):
+        """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
+        with self._timed():
+            self._motion.set_end(state.particle_q, state.particle_qd, state.body_q, dt)
+            assert self._coupling is not None
+            resolution = self._coupling.resolve(state, control, contacts, dt, self._is_coupled)
+            self._finish(resolution, state.particle_q, state.particle_qd)
+
+    def _finish(self, resolution, particle_q, particle_qd):
+        """Writes a resolved motion to the arrays of a state, and counts the step."""
+        vertices = resolution.vertices
+        inputs = [vertices.outcome, vertices.x1, vertices.velocity]
+        outputs = [particle_q, particle_qd, resolution.status]
+        self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
+        self._count_step(resolution)
+
+    def _count_step(self, resolution):
+        self._launch(_count_step, 1, [resolution.status, self._is_coupled], [self.report._totals])
 
     @contextlib.contextmanager
     def _timed(self):

@@ -1,0 +1,390 @@
+"""Coupling: in steps with contacts, the inner solver takes substeps, between which contacts are projected.
+
+A step that collides is taken again from its start in substeps: the inner solver steps, and a projection onto the
+contacts of the whole step follows. So the elastic solve of each substep begins with positions and velocities that have
+felt the contacts, and pulls against them for a fraction of the step only. The stretch between solver and contacts falls
+with the length of the substep. Contacts are detected once, before the substeps; the motion of the whole step is
+detected and certified after them.
+
+References:
+    M. Macklin, K. Storey, M. Lu, P. Terdiman, N. Chentanez, S. Jeschke and M. Mueller, Small Steps in Physics
+    Simulation, Symposium on Computer Animation, 2019, doi:10.1145/3309486.3340247.
+"""
+
+from collections.abc import Callable
+
+import newton
+import warp as wp
+from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
+
+from .buffers import Constraints, Motion, Progress, Vertices
+from .constraints import PLANE_CONTACT, approach_of
+from .model_mesh import ModelMesh
+from .model_motion import ModelMotion
+from .response import Resolution, Response
+
+__all__ = ["Coupling"]
+
+_ALLOCATION_FREE = (SolverVBD, SolverStyle3D)
+"""Solvers whose steps allocate no memory, which the body of a condition in a CUDA graph cannot; others may."""
+_UNCOUPLED = wp.constant(-2)
+"""Iteration of the last contact of a world without constraints, so that no projection moves its vertices."""
+_NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
+
+_KERNEL = {"enable_backward": False}
+
+
+@wp.kernel(**_KERNEL)
+def _find_worlds(motion: Motion, constraints: Constraints, is_coupled: wp.array[int]):
+    """Marks the worlds that have constraints."""
+    i = wp.tid()
+    if i < constraints.count[0]:
+        is_coupled[motion.world[constraints.vertices[i][0]]] = 1
+
+
+@wp.kernel(**_KERNEL)
+def _begin_substeps(
+    # in
+    constraints: Constraints,
+    substeps: int,
+    is_coupled: wp.array[int],
+    # in and out
+    progress: Progress,
+    # out
+    detected: wp.array[int],
+    remaining: wp.array[int],
+):
+    """Keeps the numbers of contacts and constraints, and starts the count of substeps."""
+    world = wp.tid()
+    if world == 0:
+        detected[0] = constraints.count[0]
+        detected[1] = progress.status.first_hits[0]
+        progress.status.recount[0] = 0  # the start remains where crossings are counted
+        remaining[0] = substeps
+    progress.contact_iteration[world] = wp.where(is_coupled[world] == 1, 0, _UNCOUPLED)
+
+
+@wp.kernel(**_KERNEL)
+def _start_substep(
+    # in
+    motion: Motion,
+    start: wp.array[wp.vec4d],
+    end: wp.array[wp.vec4d],
+    substeps: int,
+    dt: float,
+    remaining: wp.array[int],
+    detected: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    # in and out
+    substep: Motion,
+    constraints: Constraints,
+    progress: Progress,
+    # out
+    substep_start: wp.array[wp.vec4d],
+    substep_end: wp.array[wp.vec4d],
+    vertices: Vertices,
+):
+    """Writes the motion of a substep: particles go where the inner solver wants them, shapes a share of their way."""
+    i = wp.tid()
+    before = float(substeps - remaining[0]) / float(substeps)
+    after = float(substeps - remaining[0] + 1) / float(substeps)
+    if i == 0:
+        constraints.count[0] = detected[0]
+        progress.status.iteration[0] = 0
+    if i < start.shape[0]:
+        substep_start[i] = start[i] + wp.float64(before) * (end[i] - start[i])
+        substep_end[i] = start[i] + wp.float64(after) * (end[i] - start[i])
+    if i >= motion.x0.shape[0]:
+        return
+    lost = int(0)
+    if i < particle_q.shape[0]:
+        x0 = substep.x0[i]
+        x1 = particle_q[i]
+        velocity = particle_qd[i]
+        if not (wp.isfinite(x1) and wp.isfinite(velocity)):
+            x1 = x0
+            velocity = wp.vec3()
+            lost = 1
+    else:
+        path = motion.x1[i] - motion.x0[i]
+        x0 = motion.x0[i] + before * path
+        x1 = motion.x0[i] + after * path
+        velocity = path / dt
+        substep.x0[i] = x0
+    substep.x1[i] = x1
+    substep.velocity[i] = velocity
+    substep.is_lost[i] = lost
+    vertices.x1[i] = x1
+    vertices.velocity[i] = velocity
+    vertices.outcome[i] = 0
+    vertices.active[i] = 0
+    for axis in range(3):
+        vertices.particle_delta_x[i, axis] = wp.int64(0)
+        vertices.particle_delta_v[i, axis] = wp.int64(0)
+
+
+@wp.kernel(**_KERNEL)
+def _reset_constraints(
+    # in
+    substep: Motion,
+    vertices: Vertices,
+    detected: wp.array[int],
+    # in and out
+    constraints: Constraints,
+    progress: Progress,
+):
+    """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
+    i = wp.tid()
+    if i == 0:
+        progress.status.iteration[0] = 1
+        progress.status.active[0] = 0  # positions and velocities are swept without regard to a detection
+    if i >= constraints.count[0]:
+        return
+    constraints.position_multiplier[i] = wp.vec3d()
+    constraints.velocity_multiplier[i] = wp.vec3d()
+    constraints.previous_multiplier[i] = wp.vec3d()
+    constraints.last_sweep[i] = -2
+    if i < detected[0] and constraints.kind[i] == PLANE_CONTACT:
+        constraints.separation[i] = _NEVER_VIOLATED
+        return
+    corners = constraints.vertices[i]
+    constraints.approach[i] = approach_of(
+        substep, vertices, corners, constraints.weights[i], constraints.normal[i], constraints.separation[i]
+    )
+
+
+@wp.kernel(**_KERNEL)
+def _end_substep(
+    # in
+    vertices: Vertices,
+    # in and out
+    remaining: wp.array[int],
+    # out
+    substep: Motion,
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+):
+    """Makes the end of a substep the start of the next."""
+    particle = wp.tid()
+    if particle == 0:
+        remaining[0] = remaining[0] - 1
+    substep.x0[particle] = vertices.x1[particle]
+    particle_q[particle] = vertices.x1[particle]
+    particle_qd[particle] = vertices.velocity[particle]
+
+
+@wp.kernel(**_KERNEL)
+def _move_bodies(
+    # in
+    body_q_start: wp.array[wp.transform],
+    body_q_end: wp.array[wp.transform],
+    substeps: int,
+    remaining: wp.array[int],
+    # out
+    body_q_in: wp.array[wp.transform],
+    body_q_out: wp.array[wp.transform],
+):
+    """Writes the poses of bodies at both ends of a substep, between those of the whole step."""
+    body = wp.tid()
+    for end in range(2):
+        share = float(substeps - remaining[0] + end) / float(substeps)
+        start_pose = body_q_start[body]
+        end_pose = body_q_end[body]
+        p = wp.transform_get_translation(start_pose)
+        p += share * (wp.transform_get_translation(end_pose) - p)
+        r = wp.quat_slerp(wp.transform_get_rotation(start_pose), wp.transform_get_rotation(end_pose), share)
+        if end == 0:
+            body_q_in[body] = wp.transform(p, r)
+        else:
+            body_q_out[body] = wp.transform(p, r)
+
+
+@wp.kernel(**_KERNEL)
+def _end_substeps(
+    # in
+    is_coupled: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    # in and out
+    motion: Motion,
+    # out
+    particle_q_out: wp.array[wp.vec3],
+    particle_qd_out: wp.array[wp.vec3],
+    vertices: Vertices,
+):
+    """Makes the substeps the wanted motion, in worlds that have constraints, and puts vertices back to the start."""
+    particle = wp.tid()
+    vertices.x1[particle] = motion.x0[particle]
+    if particle >= particle_q.shape[0]:
+        return
+    if is_coupled[motion.world[particle]] == 0 or motion.is_lost[particle] != 0 or motion.inverse_mass[particle] == 0.0:
+        return
+    motion.x1[particle] = particle_q[particle]
+    motion.velocity[particle] = particle_qd[particle]
+    particle_q_out[particle] = particle_q[particle]
+    particle_qd_out[particle] = particle_qd[particle]
+
+
+@wp.kernel(**_KERNEL)
+def _restore_hits(detected: wp.array[int], progress: Progress):
+    """Makes the contacts of the step the inner solver wanted those that the status counts."""
+    progress.status.first_hits[0] = detected[1]
+
+
+class Coupling:
+    """Takes steps that collide again in substeps, in which the inner solver and a projection alternate.
+
+    Worlds without contacts keep what the inner solver made of the whole step, bit by bit. The bodies of all worlds do:
+    in the substeps, they move evenly between their poses at both ends. Arrays of the inner solver are restored after
+    the substeps, so that histories and clocks advance once a step. Options of a step, such as observables, are those of
+    the whole step.
+
+    An explicit inner solver is coupled as well, though it needs it less: it is stable at small steps only.
+
+    Limitations:
+        In a CUDA graph, steps that allocate memory, as those of ``SolverXPBD`` do, cannot be left out where nothing
+        touches, so that the substeps cost their time in each step. ``SolverVBD`` and ``SolverStyle3D`` themselves are
+        known not to allocate; every other solver and derived class counts as one that does. Python attributes that the
+        inner solver changes in place, and not by assignment, are not restored.
+    """
+
+    def __init__(
+        self,
+        step: Callable[..., None],
+        solver: SolverBase,
+        mesh: ModelMesh,
+        motion: ModelMotion,
+        response: Response,
+        substeps: int,
+    ):
+        """Allocates buffers.
+
+        Args:
+            step: Steps the inner solver, with the arguments of its ``step``.
+            solver: The inner solver.
+            mesh: The mesh.
+            motion: The motion of the whole step.
+            response: The response.
+            substeps: Number of substeps, at least 2.
+        """
+        self.substeps = substeps
+        self._step, self._solver = step, solver
+        self._mesh, self._motion, self._response = mesh, motion, response
+        self._substep = ModelMotion(mesh, motion.vertices.friction, motion.planes.friction)
+        model, device = mesh.model, mesh.device
+        self._start, self._in, self._out = model.state(), model.state(), model.state()
+        self._histories: dict[str, wp.array] = {}  # copies of arrays of the inner solver
+        self._is_coupled = wp.zeros(response.worlds, dtype=int, device=device)
+        self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
+        self._remaining = wp.zeros(1, dtype=int, device=device)
+        self._active = wp.zeros(1, dtype=int, device=device)
+        self._allocates = type(solver) not in _ALLOCATION_FREE or solver.collision_pipeline is not None
+        self._histories_of_solver()
+
+    def save(self, state: newton.State) -> None:
+        """Copies the state at the start of the step, before the inner solver changes it."""
+        self._start.assign(state)
+
+    def _histories_of_solver(self):
+        """Returns the arrays of the inner solver, each with one of its size, allocated here where memory can be."""
+        pairs = []
+        for name, array in vars(self._solver).items():
+            if isinstance(array, wp.array) and array.size and array.device == self._mesh.device:
+                saved = self._histories.get(name)
+                if saved is None or saved.shape != array.shape or saved.dtype != array.dtype:
+                    saved = wp.empty_like(array, requires_grad=False)
+                    if not self._mesh.device.is_capturing:  # memory of a graph is of no use outside it
+                        self._histories[name] = saved
+                pairs.append((array, saved))
+        return pairs
+
+    def resolve(
+        self,
+        state: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        is_coupled: wp.array,
+    ) -> Resolution:
+        """Returns the motion without its contacts, like :meth:`.response.Response.resolve`, and writes it to a state.
+
+        Args:
+            state: The state at the end of the step, as the inner solver made it.
+            control: As for the inner solver.
+            contacts: As for the inner solver.
+            dt: Length of the step [s].
+            is_coupled: Becomes 1 if the step is taken again, else 0; one element.
+        """
+        response, device = self._response, self._mesh.device
+        response.find_contacts(self._motion)
+        wp.copy(is_coupled, response.status.unfinished)
+        wp.copy(self._active, response.status.unfinished)
+        arguments = {"state": state, "control": control, "contacts": contacts, "dt": dt}
+        arguments["histories"] = self._histories_of_solver()
+        if device.is_capturing and self._allocates:
+            self._take_substeps(**arguments)
+        else:
+            wp.capture_if(self._active, self._take_substeps, **arguments)
+        wp.capture_if(self._active, self._finish, dt=dt)
+        return response.resolution
+
+    def _take_substeps(self, state, control, contacts, dt, histories):
+        """Takes the step again in substeps, and writes the end to the wanted motion and to the state."""
+        response, mesh = self._response, self._mesh
+        response.collect_near_pairs()
+        self._is_coupled.zero_()
+        constraints, progress = response.constraints, response._progress
+        inputs = [self._motion.vertices, constraints, self._is_coupled]
+        response._launch_over_constraints(_find_worlds, inputs)
+        outputs = [progress, self._detected, self._remaining]
+        self._launch(_begin_substeps, response.worlds, [constraints, self.substeps, self._is_coupled], outputs)
+        attributes = dict(vars(self._solver))
+        for array, saved in histories:
+            wp.copy(saved, array)
+        self._in.assign(self._start)
+        wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
+        arguments = {"body_q": state.body_q, "control": control, "contacts": contacts, "dt": dt}
+        if mesh.device.is_capturing and self._allocates:
+            for _ in range(self.substeps):
+                self._take_substep(**arguments)
+        else:
+            wp.capture_while(self._remaining, self._take_substep, **arguments)
+        vars(self._solver).update(attributes)
+        for array, saved in histories:
+            wp.copy(array, saved)
+        inputs = [self._is_coupled, self._in.particle_q, self._in.particle_qd]
+        outputs = [self._motion.vertices, state.particle_q, state.particle_qd, response.vertices]
+        self._launch(_end_substeps, mesh.vertex_count, inputs, outputs)
+
+    def _take_substep(self, body_q, control, contacts, dt):
+        """Steps the inner solver, and projects its motion onto the constraints."""
+        response, mesh, motion, substep = self._response, self._mesh, self._motion, self._substep
+        start, end = self._in, self._out
+        particle_q, particle_qd = start.particle_q, start.particle_qd
+        if mesh.model.body_count:
+            inputs = [self._start.body_q, body_q, self.substeps, self._remaining]
+            self._launch(_move_bodies, mesh.model.body_count, inputs, [start.body_q, end.body_q])
+        substep_dt = dt / self.substeps
+        self._step(start, end, control, contacts, substep_dt)
+        inputs = [motion.vertices, motion.planes.start, motion.planes.end, self.substeps, dt, self._remaining]
+        inputs += [self._detected, end.particle_q, end.particle_qd]
+        outputs = [substep.vertices, response.constraints, response._progress]
+        outputs += [substep.planes.start, substep.planes.end, response.vertices]
+        self._launch(_start_substep, max(mesh.vertex_count, len(motion.planes.start)), inputs, outputs)
+        response.collect_penetrations(substep)
+        constraints, progress = response.constraints, response._progress
+        inputs = [substep.vertices, response.vertices, self._detected, constraints, progress]
+        response._launch_over_constraints(_reset_constraints, inputs)
+        response.project(substep, substep_dt, 1.0 / self.substeps)  # creep adds up over substeps
+        start.assign(self._start)
+        outputs = [substep.vertices, particle_q, particle_qd]
+        self._launch(_end_substep, mesh.model.particle_count, [response.vertices, self._remaining], outputs)
+
+    def _finish(self, dt):
+        """Detects and resolves the contacts of the motion that the substeps made."""
+        self._response.resolve(self._motion, dt)
+        self._launch(_restore_hits, 1, [self._detected], [self._response._progress])
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._mesh.device)
