@@ -54,7 +54,7 @@ class CollisionMesh:
                 integer in [0, 2^31), or the worlds have another shape or type, are out of range, or differ within a
                 face.
         """
-        faces = faces.numpy() if isinstance(faces, wp.array) else np.asarray(faces)
+        faces = np.asarray(faces.numpy() if isinstance(faces, wp.array) else faces)
         if faces.shape == (0,):
             faces = np.empty((0, 3), np.int32)
         if faces.ndim != 2 or faces.shape[1] != 3:
@@ -130,7 +130,7 @@ class CollisionMesh:
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face."""
-        world = world.numpy() if isinstance(world, wp.array) else np.asarray(world)
+        world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
         if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):
             raise ValueError(
                 f"world must be {self.vertex_count} integers, one a vertex, got {world.dtype} {world.shape}"
