@@ -121,7 +121,7 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
     if motion.kind == VERTEX_FACE:
         x = found.coordinates[1]
         y = found.coordinates[2]
-    at = _touch_at(motion, found.toi, x, y, found.normal, found.localized == 1)
+    at = _touch_at(motion, found.toi, x, y, found.normal, found.within_tolerance == 1)
     if at.grazing == 1:
         return at
     last = wp.min(found.toi + clamped_tolerance(tolerance), _ONE)

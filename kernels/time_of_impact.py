@@ -40,13 +40,13 @@ _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 class Impact:
     """The first contact of a query; if the status is UNSURE, there is none before ``toi``.
 
-    Coordinates and normal are those at the contact, up to rounding and the square of the tolerance; if ``localized`` is
-    0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed triangle, which have
-    no plane, is along the velocity; where that is zero too, it is (0, 0, 1).
+    Coordinates and normal are those at the contact, up to rounding and the square of the tolerance; if
+    ``within_tolerance`` is 0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed
+    triangle, which have no plane, is along the velocity; where that is zero too, it is (0, 0, 1).
     """
 
     status: int
-    localized: int  # 1 where contact certainly occurs within the tolerance after ``toi``
+    within_tolerance: int  # 1 where contact certainly occurs within the tolerance after ``toi``
     toi: wp.float64  # time of impact, a lower bound in [0, 1]; 2 where the status is FREE
     coordinates: wp.vec3d  # vertex-face: barycentric coordinates in the face; edge-edge: (s, r, 0) along the edges
     normal: wp.vec3d  # unit contact normal, against the motion of the vertex or first edge relative to the other
@@ -286,7 +286,7 @@ def impact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64) -
         found = UNSURE
         toi = _ZERO
     result.status = wp.where(found == UNSURE, status, found)
-    result.localized = wp.where(found == HIT, 1, 0)
+    result.within_tolerance = wp.where(found == HIT, 1, 0)
     result.toi = toi
     if found == FREE:
         return result

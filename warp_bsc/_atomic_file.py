@@ -85,6 +85,16 @@ class OutputFile:
         self._file.seek(size)
         self._file.truncate()
 
+    def adopt(self, path: str | os.PathLike) -> None:
+        """Makes a file in :attr:`folder`, which another library wrote, the temporary file.
+
+        Raises:
+            OSError: If it cannot be opened.
+        """
+        file = open(path, "r+b", buffering=0)  # noqa: SIM115 (closed when discarded)
+        self._remove_temporary()
+        self._file, self._temporary = file, Path(path)
+
     def commit(self) -> None:
         """Puts the file in its place, with the permissions of the file that was there.
 
@@ -110,10 +120,13 @@ class OutputFile:
 
     def discard(self) -> None:
         """Removes the temporary file. A committed file stays."""
-        self._file.close()
         if self._stream is not None:
             with contextlib.suppress(OSError):  # commit has raised it already
                 self._stream.close()
+        self._remove_temporary()
+
+    def _remove_temporary(self):
+        self._file.close()
         if self._temporary:
             with contextlib.suppress(FileNotFoundError):
                 self._temporary.unlink()

@@ -246,9 +246,3 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
     ) -> wp.uint64: ...
 
     return cull_batch
-
-
-@wp.func_native("return bits ? __builtin_ctzll(bits) : 64;")
-def lowest_bit(bits: wp.uint64) -> int:
-    """Returns the number of the lowest bit that is set; 64 if there is none."""
-    ...

@@ -4,6 +4,9 @@ from typing import Any
 
 import warp as wp
 
+BoxRows = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
+"""The box of a moving element: the lowest and the highest coordinates at the start, then at the end."""
+
 _LARGEST_FLOAT = wp.constant(wp.float64(3.4028234663852886e38))
 
 
@@ -45,3 +48,43 @@ def boxes_apart(
     below = wp.min(other_low0 - high0, other_low1 - high1)
     above = wp.min(low0 - other_high0, low1 - other_high1)
     return wp.float64(wp.max(wp.max(below, above))) > wp.float64(0.0)
+
+
+@wp.func_native(
+    snippet="""
+    wp::mat_t<4, 3, wp::float32> box;
+#if defined(__CUDA_ARCH__)
+    // three loads of 16 bytes instead of twelve of four, as neighbouring threads read boxes that lie apart
+    const float4* at = reinterpret_cast<const float4*>(boxes.data + 4 * (size_t)i);
+    const float4 a = at[0], b = at[1], c = at[2];
+    const float values[12] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w};
+    for (int k = 0; k < 12; ++k)
+        box.data[k / 3][k % 3] = values[k];
+#else
+    for (int k = 0; k < 12; ++k)
+        box.data[k / 3][k % 3] = boxes.data[4 * (size_t)i + k / 3][k % 3];
+#endif
+    return box;
+"""
+)
+def read_box(boxes: wp.array2d[wp.vec3], i: int) -> BoxRows:
+    """Returns a row of an array of boxes, shape [n, 4], which is contiguous and begins at a multiple of 16 bytes."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    float4* at = reinterpret_cast<float4*>(boxes.data + 4 * (size_t)i);
+    at[0] = make_float4(box.data[0][0], box.data[0][1], box.data[0][2], box.data[1][0]);
+    at[1] = make_float4(box.data[1][1], box.data[1][2], box.data[2][0], box.data[2][1]);
+    at[2] = make_float4(box.data[2][2], box.data[3][0], box.data[3][1], box.data[3][2]);
+#else
+    for (int k = 0; k < 12; ++k)
+        boxes.data[4 * (size_t)i + k / 3][k % 3] = box.data[k / 3][k % 3];
+#endif
+"""
+)
+def write_box(box: BoxRows, boxes: wp.array2d[wp.vec3], i: int):
+    """Writes a row of an array of boxes, see :func:`read_box`."""
+    ...

@@ -97,8 +97,8 @@ def test_tables_files_and_figure(capsys, monkeypatch, tmp_path):
 def test_the_ipc_toolkit_is_measured(capsys):
     pytest.importorskip("ipctk")
     (scene,) = json.loads(bench(capsys, "cloth:1000", "--json"))["scenes"]
-    assert scene["peers"].keys() == {"tight inclusion", "additive"}
-    for took in scene["peers"].values():
+    assert scene["ipc_toolkit"].keys() == {"tight inclusion", "additive"}
+    for took in scene["ipc_toolkit"].values():
         assert took["false_negatives"] == 0
         assert took["call_nanoseconds"] > 0.0
         assert took["checked"] > 0

@@ -15,7 +15,8 @@ from warp_bsc.kernels.culling import (
     vertex_face_boxes_apart,
 )
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
-from warp_bsc.kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from warp_bsc.kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from warp_bsc.kernels.pipeline.bits import lowest_bit
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import ROUNDOFF, certified_sign_cubic
 

@@ -40,7 +40,7 @@ def kernel(dtype):
         tolerance: wp.float64,
         x: wp.array2d[dtype],
         status: wp.array[int],
-        localized: wp.array[int],
+        within_tolerance: wp.array[int],
         grazing: wp.array[int],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
@@ -56,7 +56,7 @@ def kernel(dtype):
                 x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
             )
         status[i] = contact.status
-        localized[i] = contact.localized
+        within_tolerance[i] = contact.within_tolerance
         grazing[i] = contact.grazing
         toi[i] = contact.toi
         coordinates[i] = contact.coordinates
@@ -83,7 +83,7 @@ def impacts(kind, points, tolerance=TOLERANCE):
         outputs[output].grad.assign(seed if output else seed[:, 0])
         tape.backward()
         derivatives.append(x.grad.numpy().copy())
-    names = ("status", "localized", "grazing", "toi", "coordinates", "normal")
+    names = ("status", "within_tolerance", "grazing", "toi", "coordinates", "normal")
     values = {name: array.numpy() for name, array in zip(names, [*flags, *outputs], strict=True)}
     return SimpleNamespace(**values, derivatives=np.stack(derivatives, axis=1))
 
@@ -300,7 +300,7 @@ def test_gradients_are_finite_bounded_and_flagged_for_whatever_is_asked(kind, dt
         contact = found.status != FREE
         assert not found.derivatives[~contact].any(), name
         assert not found.grazing[~contact].any(), name
-        assert (found.localized[contact & (found.grazing == 0)] == 1).all(), name
+        assert (found.within_tolerance[contact & (found.grazing == 0)] == 1).all(), name
         largest = np.abs(found.derivatives[:, 0]).max(axis=(1, 2)).astype(np.float64)
         assert (largest * size(kind, points.astype(np.float64)) <= LARGEST).all(), name
         flagged[name] = found.grazing[contact].mean()
@@ -414,7 +414,7 @@ def test_gradients_of_a_detection_are_those_of_its_pairs(dtype, method, device):
         corners = np.concatenate([first, (mesh.faces if kind == "vertex_face" else mesh.edges)[pairs[:, 1]]], axis=1)
         found = impacts(kind, np.concatenate([x0[corners], x1[corners]], axis=1))
         grazing = getattr(c.arrays, f"{kind}_grazing").numpy()
-        same = found.localized == 1
+        same = found.within_tolerance == 1
         assert same.mean() > 0.95
         np.testing.assert_array_equal(grazing[same], found.grazing[same] == 1)
         seed = np.random.default_rng(9).uniform(-1.0, 1.0, (len(pairs), 7)) * (same & ~grazing)[:, None]

@@ -25,7 +25,7 @@ def find_impacts(
     x: wp.array2d[wp.vec3d],
     tolerance: wp.float64,
     status: wp.array[int],
-    localized: wp.array[int],
+    within_tolerance: wp.array[int],
     toi: wp.array[wp.float64],
     coordinates: wp.array[wp.vec3d],
     normal: wp.array[wp.vec3d],
@@ -44,7 +44,7 @@ def find_impacts(
     else:
         contact = impact_vertex_face(x0, x1, x2, x3, x4, x5, x6, x7, tolerance)
     status[i] = contact.status
-    localized[i] = contact.localized
+    within_tolerance[i] = contact.within_tolerance
     toi[i] = contact.toi
     coordinates[i] = contact.coordinates
     normal[i] = contact.normal
@@ -67,7 +67,7 @@ def impacts(kind, points, tolerance=2.0**-20):
     n = len(points)
     outputs = {
         "status": wp.zeros(n, dtype=int),
-        "localized": wp.zeros(n, dtype=int),
+        "within_tolerance": wp.zeros(n, dtype=int),
         "toi": wp.zeros(n, dtype=wp.float64),
         "coordinates": wp.zeros(n, dtype=wp.vec3d),
         "normal": wp.zeros(n, dtype=wp.vec3d),
@@ -137,11 +137,11 @@ def passing(kind):
 def test_contact_is_found_within_the_tolerance(kind, tolerance):
     points, times = passing(kind)
     found = impacts(kind, points, tolerance)
-    localized = found.localized == 1
+    within_tolerance = found.within_tolerance == 1
     assert (found.status == HIT).mean() > 0.999
-    assert localized.mean() > 0.99
+    assert within_tolerance.mean() > 0.99
     assert (found.toi <= times[:, 1]).all()
-    assert (found.toi >= times[:, 0] - tolerance)[localized].all()
+    assert (found.toi >= times[:, 0] - tolerance)[within_tolerance].all()
     assert_exact_times(found.toi, tolerance)
 
 
@@ -154,22 +154,22 @@ def test_features_meet_at_the_coordinates_with_the_normal(kind, tolerance):
     """
     points, times = passing(kind)
     found = impacts(kind, points, tolerance)
-    localized = found.localized == 1
+    within_tolerance = found.within_tolerance == 1
     assert_valid_contact(kind, found, points, np.ones(len(points), dtype=bool))
     start, end = gaps(kind, points, found.coordinates)
     gap = start + found.toi[:, None] * (end - start)
-    assert np.linalg.norm(gap, axis=1)[localized].max() < 5.0 * tolerance
+    assert np.linalg.norm(gap, axis=1)[within_tolerance].max() < 5.0 * tolerance
     at_contact = np.linalg.norm(start + times[:, :1] * (end - start), axis=1)
-    assert np.percentile(at_contact[localized], 95) < 20.0 * tolerance**2 + 1e-14
+    assert np.percentile(at_contact[within_tolerance], 95) < 20.0 * tolerance**2 + 1e-14
     spanning = sides(kind, points, found.toi)
     length = np.linalg.norm(spanning, axis=2)
     sine = np.linalg.norm(np.cross(spanning[:, 0], spanning[:, 1]), axis=1) / length.prod(axis=1)
     tilt = np.abs((spanning * found.normal[:, None]).sum(axis=2)) * sine[:, None] * length.min(axis=1, keepdims=True)
-    assert tilt[localized].max() < 5.0 * tolerance
+    assert tilt[within_tolerance].max() < 5.0 * tolerance
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_contact_at_a_time_that_halving_hits_is_localized(kind):
+def test_contact_at_a_time_that_halving_hits_is_within_tolerance(kind):
     """Integer features meet inside both at t = 1/2 exactly, where halves of the step end."""
     rng = np.random.default_rng(2)
     n = 300
@@ -185,7 +185,7 @@ def test_contact_at_a_time_that_halving_hits_is_localized(kind):
     assert (times == 0.5).all()
     for tolerance in (2.0**-10, 2.0**-20):
         found = impacts(kind, points, tolerance)
-        assert (found.localized == 1).all()
+        assert (found.within_tolerance == 1).all()
         assert (found.toi <= 0.5).all()
         assert (found.toi >= 0.5 - tolerance).all()
 
@@ -193,7 +193,7 @@ def test_contact_at_a_time_that_halving_hits_is_localized(kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_no_contact_is_before_the_time_of_impact(kind, dtype):
-    """For every query that aims at trouble: a lower bound always, and close where it is localized."""
+    """For every query that aims at trouble: a lower bound always, and close where it is within the tolerance."""
     tolerance = 2.0**-12
     for name, generator in GENERATORS.items():
         rng = np.random.default_rng([3, *name.encode()])
@@ -207,9 +207,9 @@ def test_no_contact_is_before_the_time_of_impact(kind, dtype):
         assert hits[found.status == HIT].all(), name
         assert_exact_times(found.toi[contact], tolerance)
         assert (found.toi[hits] <= times[hits, 1]).all(), name
-        localized = found.localized == 1
-        assert (found.status[localized] == HIT).all(), name
-        assert (found.toi[localized] >= times[localized, 0] - tolerance).all(), name
+        within_tolerance = found.within_tolerance == 1
+        assert (found.status[within_tolerance] == HIT).all(), name
+        assert (found.toi[within_tolerance] >= times[within_tolerance, 0] - tolerance).all(), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -294,14 +294,14 @@ def test_features_meet_at_the_coordinates_also_where_the_tolerance_is_the_step(k
     assert hits[found.status == HIT].all()
     assert not hits[found.status == FREE].any()
     assert (found.toi[hits] <= times[hits, 1]).all()
-    localized = found.localized == 1
-    assert localized[hits].mean() > 0.99
-    assert (found.toi[localized] >= times[localized, 0] - tolerance).all()
+    within_tolerance = found.within_tolerance == 1
+    assert within_tolerance[hits].mean() > 0.99
+    assert (found.toi[within_tolerance] >= times[within_tolerance, 0] - tolerance).all()
     assert_valid_contact(kind, found, points, found.status != FREE)
-    start, end = gaps(kind, points[localized], found.coordinates[localized])
+    start, end = gaps(kind, points[within_tolerance], found.coordinates[within_tolerance])
     velocity = end - start
     time = -(start * velocity).sum(axis=1) / (velocity**2).sum(axis=1)
-    toi = found.toi[localized]
+    toi = found.toi[within_tolerance]
     assert ((time > toi - 2.0**-10) & (time < np.minimum(toi + tolerance, 1.0) + 2.0**-10)).all()
     gap = np.linalg.norm(start + time[:, None] * velocity, axis=1)
     assert gap.max() < 5.0 * 2.0**-10

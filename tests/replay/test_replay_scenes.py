@@ -488,7 +488,7 @@ def test_pairs(crowd, options, expected):
         (["--purpose", "fun"], "fun"),
         (["--purpose", "guide"], "no visible mesh in the scene, or none is selected"),
         (["--json", "--csv"], "only one of them can be printed"),
-        (["--overlay", "out.usdc"], "must end in .usda or .usd"),
+        (["--overlay", "out.usdz"], "must end in .usda, .usdc or .usd"),
         (["--report", "gone/out.html"], "there is no folder gone"),
         (["--json", "same.json", "--csv", "same.json"], "named twice"),
     ],

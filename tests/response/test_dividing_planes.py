@@ -133,7 +133,7 @@ def _divide(
     cut: wp.array[bool],
 ):
     for i in range(normals.shape[0]):
-        add_plane(planes, 0, normals[i], offsets[i], margins[i])
+        add_plane(planes, wp.vec4i(0, -1, -1, -1), 1, normals[i], offsets[i], margins[i])
     position, was_cut = position_on_sides(planes, 0, x0, x1)
     end[0] = position
     cut[0] = was_cut
@@ -179,13 +179,11 @@ def test_two_planes(device):
 
 
 def test_an_acute_wedge(device):
-    """Projection would take long where planes nearly face each other: the path is cut, but above both."""
+    """Where planes nearly face each other, a position goes up between them all the same."""
     planes = [(unit(1.0, 0.0, 0.01), 0.0, 1e-4), (unit(-1.0, 0.0, 0.01), 0.0, 1e-4)]
-    x1 = np.float32([0.3, 0.2, -1.0])
-    end, cut = divide(planes, START, x1, device)
-    assert cut
-    assert all(normal @ end > offset for normal, offset, _ in planes)
-    assert np.linalg.norm(end - START) > 0.1
+    end, cut = divide(planes, START, np.float32([0.3, 0.2, -1.0]), device)
+    np.testing.assert_allclose(end, [0.0, 0.2, 1e-4 / planes[0][0][2]], atol=1e-7)
+    assert not cut
 
 
 def test_no_room(device):
@@ -216,3 +214,30 @@ def test_the_order_of_planes_does_not_matter(normals, x1, share, device):
     end = np.frombuffer(ends.pop()[0], dtype=np.float32).astype(float)
     assert all(normal @ end > offset for normal, offset, _ in planes)
     assert np.linalg.norm(end - START) <= np.linalg.norm(np.subtract(x1, START)) + 1e-6
+
+
+def distance_above(planes, x, margins):
+    """The distance from a position to the nearest one above all planes by a share of their margins: on up to three."""
+    normals = np.array([normal for normal, _, _ in planes])
+    missing = np.array([offset + margins * margin for _, offset, margin in planes]) - normals @ x
+    moves = [np.zeros(3)]
+    for on in itertools.chain.from_iterable(itertools.combinations(range(len(planes)), n) for n in (1, 2, 3)):
+        moves.append(np.linalg.pinv(normals[list(on)]) @ missing[list(on)])
+    return min(np.linalg.norm(move) for move in moves if (normals @ move >= missing - 1e-9).all())
+
+
+@settings(max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(3, 9), spread=st.sampled_from([0.01, 0.3, 1.0, 3.0]))
+def test_the_end_is_the_nearest_position_above_all_planes(seed, count, spread, device):
+    """With any number of planes around the start, many of them nearly parallel; the path is never cut."""
+    rng = np.random.default_rng(seed)
+    normals = np.array([0.0, 0.0, 1.0]) + spread * rng.standard_normal((count, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    distances = rng.uniform(0.01, 0.5, count)
+    planes = [(n, n @ START - rng.uniform(0.3, 0.9) * d, 0.2 * d) for n, d in zip(normals, distances, strict=True)]
+    x1 = np.float32(START + 2.0 * rng.standard_normal(3))
+    end, cut = divide(planes, START, x1, device)
+    assert not cut and all(normal @ end > offset for normal, offset, _ in planes)
+    moved = np.linalg.norm(end - x1.astype(float))
+    assert distance_above(planes, x1.astype(float), 0.0) - 1e-6 <= moved
+    assert moved <= distance_above(planes, x1.astype(float), 1.0) + 1e-6

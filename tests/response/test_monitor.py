@@ -182,10 +182,10 @@ def test_gradients_of_the_inner_solver_pass_the_monitor_unchanged(device):
         gradients.append([states[0].particle_q.grad.numpy(), states[0].particle_qd.grad.numpy()])
     assert hits > 0
     for actual, expected in zip(*gradients, strict=True):
-        assert np.abs(expected).max() > 0.0
-        np.testing.assert_allclose(
-            actual, expected, rtol=1e-5 if device.is_cuda else 0.0
-        )  # sums of a GPU have no order
+        largest = np.abs(expected).max()
+        assert largest > 0.0
+        rounding = 2e-6 * largest if device.is_cuda else 0.0  # the inner solver's sums on a GPU have no order
+        np.testing.assert_allclose(actual, expected, rtol=0.0, atol=rounding)
 
 
 def particles_of_elements_with(model, particle):

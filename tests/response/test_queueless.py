@@ -57,7 +57,7 @@ def test_crossing_sheets(device, monkeypatch):
     model = crossing_sheets(3.0, device=device)
     rollout = Rollout(model, stage(model, monkeypatch, tiny=True))
     excluded = 0
-    for _ in range(25):
+    for _ in range(50):
         rollout.step()
         excluded += status(rollout.solver, "excluded")
         assert rollout.solver.report.certified

@@ -165,7 +165,7 @@ def user_kernel(point):
         x: wp.array2d[point],
         tolerance: wp.float64,
         status: wp.array[int],
-        localized: wp.array[int],
+        within_tolerance: wp.array[int],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
         normal: wp.array[wp.vec3d],
@@ -180,7 +180,7 @@ def user_kernel(point):
                 x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
             )
         status[i] = contact.status
-        localized[i] = contact.localized
+        within_tolerance[i] = contact.within_tolerance
         toi[i] = contact.toi
         coordinates[i] = contact.coordinates
         normal[i] = contact.normal
@@ -207,7 +207,7 @@ def judge_user(kind, points, tolerance, interval):
     x = wp.array(points, dtype=wp.vec3 if dtype is np.float32 else wp.vec3d)
     outputs = [wp.zeros(n, dtype=t) for t in (int, int, wp.float64, wp.vec3d, wp.vec3d)]
     wp.launch(USER_KERNELS[dtype], n, inputs=[kind == "edge_edge", x, tolerance], outputs=outputs)
-    status, localized, toi, coordinates, normal = (output.numpy() for output in outputs)
+    status, within_tolerance, toi, coordinates, normal = (output.numpy() for output in outputs)
     truth = ~np.isnan(interval[:, 0])
     used = tolerance if tolerance > 2.0**-38 else 2.0**-38
     found = status != 0
@@ -223,7 +223,7 @@ def judge_user(kind, points, tolerance, interval):
             (status == 2).sum(),
             ((status == 0) & truth).sum() + ((status == 1) & ~truth).sum() + ((status == 0) & (toi != 2.0)).sum(),
             (truth & (toi > interval[:, 1])).sum(),
-            (truth & (localized == 1) & (toi < interval[:, 0] - used)).sum(),
+            (truth & (within_tolerance == 1) & (toi < interval[:, 0] - used)).sum(),
             (found & ~inside).sum(),
         ]
     )

@@ -41,7 +41,7 @@ def draw_paper_benchmarks(benchmarks: list[dict[str, Any]], path: str | os.PathL
             for timing in scene["timings"]:
                 bars = dict(timing["nanoseconds"])
                 if timing["cores"] == 1:
-                    bars |= {method: took["nanoseconds"] for method, took in scene["peers"].items()}
+                    bars |= {method: took["nanoseconds"] for method, took in scene["ipc_toolkit"].items()}
                 panels.setdefault(timing["place"], {})[scene["name"]] = bars
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)

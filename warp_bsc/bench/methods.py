@@ -37,7 +37,8 @@ from ..detection.stage_timer import StageTimer
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
-from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic

@@ -221,7 +221,7 @@ def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
         "timings": [_timing_to_dict(timing) for timing in found.timings],
         "stage_milliseconds": found.stage_milliseconds,
         "frame_milliseconds": found.frame_milliseconds,
-        "peers": {method: asdict(took) for method, took in found.ipc_toolkit.items()},
+        "ipc_toolkit": {method: asdict(took) for method, took in found.ipc_toolkit.items()},
     }
 
 

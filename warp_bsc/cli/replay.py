@@ -21,7 +21,7 @@ from ..replay.intervals import IntervalResult, replay
 from ..replay.outputs import ReplayOutput
 from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
-from ..replay.usd_overlay import Overlay
+from ..replay.usd_overlay import SHOWN_BY, Overlay
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
@@ -177,9 +177,15 @@ def add_to(commands: Commands) -> None:
     )
 
     out = command.add_argument_group("output")
-    out.add_argument("--overlay", metavar="FILE", help="a USD layer over the scene, .usda, which shows the collisions")
+    out.add_argument(
+        "--overlay",
+        metavar="FILE",
+        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
+    )
     file = {"type": _output, "metavar": "FILE"}
-    out.add_argument("--report", **file, help="a page with charts and the worst interval in 3D, .html")
+    out.add_argument(
+        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
+    )
     printed = {"nargs": "?", "const": STDOUT, **file}
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
@@ -329,6 +335,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
                     print_new(console, baseline.new_in(summary))
                 for output in finished:
                     say(console, f"Wrote {output.file.path}.")
+                    if isinstance(output, Overlay):
+                        say(console, f"  {SHOWN_BY}")
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:
@@ -392,7 +400,7 @@ def _open_outputs(
         (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
-        (arguments.report, ReportPage),
+        (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )
     outputs = []
     for path, make in makers:

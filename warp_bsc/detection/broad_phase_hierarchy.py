@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import boxes_apart, boxes_overlap, rounded
+from ..kernels.pipeline.bits import lowest_bit
+from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box, rounded, write_box
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
@@ -33,7 +34,6 @@ from .settings import NO_GRADIENTS, Count, capacity_for
 __all__ = [
     "BroadPhaseHierarchy",
     "FaceHierarchy",
-    "lowest_bit",
     "overlapping_edges",
     "overlapping_vertices",
     "traversal_kernel",
@@ -43,6 +43,11 @@ _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 
 _WIDTH = wp.constant(WIDTH)
+
+_PAIRS_OF_THREAD = wp.constant(4)
+"""Pairs of faces whose elements a thread pairs."""
+_BITS_OF_PAIR = wp.constant(15)
+"""Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
 
 _UNGROUPED = 8
 """Number of groups up to which their boxes are not worth a launch, and all of them are traversed."""
@@ -92,6 +97,13 @@ class FaceHierarchy:
     groups: HierarchyLevel
 
 
+@wp.func
+def empty_box() -> BoxRows:
+    """A box that overlaps none."""
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    return wp.matrix_from_rows(low, -low, low, -low)
+
+
 @functools.cache
 def _box_elements(dtype: type) -> wp.Kernel:
     """The kernel that boxes moving elements and clusters, for one type of position.
@@ -104,21 +116,16 @@ def _box_elements(dtype: type) -> wp.Kernel:
         return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
 
     @wp.func
-    def write_box(
-        x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, boxes: wp.array2d[wp.vec3], row: int, finite: bool
-    ):
-        """Writes the box of two vertices, an empty one if that is not finite."""
-        low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    def box_of_two(x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, finite: bool) -> BoxRows:
+        """Returns the box of two vertices, an empty one if that is not finite."""
         if finite:
-            boxes[row, 0] = rounded(wp.min(x0[a], x0[b]))
-            boxes[row, 1] = rounded(wp.max(x0[a], x0[b]))
-            boxes[row, 2] = rounded(wp.min(x1[a], x1[b]))
-            boxes[row, 3] = rounded(wp.max(x1[a], x1[b]))
-        else:
-            boxes[row, 0] = low
-            boxes[row, 1] = -low
-            boxes[row, 2] = low
-            boxes[row, 3] = -low
+            return wp.matrix_from_rows(
+                rounded(wp.min(x0[a], x0[b])),
+                rounded(wp.max(x0[a], x0[b])),
+                rounded(wp.min(x1[a], x1[b])),
+                rounded(wp.max(x1[a], x1[b])),
+            )
+        return empty_box()
 
     @wp.kernel(**NO_GRADIENTS)
     def box_elements(
@@ -164,10 +171,10 @@ def _box_elements(dtype: type) -> wp.Kernel:
                             high1 = wp.max(high1, end)
                 low = wp.min(low0, low1)
                 high = wp.max(high0, high1)
-                mesh.face_boxes[i, 0] = wp.where(finite, low0, wp.vec3(wp.inf, wp.inf, wp.inf))
-                mesh.face_boxes[i, 1] = wp.where(finite, high0, wp.vec3(-wp.inf, -wp.inf, -wp.inf))
-                mesh.face_boxes[i, 2] = wp.where(finite, low1, wp.vec3(wp.inf, wp.inf, wp.inf))
-                mesh.face_boxes[i, 3] = wp.where(finite, high1, wp.vec3(-wp.inf, -wp.inf, -wp.inf))
+                box = wp.matrix_from_rows(low0, high0, low1, high1)
+                if not finite:
+                    box = empty_box()
+                write_box(box, mesh.face_boxes, i)
                 has_changed = 1
                 if changed:
                     has_changed = changed[a] | changed[b] | changed[c]
@@ -181,7 +188,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
             a = mesh.edges[edge, 0]
             b = mesh.edges[edge, 1]
             finite = is_finite(x0, x1, a) and is_finite(x0, x1, b)
-            write_box(x0, x1, a, b, mesh.edge_boxes, mesh.edge_rows[edge], finite)
+            write_box(box_of_two(x0, x1, a, b, finite), mesh.edge_boxes, mesh.edge_rows[edge])
             return
         vertex = edge - mesh.edges.shape[0]
         finite = is_finite(x0, x1, vertex)
@@ -194,7 +201,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     raise_count(not_finite, 0, 1)
         row = mesh.vertex_rows[vertex]
         if row >= 0:
-            write_box(x0, x1, vertex, vertex, mesh.vertex_boxes, row, finite)
+            write_box(box_of_two(x0, x1, vertex, vertex, finite), mesh.vertex_boxes, row)
 
     return box_elements
 
@@ -282,29 +289,14 @@ def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
 
 
 @wp.func
-def _low(boxes: wp.array2d[wp.vec3], i: int):
-    """The lowest coordinates over the time of the motion."""
-    return wp.min(boxes[i, 0], boxes[i, 2])
+def _overlap(a: BoxRows, b: BoxRows):
+    """Whether two boxes overlap over the time of the motion."""
+    return boxes_overlap(wp.min(a[0], a[2]), wp.max(a[1], a[3]), wp.min(b[0], b[2]), wp.max(b[1], b[3]))
 
 
 @wp.func
-def _high(boxes: wp.array2d[wp.vec3], i: int):
-    """The highest coordinates over the time of the motion."""
-    return wp.max(boxes[i, 1], boxes[i, 3])
-
-
-@wp.func
-def _apart(boxes: wp.array2d[wp.vec3], i: int, other_boxes: wp.array2d[wp.vec3], j: int):
-    return boxes_apart(
-        boxes[i, 0],
-        boxes[i, 1],
-        boxes[i, 2],
-        boxes[i, 3],
-        other_boxes[j, 0],
-        other_boxes[j, 1],
-        other_boxes[j, 2],
-        other_boxes[j, 3],
-    )
+def _apart(a: BoxRows, b: BoxRows):
+    return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
 
 
 @wp.func
@@ -318,30 +310,24 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
-def _has_box(mesh: FaceHierarchy, face: int):
-    """Whether all positions of a face are finite."""
-    return mesh.face_boxes[face, 0][0] < wp.inf
-
-
-@wp.func
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
     Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
     """
     owned = mesh.owned[face]
-    low = mesh.places.lowers[other]
-    high = mesh.places.uppers[other]
     found = int(0)
-    corners = wp.where(owned & 7 == 0, 0, 3)
+    if owned & 7 == 0:
+        return found
+    other_box = read_box(mesh.face_boxes, other)
+    corners = int(3)  # not a constant, as the body would be repeated
     for corner in range(corners):
         if owns_vertex(owned, corner):
-            row = 3 * face + corner
-            if boxes_overlap(_low(mesh.vertex_boxes, row), _high(mesh.vertex_boxes, row), low, high):
-                if not _has_vertex(mesh.faces, other, mesh.faces[face, corner]) and _has_box(mesh, other):
-                    found = found | (1 << corner)
-                    if keep_separated or not _apart(mesh.vertex_boxes, row, mesh.face_boxes, other):
-                        found = found | (8 << corner)
+            box = read_box(mesh.vertex_boxes, 3 * face + corner)
+            if _overlap(box, other_box) and not _has_vertex(mesh.faces, other, mesh.faces[face, corner]):
+                found = found | (1 << corner)
+                if keep_separated or not _apart(box, other_box):
+                    found = found | (8 << corner)
     return found
 
 
@@ -357,41 +343,24 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
     sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
     for side in range(sides):
         if owns_edge(owned, side):
-            row = 3 * face + side
-            low = _low(mesh.edge_boxes, row)
-            high = _high(mesh.edge_boxes, row)
-            if boxes_overlap(low, high, mesh.places.lowers[other], mesh.places.uppers[other]):
+            box = read_box(mesh.edge_boxes, 3 * face + side)
+            if boxes_overlap(
+                wp.min(box[0], box[2]), wp.max(box[1], box[3]), mesh.places.lowers[other], mesh.places.uppers[other]
+            ):
                 a = mesh.faces[face, side]
                 b = mesh.faces[face, _next(side)]
                 for other_side in range(sides):
                     if owns_edge(other_owned, other_side):
-                        other_row = 3 * other + other_side
-                        if boxes_overlap(
-                            low, high, _low(mesh.edge_boxes, other_row), _high(mesh.edge_boxes, other_row)
-                        ):
-                            c = mesh.faces[other, other_side]
-                            d = mesh.faces[other, _next(other_side)]
-                            if a != c and a != d and b != c and b != d:
+                        c = mesh.faces[other, other_side]
+                        d = mesh.faces[other, _next(other_side)]
+                        if a != c and a != d and b != c and b != d:
+                            other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
+                            if _overlap(box, other_box):
                                 bit = 3 * side + other_side
                                 found = found | (1 << bit)
-                                if keep_separated or not _apart(mesh.edge_boxes, row, mesh.edge_boxes, other_row):
+                                if keep_separated or not _apart(box, other_box):
                                     found = found | (512 << bit)
     return found
-
-
-@wp.func
-def _bit_count(bits: int):
-    count = int(0)
-    while bits != 0:
-        bits = bits & (bits - 1)
-        count += 1
-    return count
-
-
-@wp.func
-def lowest_bit(bits: int):
-    """The place of the lowest bit that is set."""
-    return _bit_count((bits & -bits) - 1)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -405,37 +374,54 @@ def _pair_elements(
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """First finds all pairs, then takes slots for them, so that the threads of a warp can do so together."""
+    """First finds all pairs, then takes slots for them: one atomic of a warp for 128 pairs of faces.
+
+    Atomics on one address take turns, and one for each 32 pairs of faces took most of the time.
+    """
     i = wp.tid()
-    if not is_filled(i, face_pairs, face_pair_count, 0):
-        return
-    face = face_pairs[i][0]
-    other = face_pairs[i][1]
-    vertices = overlapping_vertices(mesh, face, other, keep_separated)
-    vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
-    edges = overlapping_edges(mesh, face, other, keep_separated)
-    raise_count(vertex_face_counts, _CANDIDATES, _bit_count(vertices & 455))
-    raise_count(edge_edge_counts, _CANDIDATES, _bit_count(edges & 511))
-    # of the rest only what no axis separates
-    vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
-    edges = edges >> 9
-    slot = take_slots(vertex_face_counts, _QUEUED, _bit_count(vertices))
-    while vertices != 0:
-        corner = lowest_bit(vertices)
-        vertices = vertices & (vertices - 1)
-        if corner < 3:
-            write(wp.vec2i(mesh.faces[face, corner], mesh.order[other]), vertex_face, slot)
+    first = (i / _WIDTH) * _PAIRS_OF_THREAD * _WIDTH + i % _WIDTH
+    found = wp.uint64(0)
+    candidates = wp.vec2i()  # vertex-face, edge-edge
+    queued = wp.vec2i()
+    turns = int(_PAIRS_OF_THREAD)  # not a constant, as the body would be repeated
+    for turn in range(turns):
+        at = first + turn * _WIDTH
+        if is_filled(at, face_pairs, face_pair_count, 0):
+            face = face_pairs[at][0]
+            other = face_pairs[at][1]
+            vertices = overlapping_vertices(mesh, face, other, keep_separated)
+            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
+            edges = overlapping_edges(mesh, face, other, keep_separated)
+            candidates[0] += count_places(wp.uint32(vertices & 455))
+            candidates[1] += count_places(wp.uint32(edges & 511))
+            # of the rest only what no axis separates
+            vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
+            edges = edges >> 9
+            queued[0] += count_places(wp.uint32(vertices))
+            queued[1] += count_places(wp.uint32(edges))
+            found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
+    raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
+    raise_count(edge_edge_counts, _CANDIDATES, candidates[1])
+    vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
+    edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
+    while found != wp.uint64(0):
+        bit = lowest_bit(found)
+        found = found & (found - wp.uint64(1))
+        at = first + (bit / _BITS_OF_PAIR) * _WIDTH
+        bit = bit % _BITS_OF_PAIR
+        face = face_pairs[at][0]
+        other = face_pairs[at][1]
+        if bit < 3:
+            write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
+        elif bit < 6:
+            write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
         else:
-            write(wp.vec2i(mesh.faces[other, corner - 3], mesh.order[face]), vertex_face, slot)
-        slot += wp.int64(1)
-    slot = take_slots(edge_edge_counts, _QUEUED, _bit_count(edges))
-    while edges != 0:
-        bit = lowest_bit(edges)
-        edges = edges & (edges - 1)
-        edge = mesh.face_edges[face, bit / 3]
-        other_edge = mesh.face_edges[other, bit % 3]
-        write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, slot)
-        slot += wp.int64(1)
+            edge = mesh.face_edges[face, (bit - 6) / 3]
+            other_edge = mesh.face_edges[other, (bit - 6) % 3]
+            write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
+            edge_edge_slot += wp.int64(1)
 
 
 @wp.func
@@ -450,14 +436,8 @@ def _pair_edges_with_face(
             row = 3 * face + side
             a = mesh.faces[face, side]
             b = mesh.faces[face, _next(side)]
-            if boxes_overlap(
-                _low(mesh.edge_boxes, row),
-                _high(mesh.edge_boxes, row),
-                mesh.places.lowers[other],
-                mesh.places.uppers[other],
-            ):
-                apart = not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b)
-                if apart and _has_box(mesh, other):
+            if _overlap(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
+                if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
                     append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
 
 
@@ -612,20 +592,20 @@ class BroadPhaseHierarchy:
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
         self._pair_faces(x0, x1, changed)
-        self._launch_over_pairs(_pair_elements, False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_elements(False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
         """Enqueues all candidates of the last run."""
-        self._launch_over_pairs(_pair_elements, True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_elements(True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_edges_with_faces(
         self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
     ) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap; always only refits."""
         self._pair_faces(x, x)
-        self._launch_over_pairs(_pair_edges_with_faces, counts, pairs)
+        self._launch_over_pairs(_pair_edges_with_faces, self.capacity, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Boxes all elements of a motion, and all nodes.
@@ -655,7 +635,12 @@ class BroadPhaseHierarchy:
         queue.pairs, queue.count = self._face_pairs, self._count
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
-    def _launch_over_pairs(self, kernel, *arguments):
+    def _pair_elements(self, keep_separated, *queues):
+        """Enqueues the pairs of elements of all pairs of faces."""
+        threads = -(-self.capacity // (int(_PAIRS_OF_THREAD) * WIDTH)) * WIDTH
+        self._launch_over_pairs(_pair_elements, threads, keep_separated, *queues)
+
+    def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
         blocks = most_blocks(self._device, 256)
-        wp.launch(kernel, self.capacity, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)
+        wp.launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)

@@ -47,7 +47,7 @@ def _kernel(dtype: type) -> wp.Kernel:
         v = vertices_of_pair(kind, elements, pair)
         found = Impact()
         found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
-        found.localized = wp.where(contacts.within_tolerance[i], 1, 0)
+        found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
         found.toi = contacts.toi[i]
         found.coordinates = contacts.coordinates[i]
         found.normal = contacts.normal[i]

@@ -9,7 +9,8 @@ from ..kernels.classification import classify
 from ..kernels.closest import contact_at
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
-from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of, lowest_bit
+from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
@@ -106,7 +107,7 @@ def _enqueue_contact(pair: wp.vec2i, status: int, stages: PairStages):
 def _write_impact(i: int, result: Impact, stages: PairStages):
     contacts = stages.contacts
     contacts.status[i] = wp.int8(result.status)
-    contacts.within_tolerance[i] = result.localized == 1
+    contacts.within_tolerance[i] = result.within_tolerance == 1
     contacts.toi[i] = result.toi
     contacts.coordinates[i] = result.coordinates
     contacts.normal[i] = result.normal

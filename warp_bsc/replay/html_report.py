@@ -1,7 +1,8 @@
-"""Writes a page that shows the collisions of a replay, in one file that needs no network.
+"""Writes a page that shows the collisions of a replay interval by interval, in one file that needs no network.
 
-The page's parts are in the folder ``page``. Text from the scene's file enters the page as JSON, in which no markup can
-begin, and the page's script sets it as text. The content security policy of the page blocks everything else: other
+The page's parts are in the folder ``page``. Every interval is in the page as a block of compressed arrays, which the
+page's script unpacks when the interval is shown. Text from the scene's file enters the page as JSON, in which no markup
+can begin, and the page's script sets it as text. The content security policy of the page blocks everything else: other
 scripts, handlers in attributes, addresses.
 """
 
@@ -10,86 +11,228 @@ import hashlib
 import html
 import json
 import os
+import zlib
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from .._atomic_file import OutputFile
 from ..usd.scene import Scene
 from .intervals import IntervalResult
+from .outputs import RecordFile
+from .page_view import choose_faces
+from .scene_contacts import SceneContacts
+from .scene_intersections import SceneIntersections
+from .scene_pairs import ScenePairs
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["ReportPage"]
 
-_MAX_FACES = 150_000  # in the view in 3D
-_MAX_CONTACTS = 20_000
-_MAX_ROWS = 10  # of a table
+_ALL_FACES = 1_500_000  # in the views of all intervals together, which limits those of an interval ...
+_FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... to a number from the first to the second of these
+_ALL_ROWS = 600_000  # in the table, likewise; the time to open the page grows with them
+_FEWEST_ROWS, _MOST_ROWS = 100, 50_000
+_VIEW_BYTES = 64 << 20  # of all views together
+_SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
+_MAX_PAIRS = 10_000  # of meshes
+_MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
+_COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
 
 
-class ReportPage:
-    """A page with a summary, charts, and the worst interval in 3D."""
+class ReportPage(RecordFile):
+    """A page with a timeline, every interval in 3D, and a table of all collisions and intersections."""
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene):
         """Opens the file.
+
+        Args:
+            path: The file's place.
+            scene: The scene.
 
         Raises:
             OSError: If it cannot be written.
         """
-        self.file = OutputFile(path)
-        self._worst: IntervalResult | None = None
-
-    def add(self, result: IntervalResult) -> None:
-        """Keeps an interval if it is the first or has more contacts than all before."""
-        if self._worst is None or len(result.contacts) > len(self._worst.contacts):
-            self._worst = result
-
-    def finish(self, summary: Summary) -> None:
-        """Writes the page and puts it in its place."""
+        super().__init__(path)
         folder = resources.files("warp_bsc.replay") / "page"
+        texts = [
+            (folder / name).read_text(encoding="utf-8") for name in ("data.js", "viewer.js", "table.js", "page.js")
+        ]
         style = (folder / "page.css").read_text(encoding="utf-8")
-        script = "\n".join((folder / name).read_text(encoding="utf-8") for name in ("viewer.js", "page.js"))
+        script = "\n".join(texts)
         fields = {
-            "title": html.escape(_title(summary)),
+            "title": html.escape(_title(scene)),
             "style_hash": _policy_hash(style),
             "script_hash": _policy_hash(script),
             "style": style,
             "script": script,
-            "data": _inert(_data(summary, self._worst)),
         }
-        page = (folder / "page.html").read_text(encoding="utf-8")
-        parts = page.replace("{{", "}}").split("}}")  # text, name, text, name, ...
-        self.file.truncate(0)
-        self.file.write("".join(fields[part] if index % 2 else part for index, part in enumerate(parts)))
-        self.file.commit()
+        # Text, name, text, name, ...: a text that is filled in may have braces of its own.
+        parts = (folder / "page.html").read_text(encoding="utf-8").replace("{{", "}}").split("}}")
+        filled = [fields.get(part, part) if index % 2 else part for index, part in enumerate(parts)]
+        blocks, data = filled.index("blocks"), filled.index("data")
+        self._before, self._between = "".join(filled[:blocks]), "".join(filled[blocks + 1 : data])
+        self._after = "".join(filled[data + 1 :])
+        self._most_faces = int(np.clip(_ALL_FACES // len(scene), _FEWEST_FACES, _MOST_FACES))
+        self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
+        self._view_bytes = 0
+        self._meshes: dict[str, int] = {}  # number of each mesh, by its name
+        self._moves: list[bool] = []  # whether each moves
+        self._faces: tuple[Any, int] | None = None  # the segment whose faces are all in the page, and their block
+        self._center: np.ndarray | None = None  # of all positions in the page
+        self._rows: list[tuple[int, int]] = []  # number of rows by interval: collisions, intersections at its start
+        self._last: SceneIntersections | None = None  # at the end of the last complete interval
+        self._without_view = 0
+
+    def head(self) -> str:
+        """Returns the page up to the first interval."""
+        return self._before
+
+    def record(self, result: IntervalResult) -> Iterator[str]:
+        """Yields the blocks of an interval: those of its collisions, of the intersections at its start, of its view."""
+        interval, contacts = result.contacts.interval, result.contacts
+        index = interval.index
+        if self._center is None:
+            x = interval.x0.astype(np.float64)
+            self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
+        numbers = self._number_meshes(contacts)
+        rows = _choose_rows(contacts, self._most_rows)
+        if len(rows):
+            arrays = self._pairs(contacts, rows, numbers)
+            arrays |= {"kind": contacts.kind[rows], "toi": contacts.toi[rows].astype(np.float32)}
+            if contacts.phase is not None and contacts.separate is not None:
+                arrays |= {"phase": contacts.phase[rows], "separate": contacts.separate[rows]}
+            yield _block(f"hits-{index}", {"of": len(contacts)}, arrays)
+        at_rest = result.intersections or ()
+        rest_rows = 0
+        if at_rest and len(at_rest[0]):
+            rest_rows, text = self._rest(index, at_rest[0], numbers)
+            yield text
+        places = [contacts.position, *(found.position for found in at_rest)]
+        if index == 0 or sum(map(len, places)):
+            yield from self._view(result, np.concatenate(places), numbers)
+        self._rows[index:] = [(len(rows), rest_rows)]
+        self._last = at_rest[1] if at_rest else None
+
+    def tail(self, summary: Summary) -> str:
+        """Returns the block of the intersections at the end, the data of the whole replay, and the page's script."""
+        rows, text = 0, ""
+        last, intervals = self._last, summary.intervals
+        if last is not None and len(last) and intervals and last.time == intervals[-1].end > intervals[-1].start:
+            numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
+            rows, text = self._rest(len(intervals), last, numbers)
+        data = _data(summary)
+        data["rows"] = [*self._rows[: len(intervals)], (0, rows)]
+        data["meshes"] = [{"name": name, "moves": moves} for name, moves in zip(self._meshes, self._moves, strict=True)]
+        data["center"] = self._center.tolist() if self._center is not None else [0, 0, 0]
+        data["notes"] += self._notes(summary, data["rows"])
+        return text + self._between + _inert(data) + self._after
 
     def shrink(self) -> bool:
-        """Drops nothing: the size of the page does not depend on the number of intervals."""
-        return False
+        """Drops the last intervals."""
+        self._last = None
+        return super().shrink()
 
-    def discard(self) -> None:
-        """Removes the temporary file."""
-        self.file.discard()
+    def _number_meshes(self, contacts: SceneContacts) -> np.ndarray:
+        """Returns the numbers in the page of a segment's meshes, shape [len(segment.meshes)]."""
+        for mesh in contacts.segment.meshes:
+            if self._meshes.setdefault(mesh.name, len(self._meshes)) == len(self._moves):
+                self._moves.append(mesh.moves)
+        return np.array([self._meshes[mesh.name] for mesh in contacts.segment.meshes], dtype=np.int64)
+
+    def _pairs(self, pairs: ScenePairs, rows: np.ndarray, numbers: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns the arrays of some pairs: meshes, elements, their numbers in the prims, and positions."""
+        indices, elements = pairs.indices[rows], pairs.elements[rows]
+        meshes = numbers[pairs.meshes[rows]] if len(rows) else pairs.meshes[rows]
+        columns = (meshes[:, 0], meshes[:, 1], 4 * elements[:, 0] + elements[:, 1], *indices.reshape(-1, 4).T)
+        return dict(zip(_COLUMNS, columns, strict=True)) | {"position": self._placed(pairs.position[rows])}
+
+    def _rest(self, index: int, found: SceneIntersections, numbers: np.ndarray) -> tuple[int, str]:
+        """Returns the number of rows and the block of the intersections at one time."""
+        rows = _choose_rows(found, self._most_rows)
+        arrays = self._pairs(found, rows, numbers) | {"crosses": found.crosses[rows]}
+        curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
+        spread = np.linspace(0, len(curves) - 1, min(len(curves), self._most_rows)).astype(int)
+        arrays["curves"] = self._placed(curves[spread])
+        return len(rows), _block(f"rest-{index}", {"of": len(found), "curves": len(curves)}, arrays)
+
+    def _view(self, result: IntervalResult, places: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
+        """Yields the blocks of the triangles that move in an interval: all, or those around the given places."""
+        interval, segment = result.contacts.interval, result.contacts.segment
+        if not len(segment.faces):
+            return
+        if self._view_bytes > _VIEW_BYTES:
+            self._without_view += 1
+            return
+        lit = result.contacts.colliding_faces
+        shown = choose_faces(interval.x0[segment.faces[:, 0]], places, lit, self._most_faces)
+        texts = []
+        if len(shown) == len(segment.faces) and self._faces and self._faces[0] is segment:
+            vertices, number = np.arange(segment.vertex_count), self._faces[1]
+        else:
+            vertices, corners = np.unique(segment.faces[shown], return_inverse=True)
+            number = interval.index
+            arrays = {"faces": corners, "mesh_of_vertex": numbers[segment.locate_vertices(vertices)[0]]}
+            texts.append(_block(f"faces-{number}", {}, arrays))
+            if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:
+                self._faces = segment, number
+        arrays = {
+            "start": self._placed(interval.x0[vertices]),
+            "end": self._placed(interval.x1[vertices]),
+            "lit": np.searchsorted(shown, np.intersect1d(lit, shown)),
+        }
+        texts.append(_block(f"view-{interval.index}", {"faces": number, "of": len(segment.faces)}, arrays))
+        self._view_bytes += sum(map(len, texts))
+        yield from texts
+
+    def _placed(self, positions: np.ndarray) -> np.ndarray:
+        """Returns positions from the page's center on, in single precision."""
+        return (positions.astype(np.float64) - self._center).astype(np.float32)
+
+    def _notes(self, summary: Summary, rows: list[tuple[int, int]]) -> list[str]:
+        """Returns sentences on all that is not in the page."""
+        notes = []
+        hits, rest = (sum(column) for column in zip(*rows, strict=True))
+        found = sum(at.crossings + at.touches for at in summary.intersections)
+        most = f"an interval has at most {self._most_rows:,} rows, spread evenly, with at least one for each two meshes"
+        if hits < summary.hits:
+            notes.append(f"The table has {hits:,} of {summary.hits:,} collisions: {most}. --json and --csv have all.")
+        if rest < found:
+            notes.append(f"The table has {rest:,} of {found:,} edges at rest: {most}. --json and --csv have all.")
+        if self._without_view:
+            notes.append(f"{self._without_view:,} intervals have no view in 3D, as the page is full.")
+        pairs = len({span.meshes for span in [*summary.collision_spans, *summary.intersection_spans]})
+        if pairs > _MAX_PAIRS:
+            notes.append(f"The page has {_MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
+        if ignored := summary.ignored:
+            hits = sum(hits for _, hits in ignored)
+            notes.append(f"{hits:,} collisions of {len(ignored):,} ignored pairs of meshes are left out.")
+        return notes
 
 
-def _data(summary: Summary, worst: IntervalResult | None) -> dict:
-    """Returns the data that the page's script shows."""
+def _data(summary: Summary) -> dict:
+    """Returns the data of the whole replay that the page's script shows."""
     scene = summary.scene
     displayed = scene.display_names
+    looked = bool(summary.intersections)
+    intersecting = sum(bool(at.crossings + at.touches) for at in summary.intersections)
     tiles = [
-        (f"{summary.hits:,}", "colliding pairs"),
+        (f"{summary.hits:,}", "collisions"),
         (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
     if first := summary.first_contact:
         tiles.append((f"{first.time:.6g}", "time code of the first"))
+    if looked:
+        tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
     tiles += [
         (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
         (f"{scene.face_count:,}", "triangles"),
         ("yes" if summary.certified else "no", f"certified for {CERTIFIED_FOR}"),
     ]
     data = {
-        "title": _title(summary),
+        "title": _title(scene),
         "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {summary.method} on "
         f"{summary.device}",
         "partial": "",
@@ -98,28 +241,11 @@ def _data(summary: Summary, worst: IntervalResult | None) -> dict:
             (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
             for interval in summary.intervals
         ],
+        "rest": [(at.time, at.crossings, at.touches) for at in summary.intersections],
         "toi": summary.toi_counts,
         "stages": list(summary.milliseconds.items()),
-        "pairs": [
-            {
-                "text": first if first == second else f"{first} with {second}",
-                "under": "with itself" if first == second else "",
-                "hits": hits,
-            }
-            for (first, second), hits in summary.mesh_pairs[:_MAX_ROWS]
-        ],
-        "more_pairs": max(0, len(summary.mesh_pairs) - _MAX_ROWS),
-        "worst": [
-            {
-                "start": interval.start,
-                "end": interval.end,
-                "hits": interval.hits,
-                "time": earliest.time,
-                "what": _describe(earliest),
-            }
-            for interval in summary.worst[:_MAX_ROWS]
-            if (earliest := interval.earliest)
-        ],
+        "pairs": _pairs_of_meshes(summary),
+        "up_axis": scene.up_axis,
         "facts": [
             ("File", scene.path),
             *scene.comments,
@@ -131,7 +257,6 @@ def _data(summary: Summary, worst: IntervalResult | None) -> dict:
         ],
         "notes": [summary.motion, *scene.warnings],
         "validation": None,
-        "view": _view(worst, scene) if worst and worst.contacts.interval.segment.meshes else None,
     }
     if not summary.is_complete:
         data["partial"] = (
@@ -148,63 +273,60 @@ def _data(summary: Summary, worst: IntervalResult | None) -> dict:
     return data
 
 
-def _view(result: IntervalResult, scene: Scene) -> dict:
-    """Returns the worst interval for the view in 3D: triangles at its start and end, and the contacts."""
-    contacts = result.contacts
-    interval, segment = contacts.interval, contacts.interval.segment
-    start, end = interval.x0.astype(np.float64), interval.x1.astype(np.float64)
-    faces = segment.faces
-    title = f"time {interval.start:g} to {interval.end:g}, {len(contacts):,} colliding pairs"
-    lit = contacts.colliding_faces
-    shown = np.arange(len(faces))
-    rows = np.arange(len(contacts))
-    if len(faces) > _MAX_FACES:
-        # Show the faces around the contact nearest to the middle of all.
-        places = contacts.position if len(contacts) else start[faces[:, 0]]
-        middle = places[np.argmin(np.abs(places - np.median(places, axis=0)).max(axis=1))]
-        distance = np.abs(start[faces].mean(axis=1) - middle).max(axis=1)
-        shown = np.sort(np.argpartition(distance, _MAX_FACES)[:_MAX_FACES])
-        rows = np.flatnonzero(np.abs(contacts.position - middle).max(axis=1) <= distance[shown].max())
-        title += f"; the {_MAX_FACES:,} of {len(faces):,} triangles around one place are shown"
-    lit = np.intersect1d(lit, shown)
-    vertices, corners = np.unique(faces[shown], return_inverse=True)
-    number = np.full(len(faces), -1)
-    number[shown] = np.arange(len(shown))
-    corners = corners.reshape(-1, 3)
-    if len(rows) > _MAX_CONTACTS:
-        rows = rows[np.linspace(0, len(rows) - 1, _MAX_CONTACTS).astype(int)]
-        title += f"; {_MAX_CONTACTS:,} contacts are shown"
-    center = (start[vertices].min(axis=0) + start[vertices].max(axis=0)) / 2
-    mesh_of_vertex, _ = segment.locate_vertices(vertices)
-    return {
-        "title": title,
-        "from": interval.start,
-        "to": interval.end,
-        "at": round(float(np.median(contacts.toi)), 3) if len(contacts) else 0.0,
-        "up_axis": scene.up_axis,
-        "meshes": [{"name": mesh.name, "moves": mesh.moves} for mesh in segment.meshes],
-        "start": _packed(start[vertices] - center, np.float32),
-        "end": _packed(end[vertices] - center, np.float32),
-        "mesh_of_vertex": _packed(mesh_of_vertex, np.uint32),
-        "faces": _packed(corners, np.uint32),
-        "lit": _packed(corners[number[lit]], np.uint32),
-        "contacts": _packed(contacts.position[rows] - center, np.float32),
-        "kinds": _packed(contacts.kind[rows], np.uint32),
-        "toi": _packed(contacts.toi[rows], np.float32),
-    }
+def _pairs_of_meshes(summary: Summary) -> list[dict]:
+    """Returns the meshes that collide or intersect: names, collisions, and when they collide and intersect.
+
+    Each has at most :data:`_MAX_ROWS` spans of time; ``more`` numbers count the others.
+    """
+    hits = dict(summary.mesh_pairs)
+    spans: dict[tuple[str, str], tuple[list, list]] = {}
+    for span in summary.collision_spans:
+        spans.setdefault(span.meshes, ([], []))[0].append((span.since, span.until, span.hits))
+    for span in summary.intersection_spans:
+        spans.setdefault(span.meshes, ([], []))[1].append((span.since, span.until, span.most, span.trend))
+    return [
+        {
+            "meshes": meshes,
+            "hits": hits.get(meshes, 0),
+            "spans": collisions[:_MAX_ROWS],
+            "more": max(0, len(collisions) - _MAX_ROWS),
+            "rest": at_rest[:_MAX_ROWS],
+            "more_rest": max(0, len(at_rest) - _MAX_ROWS),
+        }
+        for meshes, (collisions, at_rest) in sorted(spans.items(), key=lambda item: -hits.get(item[0], 0))[:_MAX_PAIRS]
+    ]
 
 
-def _describe(contact):
-    (first, second), (first_element, second_element) = contact.meshes, contact.elements
-    return f"{first}, {first_element}, with {'its' if first == second else second + ','} {second_element}"
+def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
+    """Returns which pairs are in the page: all, or ``most`` spread evenly with the first of each two meshes."""
+    if len(pairs) <= most:
+        return np.arange(len(pairs))
+    firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
+    others = np.delete(np.arange(len(pairs)), firsts)
+    return np.union1d(firsts, others[np.linspace(0, len(others) - 1, most - len(firsts)).astype(int)])
 
 
-def _title(summary):
-    return f"Collisions in {Path(summary.scene.path).name}"
+def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:
+    """Returns arrays as an element that the page's script unpacks by its name.
+
+    The content is the header, JSON, and the arrays in 32 bits, the first bytes of all numbers before the second ones,
+    which makes them easier to compress; all of it in base64, and compressed unless it is small: browsers take a
+    millisecond to unpack anything.
+    """
+    columns = {}
+    for key, array in arrays.items():
+        kind = np.float32 if array.dtype.kind == "f" else np.int32
+        columns[key] = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).reshape(-1)
+    header = json.dumps(facts | {"arrays": [(key, column.dtype.kind, len(column)) for key, column in columns.items()]})
+    planes = [column.view(np.uint8).reshape(-1, 4).T.tobytes() for column in columns.values()]
+    content, packed = b"".join([len(header).to_bytes(4, "little"), header.encode(), *planes]), ""
+    if len(content) > _SMALL_BLOCK:
+        content, packed = zlib.compress(content), ' data-packed="deflate"'
+    return f'<script type="text/plain" id="{name}"{packed}>{base64.b64encode(content).decode()}</script>\n'
 
 
-def _packed(values, dtype) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+def _title(scene):
+    return f"Collisions in {Path(scene.path).name}"
 
 
 def _inert(data) -> str:

@@ -1,55 +1,104 @@
 """Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
 
 import os
+import secrets
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from .._atomic_file import OutputFile
-from ..usd.layer import display_colors, find_instances_above, just_before, layer_metadata, unused_path
+from ..usd.layer import just_before, layer_metadata, unused_path
+from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
+from ..usd.segment import Segment
 from .intervals import IntervalResult
 from .outputs import without_last_eighth
-from .scene_contacts import KINDS
+from .scene_contacts import SceneContacts
+from .scene_intersections import SceneIntersections
 from .summary import Summary
 
-__all__ = ["Overlay"]
+__all__ = ["COLORS", "LIFT", "SHOWN_BY", "Overlay"]
 
-COLORS = {"vertex-face": (0.9, 0.1, 0.1), "edge-edge": (1.0, 0.55, 0.0)}
-"""Colours of the contact points by kind."""
-
-LIT = (0.95, 0.25, 0.2)
-"""Colour of the polygons that collide."""
-
-_UNLIT = (0.6, 0.6, 0.6)  # colour of a mesh that has none
-_DISPLAY_COLOR = "primvars:displayColor"
-_POINT_SIZE = 0.006  # diameter of a contact point, as a share of the scene's size
-
-_COPIED = 1 << 20  # bytes that are copied at once
-
-_CONTACTS = {
-    "extent": ("float3[]", None),
-    "points": ("point3f[]", None),
-    "primvars:displayColor": ("color3f[]", "vertex"),
-    "primvars:toi": ("float[]", "vertex"),
-    "primvars:elementA": ("string[]", "vertex"),
-    "primvars:elementB": ("string[]", "vertex"),
+COLORS = {
+    "Polygons": (0.85, 0.08, 0.06),
+    "VertexFace": (1.0, 0.9, 0.2),
+    "EdgeEdge": (1.0, 0.5, 0.0),
+    "Intersections": (0.6, 0.2, 1.0),
 }
-"""Attributes of the contact points that have time samples: their types and interpolations."""
+"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut."""
+
+LIFT = 2e-4
+"""Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
+
+SHOWN_BY = (
+    "Its prims are guides, which programs hide at first: usdview shows them by Display, Display Purposes, Guide; "
+    "Blender by Guide among the options of its import; usdrecord by --purposes guide."
+)
+"""How to see the overlay."""
+
+_MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of that size
+_CURVE_WIDTH = 0.0015  # width of the curves, too
+
+_EXTENT = {"extent": "float3[]"}
+_CONTACTS = _EXTENT | {
+    "positions": "point3f[]",
+    "protoIndices": "int[]",
+    "primvars:toi": "float[]",
+    "primvars:primA": "int[]",
+    "primvars:primB": "int[]",
+    "primvars:elementA": "int2[]",
+    "primvars:elementB": "int2[]",
+}
+_PARTS: dict[str, tuple[str, dict[str, str]]] = {
+    "Polygons": (
+        "Mesh",
+        _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},
+    ),
+    "VertexFace": ("PointInstancer", _CONTACTS),
+    "EdgeEdge": ("PointInstancer", _CONTACTS),
+    "Intersections": (
+        "BasisCurves",
+        _EXTENT
+        | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
+    ),
+}
+"""Prims of the layer: their types, and the types of their attributes that have time samples."""
 
 
 class Overlay:
-    """A layer in USD's text format whose sublayer is the scene, so that opening the layer shows both.
+    """A layer whose sublayer is the scene, so that opening the layer shows both. The scene's own prims stay untouched.
 
-    The contact points are one ``UsdGeom.Points`` with the primvars ``toi``, ``elementA`` and ``elementB``. It has a
-    sample at the start of each interval, with the contacts of that interval. Polygons that collide are coloured from
-    the start of the interval to the start of the next. USD interpolates between samples, so every sample is repeated
-    just before the next.
+    Below ``/Collisions`` are
+
+    - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
+      are lifted by :data:`LIFT` to both sides, move with the scene, and are there from the start of the interval to its
+      end;
+    - ``VertexFace`` and ``EdgeEdge``, markers at the contact points of both kinds, from the start of their interval to
+      its end. Each is an instance with the primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the
+      attribute ``prims`` of ``/Collisions``, which has their names; ``elementA`` and ``elementB``, the two elements in
+      the prims' own numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of
+      an edge;
+    - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
+      next. Each segment in which two triangles meet is a curve of its own, with ``primA`` and ``primB``. Elements that
+      only touch make no curve.
+
+    All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
+    points are instances of a mesh, as Blender binds no materials to USD's own points; it shows the curves grey, as it
+    binds none to USD's curves either.
+
+    Their purpose is guide, so that no render of the layer contains them by accident, and a replay of the layer does not
+    take them for a part of the scene. Programs hide guides until they are asked for them; :data:`SHOWN_BY` says how,
+    which the layer's documentation and the command line repeat.
+
+    A name that ends in ``.usda`` gives a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
+    smaller. USD interpolates between samples, so all that shall not move gets an empty sample just before the next.
 
     USD's own layers hold their whole content in memory. This one keeps its samples in a temporary file, the spool, and
-    sorts them by attribute at the end. It does not read the scene then, whose file may have become unreadable.
+    sorts them by attribute at the end, a few megabytes at a time. It does not read the scene then, whose file may have
+    become unreadable.
 
     Attributes:
         file: The file.
@@ -59,60 +108,57 @@ class Overlay:
         """Opens the file.
 
         Args:
-            path: The file's place, a ``.usda`` or ``.usd`` file.
+            path: The file's place, a ``.usda``, ``.usdc`` or ``.usd`` file.
             scene: The scene.
 
         Raises:
             OSError: If the file cannot be written.
             ValueError: If its name has another suffix.
         """
-        if Path(path).suffix not in (".usda", ".usd"):
-            raise ValueError(f"{path}: the overlay is USD in text form, its name must end in .usda or .usd")
+        suffix = Path(path).suffix
+        if suffix not in (".usda", ".usdc", ".usd"):
+            raise ValueError(f"{path}: the overlay is a layer of USD, its name must end in .usda, .usdc or .usd")
+        self._is_text = suffix == ".usda"
         self._scene = scene
-        self._samples: dict[tuple[str, str], list[_Sample]] = {}  # by prim and attribute
+        self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
         self._ends = []  # where each complete interval ends in the spool
-        self._last_start: float | None = None  # of the last interval added
-        self._colored = {}  # by path of the prim: the number of polygons in the last sample, and the lit ones
-        self._unlit = {}  # by path of the prim: the colours in the scene
-        self._polygon_counts = {}  # by path: the number of polygons in the last interval added
-        self._uncolored = False
-        self._opened = set()  # native instances that must get prims of their own to be coloured
+        self._last: SceneIntersections | None = None  # at the end of the last complete interval
+        self._prims: dict[str, int] = {}  # number of each mesh that is named, by its name
         self._root_path = unused_path(scene, "/Collisions")
-        self._contacts_path = f"{self._root_path}/Contacts"
         low, high = _bounds(scene)
-        self._width = _POINT_SIZE * float(np.linalg.norm(high - low)) or 1e-3
+        self._size = float(np.linalg.norm(high - low)) or 1.0
         self._metadata = layer_metadata(scene)
         self.file = OutputFile(path)
         self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
     def add(self, result: IntervalResult) -> None:
-        """Adds the contacts of an interval."""
-        interval, contacts = result.summary, result.contacts
-        prim = self._contacts_path
-        size = self._width / 2
-        points = contacts.position.astype(np.float32)
-        corners = [points.min(axis=0) - size, points.max(axis=0) + size] if len(points) else np.zeros((2, 3))
-        colors = np.array([COLORS[kind] for kind in KINDS])[contacts.kind]
-        toi = contacts.toi.astype(np.float32)
-        chunks = contacts.chunks()
-        for name, texts in {
-            "extent": [_tuples(corners)],
-            "points": (_tuples(points[rows]) for rows in chunks),
-            "primvars:displayColor": (_tuples(colors[rows]) for rows in chunks),
-            "primvars:toi": (", ".join(f"{value:.9g}" for value in toi[rows].tolist()) for rows in chunks),
-            "primvars:elementA": (_element_texts(contacts, rows, 0) for rows in chunks),
-            "primvars:elementB": (_element_texts(contacts, rows, 1) for rows in chunks),
-        }.items():
-            self._sample(prim, name, interval.start, texts)
-        self._color(interval, contacts)
-        self._last_start = interval.start
+        """Adds the contacts of an interval, and the intersections at its start."""
+        contacts = result.contacts
+        interval = contacts.interval
+        self._sample("Polygons", interval.start, *self._find_polygons(contacts))
+        for kind, name in enumerate(("VertexFace", "EdgeEdge")):
+            self._sample(name, interval.start, self._find_points(contacts, np.flatnonzero(contacts.kind == kind)))
+        if result.intersections:
+            self._sample("Intersections", interval.start, self._find_curves(result.intersections[0]))
+            self._last = result.intersections[1]
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
         """Writes the layer and puts it in its place."""
         del self._ends[len(summary.intervals) :]
-        self.file.truncate(0)
-        self._write(summary.first(len(self._ends)))
+        summary = summary.first(len(self._ends))
+        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
+        if self._last is not None and self._last.time == end > summary.intervals[-1].start:
+            last, self._last = self._last, None
+            self._sample("Intersections", end, self._find_curves(last), interval=len(self._ends) - 1)
+        content = self._content(summary, end)
+        if self._is_text:
+            self.file.truncate(0)
+            write_text_layer(content, self.file.write)
+        else:
+            temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+            write_binary_layer(content, temporary)
+            self.file.adopt(temporary)
         self.file.commit()
 
     def shrink(self) -> bool:
@@ -120,6 +166,7 @@ class Overlay:
         if not self._ends:
             return False
         self._ends = without_last_eighth(self._ends)
+        self._last = None
         self._spool.truncate(self._ends[-1] if self._ends else 0)
         return True
 
@@ -128,210 +175,186 @@ class Overlay:
         self._spool.close()
         self.file.discard()
 
-    def _sample(self, prim, name, time, texts, lit_count=0):
-        """Adds a sample of an attribute to the spool."""
-        place = self._spool.seek(0, os.SEEK_END)
-        separator = ""
-        for text in texts:
-            rest = memoryview((separator + text).encode())
-            while rest:
-                rest = rest[self._spool.write(rest) :]
-            separator = ", "
-        sample = _Sample(time, place, self._spool.tell() - place, lit_count)
-        self._samples.setdefault((prim, name), []).append(sample)
-
-    def _color(self, interval, contacts):
-        """Adds the colours of all meshes whose colours change at the start of an interval."""
-        meshes = {mesh.path: mesh for mesh in contacts.interval.segment.meshes if mesh.path == mesh.name}
-        lit = {}
+    def _find_polygons(self, contacts: SceneContacts):
+        """Returns the mesh of the polygons that collide in an interval, and its points just before the end."""
+        segment, faces = contacts.interval.segment, []
         for number, polygons in contacts.colliding_polygons().items():
-            mesh = contacts.interval.segment.meshes[number]
-            if mesh.path in meshes:
-                lit[mesh.path] = polygons
-            else:
-                self._uncolored = True
-        for path in sorted({*self._colored, *lit} & meshes.keys()):
-            count, polygons = meshes[path].polygon_count, lit.get(path, np.zeros(0, dtype=np.int64))
-            if path not in self._colored:
-                self._opened.update(find_instances_above(self._scene, path))
-                if self._last_start is not None:
-                    self._sample_colors(path, self._last_start, self._polygon_counts.get(path, count), polygons[:0])
-            old_count, old_polygons = self._colored.get(path, (None, None))
-            if old_count != count or not np.array_equal(old_polygons, polygons):
-                self._sample_colors(path, interval.start, count, polygons)
-                self._colored[path] = count, polygons
-        self._polygon_counts = {path: mesh.polygon_count for path, mesh in meshes.items()}
+            mesh = segment.meshes[number]
+            first = np.searchsorted(mesh.polygons, polygons)
+            last = np.searchsorted(mesh.polygons, polygons, side="right")
+            faces += [mesh.faces.start + np.arange(start, stop) for start, stop in zip(first, last, strict=True)]
+        if not faces:
+            return None, None
+        vertices, corners = np.unique(segment.faces[np.concatenate(faces)], return_inverse=True)
+        corners = corners.reshape(-1, 3)
+        start, stop = (self._lift(x[vertices], corners) for x in (contacts.interval.x0, contacts.interval.x1))
+        arrays = {
+            "extent": _box(np.concatenate([start, stop])),
+            "faceVertexCounts": np.full(2 * len(corners), 3),
+            "faceVertexIndices": np.concatenate([corners, corners[:, ::-1] + len(vertices)]).reshape(-1),
+            "points": start,
+        }
+        return arrays, (just_before(contacts.interval.end), stop)
 
-    def _sample_colors(self, path, time, count, lit):
-        colors = display_colors(self._scene, path, time)
-        self._unlit[path] = np.array([_UNLIT]) if colors is None else colors
-        text = _color_text(self._unlit[path], count, lit)
-        self._sample(path, _DISPLAY_COLOR, time, [text], count if len(lit) else 0)
+    def _lift(self, x, corners) -> np.ndarray:
+        """Returns the points of triangles moved along their normals, all to the one side and then all to the other."""
+        x = x.astype(np.float64)
+        a, b, c = np.moveaxis(x[corners], 1, 0)
+        across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        normal = np.stack([np.bincount(corners.reshape(-1), across[:, axis], len(x)) for axis in range(3)], axis=1)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        step = LIFT * self._size * np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+        return np.concatenate([x + step, x - step])
 
-    def _write(self, summary):
-        """Writes the whole layer for the intervals of a summary."""
-        spool_end = self._ends[-1] if self._ends else 0
-        parts = {path: [] for path in sorted(self._opened)}
-        for (path, name), samples in self._samples.items():
-            kept = [sample for sample in samples if sample.place < spool_end]
-            if kept:
-                parts.setdefault(path, []).append((name, kept))
-        writer = _Writer(self.file)
-        writer.write(self._head(summary))
-        end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
-        self._write_prims(writer, "", _tree(parts), parts, end)
-        writer.flush()
+    def _find_points(self, contacts: SceneContacts, rows: np.ndarray):
+        """Returns some contacts as points, None if there are none."""
+        if not len(rows):
+            return None
+        prims, indices = self._number_prims(contacts.segment, contacts.meshes[rows]), contacts.indices[rows]
+        return {
+            "extent": _box(contacts.position[rows], _MARKER_SIZE * self._size / 2),
+            "positions": contacts.position[rows],
+            "protoIndices": np.zeros(len(rows)),
+            "primvars:toi": contacts.toi[rows],
+            "primvars:primA": prims[:, 0],
+            "primvars:primB": prims[:, 1],
+            "primvars:elementA": indices[:, 0],
+            "primvars:elementB": indices[:, 1],
+        }
 
-    def _head(self, summary) -> str:
-        """Returns the layer's metadata as text."""
-        doc = f"Collisions found by warp-bsc replay. {summary.motion}"
-        if self._uncolored:
-            doc += " Polygons of point instancers are not coloured: their instances are one prim."
-        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
-        asset = source if source.startswith("../") else f"./{source}"
-        complete = "true" if summary.is_complete else "false"
-        stopped = f"\n            string stopped = {_quote(summary.stopped)}" if summary.stopped else ""
-        metadata = "\n    ".join(f"{name} = {_literal(value)}" for name, value in self._metadata.items())
-        return f"""#usda 1.0
-(
-    customLayerData = {{
-        dictionary collisions = {{
-            bool complete = {complete}
-            int hits = {summary.hits}
-            int intervals = {len(summary.intervals)}{stopped}
-        }}
-    }}
-    doc = {_quote(doc)}
-    {metadata}
-    subLayers = [
-        @@@{asset}@@@
-    ]
-)
-"""
+    def _find_curves(self, found: SceneIntersections):
+        """Returns the segments in which triangles meet as curves, None if there are none."""
+        if not found.crossings:
+            return None
+        cuts = found.cuts
+        prims, points = self._number_prims(found.segment, cuts.meshes), cuts.points.reshape(-1, 3)
+        return {
+            "extent": _box(points, _CURVE_WIDTH * self._size / 2),
+            "points": points,
+            "curveVertexCounts": np.full(len(cuts.points), 2),
+            "primvars:primA": prims[:, 0],
+            "primvars:primB": prims[:, 1],
+        }
 
-    def _write_prims(self, writer, path, tree, parts, end):
-        """Writes the prims below a path, from a tree of their names."""
-        indent = "    " * path.count("/")
-        for name, children in tree.items():
-            below = f"{path}/{name}"
-            kind = {self._root_path: "def Scope", self._contacts_path: "def Points"}.get(below, "over")
-            opened = " (\n" + indent + "    instanceable = false\n" + indent + ")" if below in self._opened else ""
-            writer.write(f'\n{indent}{kind} "{name}"{opened}\n{indent}{{\n')
-            if below == self._contacts_path:
-                writer.write(f"{indent}    float[] widths = [{self._width:.9g}] (\n")
-                writer.write(f'{indent}        interpolation = "constant"\n{indent}    )\n')
-            for attribute, samples in parts.get(below, ()):
-                self._write_attribute(writer, indent + "    ", below, attribute, samples, end)
-            self._write_prims(writer, below, children, parts, end)
-            writer.write(f"{indent}}}\n")
+    def _number_prims(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
+        """Returns numbers of meshes of a segment that hold for the whole layer."""
+        used, places = np.unique(meshes, return_inverse=True)
+        names = [segment.meshes[mesh].name for mesh in used]
+        return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[places].reshape(-1, 2)
 
-    def _write_attribute(self, writer, indent, path, name, samples, end):
-        """Writes an attribute's samples, and its value after the last interval."""
-        if path == self._contacts_path:
-            value_type, interpolation = _CONTACTS[name]
-            after = "(0, 0, 0), (0, 0, 0)" if name == "extent" else ""
-        else:
-            value_type, interpolation = "color3f[]", "uniform"
-            lit_count = samples[-1].lit_count
-            after = _color_text(self._unlit[path], lit_count, []) if lit_count else None
-            writer.write(f"{indent}int[] {name}:indices = None\n")  # the scene's own
-        writer.write(f"{indent}{value_type} {name}")
-        if interpolation:
-            writer.write(f' (\n{indent}    interpolation = "{interpolation}"\n{indent})\n{indent}{value_type} {name}')
-        writer.write(".timeSamples = {\n")
-        following = [*((sample.time, sample.length) for sample in samples[1:]), (end, len(after or ""))]
-        for sample, (time, length) in zip(samples, following, strict=True):
-            self._write_sample(writer, indent, sample.time, sample)
+    def _sample(self, name, time, arrays, moved=None, interval=None):
+        """Adds a sample of a prim's attributes to the spool, unless it would repeat an empty one.
+
+        Args:
+            name: The prim.
+            time: Time code.
+            arrays: Values by attribute, None if there is nothing at that time.
+            moved: A time just before the next sample, and the points at that time.
+            interval: Number of the interval that the sample belongs to; default: the one that is added.
+        """
+        samples = self._samples[name]
+        if arrays is None and samples and samples[-1].is_empty:
+            return
+        types = _PARTS[name][1]
+        self._spool.seek(0, os.SEEK_END)
+        places = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
+        after = (moved[0], self._store(types["points"], moved[1])) if moved else None
+        samples.append(_Sample(len(self._ends) if interval is None else interval, time, places, after))
+
+    def _store(self, value_type, array) -> "_Place":
+        data = np.ascontiguousarray(array, dtype=SHAPES[value_type][0])
+        place = _Place(self._spool.tell(), data.nbytes)
+        rest = memoryview(data).cast("B")
+        while rest:
+            rest = rest[self._spool.write(rest) :]
+        return place
+
+    def _load(self, value_type, place) -> np.ndarray:
+        dtype, width = SHAPES[value_type]
+        data = np.empty(place.size, np.uint8)
+        self._spool.seek(place.offset)
+        if self._spool.readinto(data) != place.size:
+            raise RuntimeError("the spool of the overlay is cut off")
+        return data.view(dtype).reshape((-1, width) if width > 1 else -1)
+
+    def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
+        """Yields the time samples of an attribute up to the end of the last interval, in order."""
+        value_type = _PARTS[name][1][attribute]
+        empty = self._load(value_type, _Place(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
+        samples = [sample for sample in self._samples[name] if sample.interval < len(self._ends)]
+        for index, sample in enumerate(samples):
+            if sample.is_empty:
+                yield sample.time, empty
+                continue
+            value = self._load(value_type, sample.places[attribute])
+            yield sample.time, value
+            is_last = index + 1 == len(samples)
+            following = end if is_last else samples[index + 1].time
+            if attribute == "points" and sample.moved:
+                yield sample.moved[0], self._load(value_type, sample.moved[1])
             # USD interpolates if both have values, and would show points on the way from one contact to another.
-            if sample.length and length and (before := just_before(time)) > sample.time:
-                if interpolation == "vertex":
-                    writer.write(f"{indent}    {before!r}: [],\n")
-                else:
-                    self._write_sample(writer, indent, before, sample)
-        if after is not None:
-            writer.write(f"{indent}    {end!r}: [{after}],\n")
-        writer.write(f"{indent}}}\n")
+            elif value_type.startswith(("float", "point")) and (before := just_before(following)) > sample.time:
+                yield before, value if attribute == "extent" else empty
+            if is_last and end > sample.time:
+                yield end, empty
 
-    def _write_sample(self, writer, indent, time, sample):
-        writer.write(f"{indent}    {time!r}: [")
-        self._spool.seek(sample.place)
-        for size in [_COPIED] * (sample.length // _COPIED) + [sample.length % _COPIED]:
-            writer.write_bytes(self._spool.read(size))
-        writer.write("],\n")
+    def _content(self, summary: Summary, end: float) -> LayerContent:
+        """Returns the content of the layer, given the last time of its intervals."""
+        source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
+        found = {"complete": summary.is_complete, "hits": summary.hits, "intervals": len(summary.intervals)}
+        if summary.intersections:
+            found["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
+        if summary.stopped:
+            found["stopped"] = summary.stopped
+        widths = {"Mesh": 0.0, "PointInstancer": _MARKER_SIZE * self._size, "BasisCurves": _CURVE_WIDTH * self._size}
+        return LayerContent(
+            metadata=self._metadata,
+            documentation=f"Collisions found by warp-bsc replay. {SHOWN_BY} {summary.motion}",
+            custom={"collisions": found},
+            sublayer=source if source.startswith("../") else f"./{source}",
+            root=self._root_path,
+            strings={"prims": list(self._prims)},
+            prims=[
+                LayerPrim(name, kind, attributes, COLORS[name], widths[kind])
+                for name, (kind, attributes) in _PARTS.items()
+            ],
+            samples=lambda name, attribute: self._time_samples(name, attribute, end),
+        )
 
 
-class _Writer:
-    """Writes many short texts as a few long ones."""
+@dataclass(frozen=True)
+class _Place:
+    """The place of an array in the spool: offset and size in bytes."""
 
-    def __init__(self, output):
-        self.file = output
-        self._waiting, self._length = [], 0
-
-    def write(self, text):
-        self.write_bytes(text.encode())
-
-    def write_bytes(self, data):
-        self._waiting.append(data)
-        self._length += len(data)
-        if self._length >= _COPIED:
-            self.flush()
-
-    def flush(self):
-        self.file.write(b"".join(self._waiting))
-        self._waiting, self._length = [], 0
+    offset: int
+    size: int
 
 
 @dataclass(frozen=True)
 class _Sample:
-    """A sample in the spool: its time, its place and length there, and the number of polygons if any is lit."""
+    """A sample of a prim in the spool.
 
+    Attributes:
+        interval: Number of the interval.
+        time: Time code.
+        places: The places of its arrays, by attribute.
+        moved: A time just before the next sample, and the place of the points at that time, if they move.
+    """
+
+    interval: int
     time: float
-    place: int
-    length: int
-    lit_count: int
+    places: dict[str, _Place]
+    moved: tuple[float, _Place] | None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing at that time."""
+        return not self.places
 
 
-def _color_text(colors, count, lit) -> str:
-    """Returns the colours of a mesh's polygons as text, :data:`LIT` for the lit ones."""
-    if len(colors) != count:
-        colors = colors.mean(axis=0, keepdims=True)
-    table, numbers = np.unique(colors, axis=0, return_inverse=True)
-    texts = np.array([_tuples([color]) for color in [*table, LIT]], dtype=object)
-    numbers = np.broadcast_to(numbers.reshape(-1), count).copy()
-    numbers[lit] = len(table)
-    return ", ".join(texts[numbers])
-
-
-def _element_texts(contacts, rows, side) -> str:
-    """Returns the first or the second elements of some contacts as text, with the names of their meshes."""
-    both = zip(contacts.mesh_names(rows), contacts.element_names(rows), strict=True)
-    return ", ".join(_quote(f"{names[side]} {elements[side]}") for names, elements in both)
-
-
-def _tree(paths) -> dict:
-    """Returns the names of prims as a tree of dictionaries."""
-    tree = {}
-    for path in paths:
-        place = tree
-        for name in path.strip("/").split("/"):
-            place = place.setdefault(name, {})
-    return tree
-
-
-def _tuples(rows) -> str:
-    return ", ".join(f"({x:.9g}, {y:.9g}, {z:.9g})" for x, y, z in np.asarray(rows, dtype=np.float32).tolist())
-
-
-def _literal(value: str | float) -> str:
-    """Returns a string or a number in the syntax of USD's text format."""
-    return _quote(value) if isinstance(value, str) else repr(value)
-
-
-def _quote(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    if escaped.isprintable():
-        return f'"{escaped}"'
-    return '"' + "".join(c if c.isprintable() else f"\\x{ord(c):02x}" if ord(c) < 128 else "?" for c in escaped) + '"'
+def _box(points, margin=0.0) -> np.ndarray:
+    """Returns the corners of the bounding box of points, with a margin around it, shape [2, 3]."""
+    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:

@@ -46,7 +46,7 @@ _CONSTRAINT_ARRAYS = (
     "separation",
     "friction",
     "kind",
-    "localized",
+    "within_tolerance",
     "toi",
     "approach",
     "slow",

@@ -239,15 +239,15 @@ def _impact(
     vertices: Vertices,
     corners: wp.vec4i,
     kind: int,
-    localized: bool,
+    within_tolerance: bool,
     toi: wp.float64,
     coordinates: wp.vec3d,
     normal: wp.vec3d,
 ) -> Impact:
     """Returns a contact as a differentiable function of the positions of its vertices."""
     found = Impact()
-    found.status = wp.where(localized, HIT, UNSURE)
-    found.localized = wp.where(localized, 1, 0)
+    found.status = wp.where(within_tolerance, HIT, UNSURE)
+    found.within_tolerance = wp.where(within_tolerance, 1, 0)
     found.toi = toi
     found.coordinates = coordinates
     found.normal = normal
@@ -302,8 +302,8 @@ def make_constraints(
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
         if edges == 1:
             coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
-        localized = constraints.localized[i]
-        impact = _impact(motion, vertices, corners, kind, localized, constraints.toi[i], coordinates, normal)
+        within_tolerance = constraints.within_tolerance[i]
+        impact = _impact(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
         weight = contact_weights(edges, impact.coordinates)
         normal = impact.normal
         if constraints.slow[i] == 1:
@@ -353,7 +353,7 @@ def truncate_paths(
             vertices,
             corners,
             kind,
-            record.localized[entry],
+            record.within_tolerance[entry],
             record.toi[entry],
             record.coordinates[entry],
             record.normal[entry],
@@ -373,7 +373,9 @@ def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: in
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]
-    impact = _impact(motion, vertices, corners, kind, contacts.localized[i], contacts.toi[i], at, contacts.normal[i])
+    impact = _impact(
+        motion, vertices, corners, kind, contacts.within_tolerance[i], contacts.toi[i], at, contacts.normal[i]
+    )
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)
 
 

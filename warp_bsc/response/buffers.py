@@ -70,7 +70,7 @@ class Constraints:
     separation: wp.array[wp.float64]  # along the normal [m]
     friction: wp.array[float]  # coefficient
     kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
-    localized: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
+    within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
     toi: wp.array[wp.float64]  # time of impact
     approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
     slow: wp.array[int]  # 1 if its elements move little, see constraints.is_slow

@@ -9,6 +9,7 @@ from .exclusion import Connectivity, crossed_at_start, is_movable
 __all__ = [
     "EDGE_EDGE_CONTACT",
     "EDGE_EDGE_PROXIMITY",
+    "LEAST_DISTANCE",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
@@ -28,6 +29,7 @@ __all__ = [
     "feasible",
     "feasible_in_contact",
     "gap",
+    "has_overflowed",
     "is_dividing",
     "is_excluded",
     "is_projecting",
@@ -73,7 +75,7 @@ _SLOW = wp.constant(wp.float64(0.5))
 _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
-_LEAST = wp.constant(wp.float64(0.1))
+LEAST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -90,7 +92,7 @@ class Contacts:
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
     status: wp.array[wp.int8]
-    localized: wp.array[wp.bool]
+    within_tolerance: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
@@ -121,6 +123,15 @@ def is_projecting(progress: Progress, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
     iteration = progress.status.iteration[0]
     return progress.contact_iteration[world] == iteration - 1 and not is_dividing(progress, world, iteration - 1)
+
+
+@wp.func
+def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
+    """Returns whether a queue of the detector was too small for a detection."""
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
+        if counts[i] > capacities[i]:
+            return True
+    return False
 
 
 @wp.func
@@ -202,7 +213,7 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 @wp.func
 def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    recovered = wp.max(start + _RECOVERY * path, _LEAST * separation)
+    recovered = wp.max(start + _RECOVERY * path, LEAST_DISTANCE * separation)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
@@ -271,7 +282,7 @@ def add_constraint(
     friction: float,
     slow: int,
     kind: int,
-    localized: bool,
+    within_tolerance: bool,
     toi: wp.float64,
     multiplier: wp.vec3d,
 ):
@@ -285,7 +296,7 @@ def add_constraint(
         constraints.friction[i] = friction
         constraints.slow[i] = slow
         constraints.kind[i] = kind
-        constraints.localized[i] = localized
+        constraints.within_tolerance[i] = within_tolerance
         constraints.toi[i] = toi
         constraints.approach[i] = approach_of(motion, vertices, corners, weights, normal, separation)
         constraints.position_multiplier[i] = multiplier

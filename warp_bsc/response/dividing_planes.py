@@ -10,18 +10,31 @@ slides along a plane goes on sliding, unlike what is truncated.
 import warp as wp
 
 from .buffers import Motion, Vertices
-from .constraints import to_double, to_single
-from .proximities import closest_vector
+from .constraints import LEAST_DISTANCE, to_double, to_single
+from .proximities import closest_direction
 
-__all__ = ["DividingPlanes", "add_dividing_planes", "add_plane", "allocate_dividing_planes", "position_on_sides"]
+__all__ = [
+    "DividingPlanes",
+    "add_dividing_plane",
+    "add_plane",
+    "allocate_dividing_planes",
+    "has_all_planes",
+    "position_on_sides",
+]
 
 _NONE = wp.constant(-1)
-_PASSES = wp.constant(256)
-"""Passes over the planes of a vertex, each projecting onto all of them in turn."""
-_MARGIN = wp.constant(wp.float64(0.25))
-"""Least distance of a plane from the elements at the start, as a share of their distance."""
-_ROUNDING = wp.constant(wp.float64(0.2))
-"""Distance from a plane that vertices are projected to, as a share of the elements' distance: room for rounding."""
+_INCOMPLETE = wp.constant(-2)
+"""End of a list that lacks a plane."""
+_STEPS = wp.constant(64)
+"""Most steps of the projection of a vertex onto its planes: it takes 4 on average, and 21 at most were seen."""
+_PARALLEL = wp.constant(wp.float64(1.0e-14))
+"""Squared sine up to which a normal counts as one within the span of others."""
+_MARGIN = wp.constant(wp.float64(0.2))
+"""Least distance from a plane after projection, as a share of the elements' distance at the start."""
+_NEAR_MARGIN = wp.constant(wp.float64(0.45))
+"""The same of elements that are so near that they may hardly come nearer, step after step: positions are rounded."""
+_ROOM = wp.constant(wp.float64(0.05))
+"""How much farther than that both are from the plane at the start at least, as a share of their distance."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _FAR = wp.constant(wp.float64(1.0e300))
@@ -29,14 +42,18 @@ _FAR = wp.constant(wp.float64(1.0e300))
 
 @wp.struct
 class DividingPlanes:
-    """Planes that vertices stay above, in a list for each vertex."""
+    """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
 
-    count: wp.array[int]
+    The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices.
+    """
+
+    count: wp.array[int]  # of planes, whether they fit or not
     normal: wp.array[wp.vec3d]
-    offset: wp.array[wp.float64]  # least coordinate of the vertex along the normal [m]
-    margin: wp.array[wp.float64]  # by which projection exceeds it [m]
-    next: wp.array[int]  # plane of the same vertex, or -1
-    first: wp.array[int]  # plane of a vertex, or -1
+    offset: wp.array[wp.float64]  # coordinate along the normal [m]
+    margin: wp.array[float]  # by which projection exceeds it [m]
+    split: wp.array[wp.int8]  # the first corner that stays below
+    next: wp.array[int]  # the next node in the list of the same vertex, or the end
+    first: wp.array[int]  # node of a vertex, or the end
 
 
 def allocate_dividing_planes(vertices: int, capacity: int, device: wp.Device) -> DividingPlanes:
@@ -45,21 +62,62 @@ def allocate_dividing_planes(vertices: int, capacity: int, device: wp.Device) ->
     planes.count = wp.zeros(1, dtype=int, device=device)
     planes.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
     planes.offset = wp.empty(capacity, dtype=wp.float64, device=device)
-    planes.margin = wp.empty(capacity, dtype=wp.float64, device=device)
-    planes.next = wp.empty(capacity, dtype=int, device=device)
+    planes.margin = wp.empty(capacity, dtype=float, device=device)
+    planes.split = wp.empty(capacity, dtype=wp.int8, device=device)
+    planes.next = wp.empty(4 * capacity, dtype=int, device=device)
     planes.first = wp.full(vertices, int(_NONE), dtype=int, device=device)
     return planes
 
 
 @wp.func
-def add_plane(planes: DividingPlanes, vertex: int, normal: wp.vec3d, offset: wp.float64, margin: wp.float64):
-    """Adds a plane to the list of a vertex if it fits; a contact without its planes is found again, and frozen."""
+def _add_node(planes: DividingPlanes, vertex: int, node: int):
+    """Puts a node before the list of a vertex."""
+    after = wp.atomic_exch(planes.first, vertex, node)
+    if node >= 0:
+        planes.next[node] = after
+
+
+@wp.func
+def add_plane(
+    planes: DividingPlanes, corners: wp.vec4i, split: int, normal: wp.vec3d, offset: wp.float64, margin: wp.float64
+):
+    """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` says so.
+
+    Args:
+        planes: The planes.
+        corners: The vertices, -1 for none. Those before ``split`` stay above the plane, the others below.
+        split: The first that stays below.
+        normal: Unit normal of the plane.
+        offset: Its coordinate along the normal [m].
+        margin: Least distance from it after projection [m].
+    """
     plane = wp.atomic_add(planes.count, 0, 1)
-    if plane < planes.normal.shape[0]:
+    fits = plane < planes.normal.shape[0]
+    if fits:
         planes.normal[plane] = normal
         planes.offset[plane] = offset
-        planes.margin[plane] = margin
-        planes.next[plane] = wp.atomic_exch(planes.first, vertex, plane)
+        planes.margin[plane] = float(margin)
+        planes.split[plane] = wp.int8(split)
+    for j in range(4):
+        if corners[j] >= 0:
+            _add_node(planes, corners[j], wp.where(fits, 4 * plane + j, _INCOMPLETE))
+
+
+@wp.func
+def has_all_planes(planes: DividingPlanes, vertex: int) -> bool:
+    """Returns whether all contacts of a vertex have a plane: of those that touch at the start, there is none."""
+    node = planes.first[vertex]
+    while node >= 0:
+        node = planes.next[node]
+    return node != _INCOMPLETE
+
+
+@wp.func
+def _half_space(planes: DividingPlanes, node: int):
+    """Returns the normal of a vertex's side of a plane, its least coordinate along it, and the margin."""
+    plane = node / 4
+    side = wp.where(node % 4 < int(planes.split[plane]), _ONE, -_ONE)
+    return side * planes.normal[plane], side * planes.offset[plane], wp.float64(planes.margin[plane])
 
 
 @wp.struct
@@ -94,47 +152,52 @@ def _side(
 
 
 @wp.func
-def add_dividing_planes(motion: Motion, vertices: Vertices, corners: wp.vec4i, edges: int, planes: DividingPlanes):
-    """Adds planes between two elements to the lists of those of their four vertices that can be moved.
+def add_dividing_plane(
+    motion: Motion,
+    vertices: Vertices,
+    corners: wp.vec4i,
+    edges: int,
+    separation: wp.float64,
+    planes: DividingPlanes,
+):
+    """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
-    vertex that cannot be moved. Elements that touch at the start get none.
+    vertex that cannot be moved. Elements that touch at the start have none.
     """
-    _weights, between = closest_vector(motion, corners, edges)
-    if wp.length(between) == _ZERO:
-        return
-    normal = wp.normalize(between)
+    normal = closest_direction(motion, corners, edges)
     origin = to_double(motion.x0[corners[3]])
     split = wp.where(edges == 1, 2, 1)
     above = _side(motion, vertices, corners, 0, split, origin, normal)
     below = _side(motion, vertices, corners, split, 4, origin, -normal)
     distance = above.start + below.start
+    movable = wp.vec4i()
+    for j in range(4):
+        movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)
     if distance <= _ZERO:
+        for j in range(4):
+            if movable[j] >= 0:
+                _add_node(planes, movable[j], _INCOMPLETE)
         return
-    margin = _ROUNDING * distance
+    margin = wp.where(distance < LEAST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
+    least = margin + _ROOM * distance
     share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
     offset = above.end + share * (-below.end - above.end)
-    offset = wp.clamp(offset, _MARGIN * distance - below.start, above.start - _MARGIN * distance)
+    offset = wp.clamp(offset, least - below.start, above.start - least)
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
-    at_origin = wp.dot(normal, origin)
-    for j in range(4):
-        vertex = corners[j]
-        if motion.inverse_mass[vertex] > 0.0:
-            if j < split:
-                add_plane(planes, vertex, normal, at_origin + offset, margin)
-            else:
-                add_plane(planes, vertex, -normal, -at_origin - offset, margin)
+    add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin)
 
 
 @wp.func
 def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
     """Returns whether a position of a vertex is above all of its planes."""
-    plane = planes.first[vertex]
-    while plane >= 0:
-        if wp.dot(planes.normal[plane], x) <= planes.offset[plane]:
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, _margin = _half_space(planes, node)
+        if wp.dot(normal, x) <= least:
             return False
-        plane = planes.next[plane]
+        node = planes.next[node]
     return True
 
 
@@ -149,23 +212,88 @@ def _precedes(a: wp.vec3d, b: wp.vec3d) -> bool:
 
 
 @wp.func
+def _steps_towards(normals: wp.mat33d, count: int, normal: wp.vec3d):
+    """Returns the part of a normal that is across the first ``count`` normals, and the coefficients of the rest."""
+    a = normals[0]
+    b = normals[1]
+    c = normals[2]
+    if count == 0:
+        return normal, wp.vec3d()
+    if count == 1:
+        return wp.cross(a, wp.cross(normal, a)), wp.vec3d(wp.dot(a, normal), _ZERO, _ZERO)
+    if count == 2:
+        across = wp.cross(a, b)
+        size = wp.length_sq(across)
+        of_a = wp.dot(wp.cross(normal, b), across) / size
+        of_b = wp.dot(wp.cross(a, normal), across) / size
+        return (wp.dot(normal, across) / size) * across, wp.vec3d(of_a, of_b, _ZERO)
+    bc = wp.cross(b, c)
+    volume = wp.dot(a, bc)
+    of_b = wp.dot(a, wp.cross(normal, c)) / volume
+    of_c = wp.dot(a, wp.cross(b, normal)) / volume
+    return wp.vec3d(), wp.vec3d(wp.dot(normal, bc) / volume, of_b, of_c)
+
+
+@wp.func
 def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
-    """Returns a position projected a few times onto the plane that it is farthest below, whatever their order."""
-    passes = int(0)
-    while passes < _PASSES:
-        most = _ZERO
-        farthest = wp.vec3d()
-        plane = planes.first[vertex]
-        while plane >= 0:
-            normal = planes.normal[plane]
-            missing = planes.offset[plane] - wp.dot(normal, x) + planes.margin[plane]
-            if missing > planes.margin[plane] and missing >= most:
-                if missing > most or _precedes(normal, farthest):
-                    most = missing
-                    farthest = normal
-            plane = planes.next[plane]
-        x += most * farthest
-        passes = wp.where(most == _ZERO, _PASSES, passes + 1)
+    """Returns the nearest position above the planes of a vertex, whatever their order (Goldfarb and Idnani 1983).
+
+    The planes that the position lies on are at most three, the active ones. The plane that it is farthest below joins
+    them; what pushes the wrong way then leaves. If rounding prevents an end, the position is near, but not above all.
+    """
+    normals = wp.mat33d()
+    multipliers = wp.vec3d()
+    count = int(0)
+    joins = bool(False)  # whether a plane is about to join the active ones
+    normal = wp.vec3d()
+    height = _ZERO  # least coordinate along it
+    multiplier = _ZERO
+    left = int(_STEPS)
+    while left > 0:
+        left -= 1
+        if not joins:
+            most = _ZERO
+            node = planes.first[vertex]
+            while node >= 0:
+                other, least, margin = _half_space(planes, node)
+                missing = least + margin - wp.dot(other, x)
+                if missing >= margin and missing >= most:
+                    if missing > most or _precedes(other, normal):
+                        most = missing
+                        normal = other
+                        height = least + margin
+                node = planes.next[node]
+            if most == _ZERO:
+                return x
+            joins = True
+            multiplier = _ZERO
+        across, parts = _steps_towards(normals, count, normal)
+        rise = wp.dot(across, normal)
+        length = _FAR
+        if rise > _PARALLEL:
+            length = (height - wp.dot(normal, x)) / rise
+        leaves = int(_NONE)
+        for j in range(count):
+            if parts[j] > _ZERO and multipliers[j] < length * parts[j]:
+                length = multipliers[j] / parts[j]
+                leaves = j
+        if length == _FAR:
+            return x
+        for j in range(count):
+            multipliers[j] = multipliers[j] - length * parts[j]
+        multiplier += length
+        if rise > _PARALLEL:
+            x += length * across
+        if leaves == _NONE:
+            normals[count] = normal
+            multipliers[count] = multiplier
+            count += 1
+            joins = False
+        else:
+            count -= 1
+            for j in range(leaves, count):
+                normals[j] = normals[j + 1]
+                multipliers[j] = multipliers[j + 1]
     return x
 
 
@@ -173,13 +301,14 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
 def _share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
     """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = _ONE
-    plane = planes.first[vertex]
-    while plane >= 0:
-        before = wp.dot(planes.normal[plane], x0) - planes.offset[plane]
-        after = wp.dot(planes.normal[plane], x1) - planes.offset[plane]
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, margin = _half_space(planes, node)
+        before = wp.dot(normal, x0) - least
+        after = wp.dot(normal, x1) - least
         if after <= _ZERO and before > after:
-            share = wp.min(share, wp.max(before - planes.margin[plane], _ZERO) / (before - after))
-        plane = planes.next[plane]
+            share = wp.min(share, wp.max(before - margin, _ZERO) / (before - after))
+        node = planes.next[node]
     return share
 
 

@@ -19,6 +19,7 @@ from .constraints import (
     contact_weights,
     count_contact,
     feasible_in_contact,
+    has_overflowed,
     is_dividing,
     is_slow,
     to_double,
@@ -27,7 +28,7 @@ from .constraints import (
     update_first_contact,
     widened,
 )
-from .dividing_planes import DividingPlanes, add_dividing_planes, position_on_sides
+from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
 from .exclusion import crossed_at_start, is_movable
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
@@ -135,7 +136,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_planes(motion, vertices, corners, contacts.edges, dividing)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing)
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
@@ -156,7 +157,7 @@ def _collect_contact(
         friction,
         slow,
         kind,
-        contacts.localized[i],
+        contacts.within_tolerance[i],
         contacts.toi[i],
         multiplier,
     )
@@ -172,12 +173,18 @@ def collect_contacts(
     dividing: DividingPlanes,
     progress: Progress,
     separation: wp.float64,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    can_search: bool,
 ):
     """Counts the contacts of both kinds, and adds constraints for them; after the last projection, dividing planes.
 
-    Then it finds the first contact of each vertex as well.
+    Then it finds the first contact of each vertex as well. Does nothing if :mod:`.queueless` is to find all contacts,
+    because a queue overflowed: which contacts are among those that fit depends on the order of threads.
     """
     i = wp.tid()
+    if can_search and has_overflowed(counts, capacities):
+        return
     _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, progress, separation)
     _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, progress, separation)
 
@@ -214,9 +221,7 @@ def decide(
     :mod:`.queueless`, and decided upon by another launch.
     """
     status = progress.status
-    overflowed = bool(False)
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        overflowed = overflowed or counts[i] > capacities[i]
+    overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and status.undetected[0] == 0:
         status.undetected[0] = 1
         status.hits[0] = 0
@@ -259,7 +264,7 @@ def _record_truncation(
     record.toi[entry] = time
     if kind != PLANE_CONTACT and kind != NO_CONTACT:
         record.contact[entry] = contact_vertices(contacts, i)
-        record.localized[entry] = contacts.localized[i]
+        record.within_tolerance[entry] = contacts.within_tolerance[i]
         record.toi[entry] = contacts.toi[i]
         record.coordinates[entry] = contacts.coordinates[i]
         record.normal[entry] = contacts.normal[i]
@@ -296,30 +301,35 @@ def truncate_vertices(
             _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
         else:
             _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
-    divides = bool(False)
-    if dividing.first:
-        divides = cuts and dividing.first[vertex] >= 0
-    if divides:
-        end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], vertices.x1[vertex])
-        outcome = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
-        if int(key & wp.int64(3)) == NO_CONSTRAINT:
-            vertices.velocity[vertex] = (end - motion.x0[vertex]) / float(dt)
+    outcome = vertices.outcome[vertex]
+    if cuts:
+        x0 = motion.x0[vertex]
+        end = vertices.x1[vertex]
+        divides = bool(False)
+        complete = bool(False)
+        if dividing.first:
+            divides = dividing.first[vertex] >= 0
+            complete = divides and has_all_planes(dividing, vertex)
+        if divides:
+            end, truncated = position_on_sides(dividing, vertex, x0, end)
+            outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+        if not complete:
+            path = truncated_path(to_double(x0), to_double(end), time)
+            end = to_single(to_double(x0) + path)
+            outcome = outcome | TRUNCATED
+            if not divides:
+                vertices.velocity[vertex] = to_single(path / dt)
+        if divides and int(key & wp.int64(3)) == NO_CONSTRAINT:
+            vertices.velocity[vertex] = (end - x0) / float(dt)
             outcome = outcome | UNCONSTRAINED
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = outcome
-    elif cuts:
-        x0 = to_double(motion.x0[vertex])
-        path = truncated_path(x0, to_double(vertices.x1[vertex]), time)
-        vertices.x1[vertex] = to_single(x0 + path)
-        vertices.changed[vertex] = 1
-        vertices.velocity[vertex] = to_single(path / dt)
-        vertices.outcome[vertex] = vertices.outcome[vertex] | TRUNCATED
-    elif vertices.outcome[vertex] & FROZEN == 0:
+    elif outcome & FROZEN == 0:
         vertices.x1[vertex] = motion.x0[vertex]
         vertices.changed[vertex] = 1
         vertices.velocity[vertex] = wp.vec3()
-        vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+        vertices.outcome[vertex] = outcome | FROZEN
         wp.atomic_add(progress.status.newly_frozen, 0, 1)
 
 

@@ -115,7 +115,8 @@ def collect_penetrations(
             if not dividing.first:
                 continue
             margin = _MARGIN * separation
-            add_plane(dividing, vertex, normal, plane[3] + wp.min(wp.float64(2.0) * error_after, margin), margin)
+            least = plane[3] + wp.min(wp.float64(2.0) * error_after, margin)
+            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, least, margin)
             multiplier = TOUCH * normal
         else:
             progress.status.projecting[0] = 1

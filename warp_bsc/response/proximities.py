@@ -13,6 +13,7 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     add_constraint,
     feasible,
+    has_overflowed,
     is_projecting,
     is_slow,
     longest_path,
@@ -21,7 +22,7 @@ from .constraints import (
 )
 from .exclusion import Connectivity, crossed_at_start, is_movable
 
-__all__ = ["Proximities", "closest_vector", "collect_proximities", "drop_proximities"]
+__all__ = ["Proximities", "closest_direction", "closest_vector", "collect_proximities", "drop_proximities"]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _REACH = wp.constant(wp.float64(1.5))
@@ -75,6 +76,25 @@ def closest_vector(motion: Motion, corners: wp.vec4i, edges: int):
     """Returns the weights of the closest points of two elements at the start, and the vector between them [m]."""
     weights = _closest_weights(motion, corners, edges)
     return weights, relative(weights, corners, motion.x0)
+
+
+@wp.func
+def closest_direction(motion: Motion, corners: wp.vec4i, edges: int) -> wp.vec3d:
+    """Returns the unit vector from the second to the first of two elements at the start; zero if they touch.
+
+    Within both elements it is across both, which rounding hardly turns, however near they are.
+    """
+    weights, between = closest_vector(motion, corners, edges)
+    if _is_within(weights, edges):
+        b = to_double(motion.x0[corners[1]])
+        c = to_double(motion.x0[corners[2]])
+        d = to_double(motion.x0[corners[3]])
+        across = wp.cross(c - b, d - b)
+        if edges == 1:
+            across = wp.cross(b - to_double(motion.x0[corners[0]]), d - c)
+        if wp.length_sq(across) > _ZERO:
+            between = wp.where(wp.dot(across, between) < _ZERO, -across, across)
+    return wp.normalize(between)
 
 
 @wp.func
@@ -157,8 +177,5 @@ def drop_proximities(
 
     They only save iterations; but which of them fit would depend on the order of threads.
     """
-    missing = constraints.count[0] > constraints.vertices.shape[0] - needed
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        missing = missing or counts[i] > capacities[i]
-    if missing:
+    if has_overflowed(counts, capacities) or constraints.count[0] > constraints.vertices.shape[0] - needed:
         constraints.count[0] = kept[0]

@@ -7,7 +7,6 @@ import warp as wp
 from ..detection.broad_phase_hierarchy import (
     BroadPhaseHierarchy,
     FaceHierarchy,
-    lowest_bit,
     overlapping_edges,
     overlapping_vertices,
     traversal_kernel,
@@ -21,7 +20,7 @@ from ..kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
 from .constraints import NO_CONSTRAINT, count_contact, update_first_contact
-from .dividing_planes import DividingPlanes, add_dividing_planes
+from .dividing_planes import DividingPlanes, add_dividing_plane
 from .exclusion import Connectivity, crossed_at_start, is_movable
 
 __all__ = ["find_contacts_without_queues"]
@@ -39,6 +38,7 @@ class _Arguments:
     vertices: Vertices
     dividing: DividingPlanes
     progress: Progress
+    separation: wp.float64
 
 
 @wp.func
@@ -80,7 +80,7 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
         wp.atomic_add(arguments.progress.status.crossed_hits, 0, 1)
         return
     count_contact(arguments.progress, motion.world[corners[0]])
-    add_dividing_planes(motion, arguments.vertices, corners, edges, arguments.dividing)
+    add_dividing_plane(motion, arguments.vertices, corners, edges, arguments.separation, arguments.dividing)
     for j in range(4):
         arguments.vertices.changed[corners[j]] = 1
         update_first_contact(arguments.vertices, corners[j], result.toi, NO_CONSTRAINT, 0)
@@ -94,7 +94,7 @@ def _decide_faces(arguments: _Arguments, place: int, other: int):
     left = left | ((overlapping_vertices(mesh, other, place, False) >> 3) << 3)
     left = left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
     while left != 0:  # one body for all, which is large
-        bit = lowest_bit(left)
+        bit = lowest_place(wp.uint32(left))
         left = left & (left - 1)
         kind = VERTEX_FACE
         pair = wp.vec2i()
@@ -139,6 +139,7 @@ def find_contacts_without_queues(
     vertices: Vertices,
     dividing: DividingPlanes,
     progress: Progress,
+    separation: float,
 ) -> None:
     """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
 
@@ -152,8 +153,10 @@ def find_contacts_without_queues(
         vertices: The vertices as they are moved.
         dividing: The dividing planes.
         progress: The progress of the response.
+        separation: Distance that projection moves contacts apart [m].
     """
     arguments = _Arguments()
     arguments.faces, arguments.mesh, arguments.motion = broad_phase.hierarchy, mesh, motion
     arguments.vertices, arguments.dividing, arguments.progress = vertices, dividing, progress
+    arguments.separation = wp.float64(separation)
     broad_phase.traverse(_kernel(), arguments)

@@ -68,7 +68,7 @@ _TOLERANCE = 0.1
 _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
 _DIVIDING_PLANES = 32
-"""Capacity for dividing planes, for each particle."""
+"""Capacity for dividing planes, for each particle: piles of cloth take up to 9."""
 _ITERATIONS_RESERVED = 2
 """Iterations for whose contacts constraints are reserved."""
 
@@ -153,9 +153,7 @@ class Response:
         self._most_penetrations = self._movable * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
         self._crossing_candidates = CrossingCandidates(mesh)
-        self._dividing_planes = allocate_dividing_planes(
-            mesh.vertex_count, _DIVIDING_PLANES * self._movable + 8192, device
-        )
+        self._dividing_planes = allocate_dividing_planes(mesh.vertex_count, _DIVIDING_PLANES * self._movable, device)
         self._dividing = DividingPlanes() if differentiable else self._dividing_planes
         progress.max_slow_iterations = MAX_ITERATIONS if differentiable else MAX_SLOW_ITERATIONS
         progress.slow_position_sweeps = int(MAX_SWEEPS) if differentiable else SLOW_POSITION_SWEEPS
@@ -369,7 +367,7 @@ class Response:
         contacts = list(self._contacts())
         queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
         inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
-        self._launch_over(collect_contacts, queues, inputs)
+        self._launch_over(collect_contacts, queues, [*inputs, *self._fill_of_queues()])
         if self._recorder is not None:
             self._launch_over(count_grazing, queues, [motion, vertices, *contacts, self._record])
         if self._most_penetrations:
@@ -384,9 +382,12 @@ class Response:
         return not self._differentiable and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
 
     def _decide(self):
-        counts, capacities = self.detector.counters.array, self.detector.capacities
-        inputs = [self.constraints, self._progress, counts, capacities, self._can_search]
+        inputs = [self.constraints, self._progress, *self._fill_of_queues()]
         wp.launch(decide, 1, inputs=inputs, device=self.device)
+
+    def _fill_of_queues(self):
+        """Returns what says whether a queue of the detector overflowed, and whether contacts can be searched then."""
+        return self.detector.counters.array, self.detector.capacities, self._can_search
 
     def _search(self):
         """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
@@ -394,7 +395,7 @@ class Response:
         assert isinstance(broad_phase, BroadPhaseHierarchy)
         broad_phase.fit(motion.x0, self.vertices.x1)
         find_contacts_without_queues(
-            broad_phase, self._connectivity, motion, self.vertices, self._dividing, self._progress
+            broad_phase, self._connectivity, motion, self.vertices, self._dividing, self._progress, self.separation
         )
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
@@ -408,7 +409,11 @@ class Response:
             contacts.mesh = self._connectivity
             contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
             contacts.elements, contacts.counts = elements, narrow_phase.counts
-            contacts.pairs, contacts.status, contacts.localized = found.pairs, found.status, found.within_tolerance
+            contacts.pairs, contacts.status, contacts.within_tolerance = (
+                found.pairs,
+                found.status,
+                found.within_tolerance,
+            )
             contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
             yield contacts
 

@@ -26,7 +26,7 @@ MAX_OFFSETS = wp.constant(64)
 
 OFFSETS = "sweep_offsets", "constraint_offsets", "truncation_offsets"
 PER_ENTRY = "constraint", "multiplier", "previous_multiplier", "momentum"
-PER_TRUNCATION = "vertex", "end", "contact", "kind", "localized", "toi", "coordinates", "normal"
+PER_TRUNCATION = "vertex", "end", "contact", "kind", "within_tolerance", "toi", "coordinates", "normal"
 """Arrays of a record that have an element for each iteration, each entry, and each truncated path."""
 
 
@@ -58,7 +58,7 @@ class StepRecord:
     end: wp.array[wp.vec3]  # of the path before it was truncated [m]
     kind: wp.array[int]  # of the contact that it was truncated before, or NO_CONTACT
     contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a plane
-    localized: wp.array[wp.bool]
+    within_tolerance: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]

@@ -1,13 +1,11 @@
-"""Facts of a scene for a layer over it: metadata, display colours, instances, and time codes just before others."""
+"""Facts of a scene for a layer over it: metadata, unused paths, and time codes just before others."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
-import numpy as np
-
 from .scene import Scene
 
-__all__ = ["display_colors", "find_instances_above", "just_before", "layer_metadata", "unused_path"]
+__all__ = ["just_before", "layer_metadata", "unused_path"]
 
 
 def unused_path(scene: Scene, path: str) -> str:
@@ -38,38 +36,6 @@ def layer_metadata(scene: Scene) -> dict[str, str | float]:
         "timeCodesPerSecond": stage.GetTimeCodesPerSecond(),
         "upAxis": scene.up_axis,
     }
-
-
-def display_colors(scene: Scene, path: str, time: float) -> np.ndarray | None:
-    """Returns the display colours of a mesh at a time.
-
-    Args:
-        scene: The scene.
-        path: The mesh's path.
-        time: Time code.
-
-    Returns:
-        RGB, float64: of each polygon, shape [polygon_count, 3], if the mesh has uniform colours; otherwise their mean,
-        shape [1, 3]. None if the mesh has no colour.
-    """
-    from pxr import UsdGeom  # noqa: PLC0415 (slow)
-
-    primvar = UsdGeom.Gprim(scene.stage.GetPrimAtPath(path)).GetDisplayColorPrimvar()
-    values = primvar.ComputeFlattened(time) if primvar and primvar.HasValue() else None
-    if not values:
-        return None
-    colors = np.array(values, dtype=np.float64)
-    return colors if primvar.GetInterpolation() == UsdGeom.Tokens.uniform else colors.mean(axis=0, keepdims=True)
-
-
-def find_instances_above(scene: Scene, path: str) -> list[str]:
-    """Returns the paths of the native instances that a prim is inside of: only their prototype can be edited there."""
-    prim, instances = scene.stage.GetPrimAtPath(path), []
-    while prim.IsInstanceProxy():
-        prim = prim.GetParent()
-        if prim.IsInstance():
-            instances.append(str(prim.GetPath()))
-    return instances
 
 
 def just_before(time: float) -> float:

@@ -1,11 +1,10 @@
-// Fills in the page from the data in it. Text goes in as text, never as markup.
+// Fills in the page from the data in it, and ties its parts together. Text goes in as text, never as markup.
 "use strict";
 
-const data = JSON.parse(document.getElementById("data").textContent);
 const SVG = "http://www.w3.org/2000/svg";
 const byId = (id) => document.getElementById(id);
 const count = (number) => number.toLocaleString("en");
-const short = (number) => String(Number(number.toPrecision(7)));
+const short = (number) => String(Number(number.toPrecision(Math.abs(number) < 1e4 ? 6 : 9)));
 const plural = (number, one) => `${count(number)} ${one}${number === 1 ? "" : "s"}`;
 
 function add(parent, name, attributes = {}, text = null) {
@@ -62,9 +61,9 @@ function niceStep(range, parts) {
 }
 
 // Bars: {from, to, parts: [numbers, one a class], tip}.
-function addBars(parent, bars, classes, width, xLabel) {
+function addBars(parent, bars, classes, width, xLabel, height = 230, least = 46) {
   const most = Math.max(1, ...bars.map((bar) => bar.parts.reduce((a, b) => a + b, 0)));
-  const height = 230, left = Math.max(46, 8 * count(most).length + 14), bottom = 40, top = 8, right = 20;
+  const left = Math.max(least, 8 * count(most).length + 14), bottom = xLabel ? 40 : 6, top = 8, right = 20;
   const low = bars[0].from, high = bars[bars.length - 1].to;
   const x = (value) => left + ((value - low) / (high - low || 1)) * (width - left - right);
   const y = (value) => height - bottom - (value / most) * (height - bottom - top);
@@ -74,12 +73,12 @@ function addBars(parent, bars, classes, width, xLabel) {
     add(chart, "line", { class: "grid", x1: left, x2: width - right, y1: y(value), y2: y(value) });
     add(chart, "text", { x: left - 7, y: y(value) + 4, "text-anchor": "end" }, count(value));
   }
-  const stepX = niceStep(high - low, width / 110);
+  const stepX = xLabel ? niceStep(high - low, width / 110) : Infinity;
   for (let at = Math.ceil(low / stepX - 1e-9); at * stepX <= high + 1e-9 * stepX; at += 1) {
     const options = { x: x(at * stepX), y: height - bottom + 17, "text-anchor": "middle" };
     add(chart, "text", options, short(at * stepX));
   }
-  add(chart, "text", { x: (left + width) / 2, y: height - 5, "text-anchor": "middle" }, xLabel);
+  if (xLabel) add(chart, "text", { x: (left + width) / 2, y: height - 5, "text-anchor": "middle" }, xLabel);
   for (const bar of bars) {
     const gap = Math.min(1.5, (x(bar.to) - x(bar.from)) * 0.12);
     const box = { x: x(bar.from) + gap, width: Math.max(0.5, x(bar.to) - x(bar.from) - 2 * gap) };
@@ -89,24 +88,208 @@ function addBars(parent, bars, classes, width, xLabel) {
       sum += part;
     });
     const hover = { x: x(bar.from), width: x(bar.to) - x(bar.from), y: top, height: height - bottom - top };
-    addTip(add(chart, "rect", { ...hover, class: "hover" }), bar.tip);
+    const area = add(chart, "rect", { ...hover, class: "hover" });
+    addTip(area, bar.tip);
+    if (bar.click) area.addEventListener("click", bar.click);
   }
+  return { chart, x, bottom: height - bottom };
 }
 
+
+// --- The state: the interval in the view, and what the table is filtered by. The address has it after the #. ---
+
+const state = { interval: -1, prims: [], text: "", kind: "", only: false };
+const LAST = data.intervals.length - 1;
+const restAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[index][2] : 0);
+const hitsIn = (index) => data.intervals[index][2] + data.intervals[index][3];
+const isBusy = (index) => hitsIn(index) + restAt(index) + (index === LAST ? restAt(index + 1) : 0) > 0;
+let table = null, rows = null, viewer = null;
+
+function addressOf(interval, prims) {
+  const parts = new URLSearchParams();
+  if (interval >= 0) parts.set("interval", interval);
+  prims.forEach((name) => parts.append("prim", name));
+  return `#${parts}`;
+}
+
+function readAddress() {
+  const parts = new URLSearchParams(location.hash.slice(1));
+  state.prims = parts.getAll("prim").slice(0, 2);
+  const interval = Number(parts.get("interval") ?? -1);
+  if (Number.isInteger(interval) && interval >= 0 && interval <= LAST) showInterval(interval);
+  filterRows();
+}
+
+function showInterval(index, at = null) {
+  if (index < 0 || index > LAST) return;
+  const isNew = index !== state.interval;
+  state.interval = index;
+  history.replaceState(null, "", addressOf(index, state.prims));
+  markInterval();
+  if (isNew && state.only) filterRows();
+  viewer.show(index, at);
+}
+
+// Goes to the next interval, in the direction of the step, in which there is something to see.
+function stepInterval(step, from = state.interval) {
+  for (let index = from + step; index >= 0 && index <= LAST; index += step)
+    if (isBusy(index)) return showInterval(index);
+  return undefined;
+}
+
+function mostInterval() {
+  let best = 0;
+  const weight = (index) => hitsIn(index) * 1e6 + restAt(index);
+  for (let index = 1; index <= LAST; index += 1) if (weight(index) > weight(best)) best = index;
+  return best;
+}
+
+// --- The timeline ---
+
+let timeline = null, mark = null;
+
 function fillIntervals() {
+  if (LAST < 0) return;
   addKey(byId("intervals-legend"), { class: "first" }, "vertex-face");
   addKey(byId("intervals-legend"), { class: "second" }, "edge-edge");
-  const together = Math.ceil(data.intervals.length / 400);
-  const bars = [];
+  if (data.rest.length) addKey(byId("intervals-legend"), { class: "third" }, "edges in faces, at rest");
+  const width = Math.max(340, Math.min(1100, byId("intervals").clientWidth || 1100));
+  const together = Math.ceil(data.intervals.length / (width / 2.5));
+  const bars = [], restBars = [];
   for (let at = 0; at < data.intervals.length; at += together) {
     const some = data.intervals.slice(at, at + together);
     const sum = (column) => some.reduce((total, interval) => total + interval[column], 0);
     const [from, to] = [some[0][0], some[some.length - 1][1]];
-    const text = `time ${short(from)} to ${short(to)}\n${count(sum(2))} vertex-face\n${count(sum(3))} edge-edge`;
-    bars.push({ from, to, parts: [sum(2), sum(3)], tip: text });
+    const rest = data.rest.slice(at, at + together);
+    const most = (column) => rest.reduce((largest, sample) => Math.max(largest, sample[column]), 0);
+    let tip = `time ${short(from)} to ${short(to)}\n${count(sum(2))} vertex-face\n${count(sum(3))} edge-edge`;
+    if (rest.length) tip += `\n${together > 1 ? "at most " : ""}${count(most(1))} edges through faces`;
+    if (most(2)) tip += `, ${count(most(2))} touch`;
+    const click = () => {
+      let best = at;
+      for (let index = at; index < at + some.length; index += 1)
+        if (hitsIn(index) * 1e6 + restAt(index) > hitsIn(best) * 1e6 + restAt(best)) best = index;
+      showInterval(best);
+    };
+    const place = { from, to: to > from ? to : from + 1, tip, click };
+    bars.push({ ...place, parts: [sum(2), sum(3)] });
+    restBars.push({ ...place, parts: [most(1) + most(2)] });
   }
-  if (bars.length) addBars(byId("intervals"), bars, ["first", "second"], 1100, "time code");
+  timeline = addBars(byId("intervals"), bars, ["first", "second"], width, "time code", 200, 64);
+  if (data.rest.length) addBars(byId("intervals"), restBars, ["third"], width, "", 80, 64);
+  mark = add(timeline.chart, "rect", { class: "mark", y: 2, height: timeline.bottom - 1, rx: 3 });
 }
+
+function markInterval() {
+  const [from, to] = data.intervals[state.interval];
+  const [left, right] = [timeline.x(from), timeline.x(to > from ? to : from + 1)];
+  mark.setAttribute("x", left - 1);
+  mark.setAttribute("width", right - left + 2);
+}
+
+// --- The tables ---
+
+// A link that filters the table by a prim.
+function addPrim(parent, mesh) {
+  const { name } = data.meshes[mesh];
+  const link = add(parent, "a", { href: addressOf(-1, [name]), title: `Only ${name}`, class: "prim" });
+  // The end of a long path says most: it stays in sight.
+  add(link, "bdi", {}, name);
+  return link;
+}
+
+function fillTable() {
+  const side = (title, mesh, isSecond) => ({
+    title,
+    fill: (cell, row) => {
+      addPrim(cell, rows[mesh][row]);
+      add(cell, "span", { class: "element" }, elementText(rows, row, isSecond));
+    },
+    key: (row) => ranks[rows[mesh][row]] * 2 ** 32 + rows[isSecond ? "second_0" : "first_0"][row],
+  });
+  const ranks = [];
+  data.meshes.map(({ name }, index) => [name, index]).sort(([a], [b]) => (a < b ? -1 : 1)).forEach(([, index], rank) => { ranks[index] = rank; });
+  const PHASES = ["passes", "enters", "leaves", "stays"];
+  const columns = [
+    { title: "Time", number: true, class: "narrow", key: (row) => rows.time[row], fill: (cell, row) => { cell.textContent = short(rows.time[row]); } },
+    { title: "Kind", class: "kind", key: (row) => rows.kind[row], fill: (cell, row) => {
+      addKey(cell, { class: ["first", "second", "third", "third"][rows.kind[row]] }, KINDS[rows.kind[row]]);
+    } },
+    side("First", "first", false),
+    side("Second", "second", true),
+    { title: "Surfaces", class: "wide-only narrow", key: (row) => rows.phase[row] * 2 + rows.separate[row], fill: (cell, row) => {
+      if (rows.phase[row] >= 0) cell.textContent = PHASES[rows.phase[row]] + (rows.separate[row] === 1 ? ", separate before" : "");
+    } },
+  ];
+  table = new LongTable(byId("rows"), columns, matchMedia("(max-width: 760px)").matches ? 66 : 44, showRow);
+  KINDS.forEach((text, kind) => { if (rows.kind.includes(kind)) add(byId("kind"), "option", { value: kind }, text); });
+}
+
+// Shows the interval of a row, with the row's place in the middle.
+function showRow(row) {
+  const isRest = rows.kind[row] > 1;
+  showInterval(rows.interval[row], { isRest, place: rows.place[row], time: rows.toi[row] });
+  const name = (isSecond) => `${data.meshes[rows[isSecond ? "second" : "first"][row]].name} ${elementText(rows, row, isSecond)}`;
+  byId("selected").hidden = false;
+  byId("selected").textContent = `${KINDS[rows.kind[row]]} at time ${short(rows.time[row])}: ${name(false)} and ${name(true)}`;
+}
+
+function filterRows() {
+  byId("chips").replaceChildren();
+  state.prims.forEach((name, index) => {
+    const others = state.prims.filter((_, other) => other !== index);
+    add(byId("chips"), "a", { class: "chip", href: addressOf(state.interval, others), title: "Remove this filter" }, `${name} ×`);
+  });
+  if (!table) return;
+  const words = state.text.toLowerCase().split(/\s+/).filter(Boolean);
+  const names = data.meshes.map(({ name }) => name.toLowerCase());
+  const wanted = state.prims.map((name) => data.meshes.findIndex((mesh) => mesh.name === name));
+  const found = [];
+  for (let row = 0; row < rows.count; row += 1) {
+    const [first, second] = [rows.first[row], rows.second[row]];
+    if (state.kind !== "" && rows.kind[row] !== Number(state.kind)) continue;
+    if (state.only && rows.interval[row] !== state.interval) continue;
+    if (wanted.length && !((wanted.length < 2 && second === wanted[0]) || (first === wanted[0] && (wanted.length < 2 || second === wanted[1])) || (wanted.length > 1 && first === wanted[1] && second === wanted[0]))) continue;
+    if (words.length) {
+      const text = `${names[first]} ${elementText(rows, row, false)} ${names[second]} ${elementText(rows, row, true)}`;
+      if (!words.every((word) => text.includes(word))) continue;
+    }
+    found.push(row);
+  }
+  table.show(found);
+  const all = data.intervals.reduce((sum, interval) => sum + interval[2] + interval[3], 0) + data.rest.reduce((sum, at) => sum + at[1] + at[2], 0);
+  byId("rows-count").textContent = `${count(found.length)} of ${plural(rows.count, "row")}${rows.count < all ? `; ${count(all)} were found, see the notes` : ""}`;
+}
+
+function fillPairs() {
+  const numbers = new Map(data.meshes.map(({ name }, index) => [name, index]));
+  const pairs = data.pairs;
+  const range = (since, until) => (since === until ? `at ${short(since)}` : `${short(since)} to ${short(until)}`);
+  const fillSpans = (cell, texts, more) => add(cell, "span", { class: "clip" }, texts.join("; ") + (more ? `; ${count(more)} more` : ""));
+  const columns = [
+    { title: "Meshes", key: (row) => pairs[row].meshes.join(" "), fill: (cell, row) => {
+      const [first, second] = pairs[row].meshes;
+      addPrim(cell, numbers.get(first));
+      if (first === second) add(cell, "span", { class: "element" }, "with itself");
+      else addPrim(cell, numbers.get(second));
+      const both = add(cell, "a", { class: "element", href: addressOf(-1, first === second ? [first] : [first, second]) }, "rows of the two");
+      both.hidden = first === second;
+    } },
+    { title: "Collisions", key: (row) => pairs[row].hits, fill: (cell, row) => {
+      const { spans, more } = pairs[row];
+      fillSpans(cell, spans.map(([since, until, hits]) => `${range(since, until)}: ${count(hits)}`), more);
+    } },
+    { title: "Intersections at rest", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => {
+      const { rest, more_rest } = pairs[row];
+      fillSpans(cell, rest.map(([since, until, most, trend]) => `${range(since, until)}: ${plural(most, "edge")}, ${trend}`), more_rest);
+    } },
+  ];
+  byId("pairs-count").textContent = pairs.length ? plural(pairs.length, "pair") : "No meshes collide.";
+  byId("pairs").hidden = !pairs.length;
+  new LongTable(byId("pairs"), columns, 66, () => {}).show(pairs.map((_, index) => index));
+}
+
+// --- The small charts ---
 
 function fillImpacts() {
   const bins = data.toi.length;
@@ -139,12 +322,6 @@ function fillText() {
     add(tile, "b", {}, value);
     add(tile, "span", {}, label);
   }
-  addTable(byId("pairs"), [["Meshes"], ["Collisions", true]],
-    data.pairs.map(({ text, under, hits }) => [[text, under], count(hits)]), "No meshes collide.");
-  if (data.more_pairs) add(byId("pairs"), "p", { class: "muted small" }, `and ${plural(data.more_pairs, "more pair")}`);
-  addTable(byId("worst"), [["Interval"], ["Collisions", true], ["First at", true], ["Which is"]],
-    data.worst.map(({ start, end, hits, time, what }) => [`${short(start)} → ${short(end)}`, count(hits), short(time), what]),
-    "No interval has collisions.");
   addTable(byId("facts"), [["What"], ["Value"]], data.facts, "");
   data.notes.forEach((note) => add(byId("notes"), "li", {}, note));
   if (data.validation) {
@@ -156,8 +333,53 @@ function fillText() {
   }
 }
 
-fillText();
-fillIntervals();
-fillImpacts();
-fillStages();
-showWorst(data.view);
+// --- Mouse and keyboard ---
+
+function listen() {
+  let waiting = 0;
+  byId("filter").addEventListener("input", (event) => {
+    clearTimeout(waiting);
+    waiting = setTimeout(() => { state.text = event.target.value; filterRows(); }, 120);
+  });
+  byId("kind").addEventListener("change", (event) => { state.kind = event.target.value; filterRows(); });
+  byId("only-interval").addEventListener("change", (event) => { state.only = event.target.checked; filterRows(); });
+  byId("previous").addEventListener("click", () => stepInterval(-1));
+  byId("next").addEventListener("click", () => stepInterval(1));
+  addEventListener("hashchange", readAddress);
+  addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=checkbox]), select")) return;
+    const keys = {
+      ArrowLeft: () => stepInterval(-1),
+      ArrowRight: () => stepInterval(1),
+      Home: () => stepInterval(1, -1),
+      End: () => stepInterval(-1, LAST + 1),
+      " ": () => byId("play").click(),
+      f: () => byId("frame-contacts").click(),
+      a: () => byId("frame-all").click(),
+      "/": () => byId("filter").focus(),
+    };
+    const turns = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+    const action = event.shiftKey ? turns[event.key] && (() => viewer.turn(...turns[event.key])) : keys[event.key];
+    if (!action || (event.key === " " && event.target.matches("button, summary, input"))) return;
+    event.preventDefault();
+    action();
+  });
+}
+
+async function start() {
+  fillText();
+  fillIntervals();
+  fillImpacts();
+  fillStages();
+  fillPairs();
+  viewer = makeViewer();
+  listen();
+  if (LAST >= 0 && !location.hash) showInterval(mostInterval());
+  rows = await loadRows();
+  fillTable();
+  readAddress();
+  if (state.interval < 0 && LAST >= 0) showInterval(mostInterval());
+  document.body.dataset.state = "ready";
+}
+
+start();

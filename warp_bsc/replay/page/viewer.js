@@ -1,10 +1,12 @@
-// Shows the worst interval in 3D: triangles that move from start to end, and contacts. WebGL 2, no library.
+// Shows an interval in 3D: triangles that move from start to end, contacts, cut curves. WebGL 2, no library.
 "use strict";
 
 const MESH_COLORS = [[0.52, 0.68, 0.86], [0.62, 0.78, 0.6], [0.8, 0.7, 0.55], [0.72, 0.62, 0.8], [0.55, 0.76, 0.76], [0.84, 0.66, 0.72]];
 const REST_COLOR = [0.62, 0.64, 0.67];
 const LIT_COLOR = [0.93, 0.28, 0.22];
 const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1]];
+const CURVE_COLOR = [0.55, 0.24, 0.92];
+const CHOSEN_COLOR = [0.05, 0.75, 0.95];
 
 const TRIANGLE_SHADER = `#version 300 es
 in vec3 start; in vec3 end; in vec3 color;
@@ -48,10 +50,24 @@ void main() {
   result = vec4(mix(vec3(1.0), tint.rgb, inner), tint.a * disc);
 }`;
 
-function decode(text, Type) {
-  const bytes = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-  return new Type(bytes.buffer);
-}
+// A segment is drawn as a rectangle of some pixels' width: two triangles, of four corners.
+const CURVE_SHADER = `#version 300 es
+in vec3 start; in vec3 end;
+uniform mat4 view; uniform mat4 projection; uniform vec2 pixel;
+void main() {
+  vec4 a = projection * view * vec4(start, 1.0), b = projection * view * vec4(end, 1.0);
+  vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-6, 0.0));
+  int corner = int[](0, 1, 2, 2, 1, 3)[gl_VertexID]; // two at a, two at b
+  gl_Position = corner < 2 ? a : b;
+  float side = corner % 2 == 0 ? 1.0 : -1.0;
+  gl_Position.xy += side * vec2(-along.y, along.x) * pixel * gl_Position.w;
+  gl_Position.z -= 1e-4 * gl_Position.w;
+}`;
+const CURVE_COLOR_SHADER = `#version 300 es
+precision highp float;
+uniform vec4 color;
+out vec4 result;
+void main() { result = color; }`;
 
 function multiply(a, b) {
   const result = new Float32Array(16);
@@ -75,22 +91,26 @@ function program(gl, vertex, fragment) {
   return made;
 }
 
+// Attributes: [name, values, width], and for one value an instance also [stride, offset] in bytes.
 function vertexArray(gl, made, attributes, indices) {
-  const array = gl.createVertexArray();
+  const array = gl.createVertexArray(), buffers = [];
+  const fill = (target, values) => {
+    const buffer = gl.createBuffer();
+    buffers.push(buffer);
+    gl.bindBuffer(target, buffer);
+    gl.bufferData(target, values, gl.STATIC_DRAW);
+  };
   gl.bindVertexArray(array);
-  for (const [name, values, width] of attributes) {
+  for (const [name, values, width, strided] of attributes) {
     const place = gl.getAttribLocation(made, name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+    fill(gl.ARRAY_BUFFER, values);
     gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, width, gl.FLOAT, false, 0, 0);
+    gl.vertexAttribPointer(place, width, gl.FLOAT, false, ...(strided || [0, 0]));
+    if (strided) gl.vertexAttribDivisor(place, 1);
   }
-  if (indices) {
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
-  }
+  if (indices) fill(gl.ELEMENT_ARRAY_BUFFER, indices);
   gl.bindVertexArray(null);
-  return array;
+  return { array, free: () => { gl.deleteVertexArray(array); buffers.forEach((buffer) => gl.deleteBuffer(buffer)); } };
 }
 
 function boxOf(arrays) {
@@ -104,67 +124,144 @@ function boxOf(arrays) {
   return { center, radius: Math.max(1e-9, Math.hypot(...high.map((value, axis) => value - low[axis])) / 2) };
 }
 
-function showWorst(shown) {
+const NO_FLOATS = new Float32Array(0), NO_INTS = new Int32Array(0);
+const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`;
+const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_COLORS.length] : REST_COLOR);
+
+// Returns the blocks of an interval as the arrays that are drawn.
+async function loadView(index) {
+  const [view, hits, ...rest] = await Promise.all(["view", "hits", "rest"].map((name) => unpack(`${name}-${index}`)).concat(unpack(`rest-${index + 1}`)));
+  if (!view) return null;
+  const topology = await unpack(`faces-${view.faces}`);
+  const faces = topology.faces, lit = new Int32Array(3 * view.lit.length);
+  view.lit.forEach((face, place) => lit.set(faces.subarray(3 * face, 3 * face + 3), 3 * place));
+  const contacts = hits ? hits.position : NO_FLOATS;
+  return {
+    faces, lit, meshes: topology.mesh_of_vertex, start: view.start, end: view.end, of: view.of,
+    contacts, toi: hits ? hits.toi : NO_FLOATS, kinds: hits ? hits.kind : NO_INTS,
+    rest: rest.map((block) => (block ? block.position : NO_FLOATS)),
+    curves: rest.map((block) => (block ? block.curves : NO_FLOATS)),
+  };
+}
+
+// Makes the view and its controls. Returns how to show an interval, and how to turn the view.
+function makeViewer() {
   const message = byId("viewer-message");
-  const fail = (text) => { message.textContent = text; message.hidden = false; };
-  if (!shown) {
-    byId("viewer").querySelector(".controls").hidden = true;
-    return fail("There is nothing to show.");
-  }
+  const say = (text) => { message.textContent = text; message.hidden = !text; };
   const canvas = byId("canvas");
   const gl = canvas.getContext("webgl2", { antialias: true });
-  byId("viewer-title").textContent = shown.title;
-  if (!gl) return fail("This browser has no WebGL 2, which the view in 3D needs.");
+  if (!gl) say("This browser has no WebGL 2, which the view in 3D needs.");
+  if (LAST < 0) say("There is nothing to show.");
 
-  const start = decode(shown.start, Float32Array), end = decode(shown.end, Float32Array);
-  const faces = decode(shown.faces, Uint32Array), lit = decode(shown.lit, Uint32Array);
-  const meshes = decode(shown.mesh_of_vertex, Uint32Array);
-  const contacts = decode(shown.contacts, Float32Array), toi = decode(shown.toi, Float32Array);
-  const kinds = decode(shown.kinds, Uint32Array);
-  const colorOf = shown.meshes.map(({ moves }, index) => (moves ? MESH_COLORS[index % MESH_COLORS.length] : REST_COLOR));
-  const colors = new Float32Array(start.length);
-  meshes.forEach((mesh, vertex) => colors.set(colorOf[mesh], 3 * vertex));
-  const pointColors = new Float32Array(contacts.length);
-  kinds.forEach((kind, point) => pointColors.set(CONTACT_COLORS[kind], 3 * point));
-
-  const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`;
-  shown.meshes.slice(0, 8).forEach(({ name }, index) => addKey(byId("viewer-legend"), { fill: css(colorOf[index]) }, name));
-  if (shown.meshes.length > 8) add(byId("viewer-legend"), "span", {}, `and ${count(shown.meshes.length - 8)} more`);
-  if (lit.length) addKey(byId("viewer-legend"), { fill: css(LIT_COLOR) }, "faces that collide");
-  if (!toi.length) {
-    byId("viewer-heading").textContent = "First interval";
-    byId("frame-contacts").hidden = true;
-  }
-  ["vertex-face contact", "edge-edge contact"].forEach((text, kind) => {
-    if (kinds.includes(kind)) addKey(byId("viewer-legend"), { fill: css(CONTACT_COLORS[kind]), rx: 5 }, text);
-  });
-
-  const triangles = program(gl, TRIANGLE_SHADER, TRIANGLE_COLOR), points = program(gl, POINT_SHADER, POINT_COLOR);
-  const positions = [["start", start, 3], ["end", end, 3], ["color", colors, 3]];
-  const allFaces = vertexArray(gl, triangles, positions, faces), litFaces = vertexArray(gl, triangles, positions, lit);
-  const dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
-
+  const triangles = gl && program(gl, TRIANGLE_SHADER, TRIANGLE_COLOR);
+  const points = gl && program(gl, POINT_SHADER, POINT_COLOR);
+  const lines = gl && program(gl, CURVE_SHADER, CURVE_COLOR_SHADER);
   // Up is the scene's: y in the view.
-  const zUp = shown.up_axis === "Z";
-  const turn = zUp ? ([x, y, z]) => [x, z, -y] : (point) => point;
-  const moving = [];
-  for (const values of [start, end])
-    moving.push(values.filter((_, i) => shown.meshes[meshes[Math.floor(i / 3)]].moves));
-  const whole = boxOf(moving.some((values) => values.length) ? moving : [start]), near = toi.length ? boxOf([contacts]) : { ...whole };
-  const all = { center: whole.center, radius: 1.15 * whole.radius };
-  near.radius = Math.max(near.radius * 1.6, whole.radius * 0.12);
+  const zUp = data.up_axis === "Z";
+  const turned = zUp ? ([x, y, z]) => [x, z, -y] : (point) => point;
   const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
-  const state = { time: 0, playing: false, last: 0, asked: false };
+  const state = { time: 0, playing: false, last: 0, asked: false, index: -1, shown: null, parts: [], chosen: null, framed: false };
   const FIELD = 0.62;
 
   function frame(box) {
-    camera.center = turn(box.center);
+    camera.center = turned(box.center);
     camera.distance = ((0.8 * box.radius) / Math.sin(FIELD / 2)) * Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
     ask();
   }
 
+  // Shows an interval. `at`, if given, is a row of the table: {isRest, place, time}.
+  async function show(index, at = null) {
+    const isNew = index !== state.index;
+    state.index = index;
+    const [from, to] = data.intervals[index];
+    byId("viewer-heading").textContent = from === to ? `Time ${short(from)}` : `Time ${short(from)} to ${short(to)}`;
+    canvas.setAttribute("aria-label", `${byId("viewer-heading").textContent} in 3D. Drag to turn, scroll to zoom.`);
+    byId("selected").hidden = true;
+    if (!gl) return;
+    if (isNew) {
+      const shown = await loadView(index);
+      if (state.index !== index) return; // another one was asked for meanwhile
+      fill(shown, index);
+    }
+    if (!state.shown) return;
+    if (at) choose(at);
+    else if (isNew) state.time = state.shown.median;
+    showTime();
+    ask();
+  }
+
+  function fill(shown, index) {
+    state.parts.forEach((part) => part.free());
+    [state.parts, state.shown, state.chosen] = [[], shown, null];
+    const legend = byId("viewer-legend");
+    legend.replaceChildren();
+    const [hits, rest] = [hitsIn(index), restAt(index)];
+    let title = plural(hits, "collision");
+    if (data.rest.length) title += `; ${plural(rest, "edge")} in faces at the start, ${count(restAt(index + 1))} at the end`;
+    const isEmpty = !shown;
+    byId("viewer-title").textContent = title;
+    byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
+    if (isEmpty) {
+      say(hits + rest + restAt(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
+      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+      return;
+    }
+    say("");
+    const { faces, lit, meshes, start, end, contacts, kinds, toi } = shown;
+    if (faces.length / 3 < shown.of) title += `; the ${count(faces.length / 3)} of ${count(shown.of)} triangles around them are shown`;
+    byId("viewer-title").textContent = title;
+
+    const colors = new Float32Array(start.length), pointColors = new Float32Array(contacts.length);
+    meshes.forEach((mesh, vertex) => colors.set(meshColor(mesh), 3 * vertex));
+    kinds.forEach((kind, point) => pointColors.set(CONTACT_COLORS[kind], 3 * point));
+    const present = [...new Set(meshes)];
+    present.slice(0, 6).forEach((mesh) => addKey(legend, { fill: css(meshColor(mesh)) }, data.meshes[mesh].name));
+    if (present.length > 6) add(legend, "span", {}, `and ${count(present.length - 6)} more`);
+    if (lit.length) addKey(legend, { fill: css(LIT_COLOR) }, "faces that collide");
+    ["vertex-face contact", "edge-edge contact"].forEach((text, kind) => {
+      if (kinds.includes(kind)) addKey(legend, { fill: css(CONTACT_COLORS[kind]), rx: 5 }, text);
+    });
+    if (shown.curves.some((curves) => curves.length)) addKey(legend, { fill: css(CURVE_COLOR), y: 3, height: 4 }, "curves where surfaces cut");
+
+    const positions = [["start", start, 3], ["end", end, 3], ["color", colors, 3]];
+    shown.all = vertexArray(gl, triangles, positions, faces);
+    shown.some = vertexArray(gl, triangles, positions, lit);
+    shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
+    shown.cuts = shown.curves.map((curves) => vertexArray(gl, lines, [["start", curves, 3, [24, 0]], ["end", curves, 3, [24, 12]]]));
+    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts];
+
+    const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
+    shown.whole = boxOf(moving.some((values) => values.length) ? moving : [start]);
+    const places = [contacts, ...shown.rest].filter((values) => values.length);
+    shown.near = places.length ? boxOf(places) : { ...shown.whole };
+    shown.near.radius = Math.max(shown.near.radius * 1.2, shown.whole.radius * 0.12);
+    shown.median = toi.length ? Array.from(toi).sort((a, b) => a - b)[toi.length >> 1] : 0;
+    byId("frame-contacts").hidden = !places.length;
+    if (!state.framed) {
+      const { near, whole } = shown;
+      frame(places.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : { center: whole.center, radius: 1.15 * whole.radius });
+      state.framed = true;
+    }
+  }
+
+  // Marks the place of a row, and moves the view to it.
+  function choose({ isRest, place, time }) {
+    const from = isRest ? state.shown.rest[Math.round(time)] : state.shown.contacts;
+    const point = from.slice(3 * place, 3 * place + 3);
+    state.time = time;
+    if (point.length < 3) return;
+    state.chosen?.free();
+    state.parts = state.parts.filter((part) => part !== state.chosen);
+    state.chosen = vertexArray(gl, points, [["start", point, 3], ["color", new Float32Array(CHOSEN_COLOR), 3], ["toi", new Float32Array([0]), 1]]);
+    state.parts.push(state.chosen);
+    camera.center = turned([...point]);
+    camera.distance = Math.min(camera.distance, 0.5 * state.shown.whole.radius);
+  }
+
   function draw(now) {
     state.asked = false;
+    const { shown } = state;
+    if (!shown) return;
     if (state.playing) {
       state.time = (state.time + (now - (state.last || now)) / 2500) % 1;
       showTime();
@@ -180,8 +277,8 @@ function showWorst(shown) {
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
 
-    const { distance, yaw, pitch, center } = camera;
-    const [nearest, farthest] = [Math.max(distance - 3 * whole.radius, distance * 0.01), distance + 60 * whole.radius];
+    const { distance, yaw, pitch, center } = camera, { radius } = shown.whole;
+    const [nearest, farthest] = [Math.max(distance - 3 * radius, distance * 0.01), distance + 60 * radius];
     const focal = 1 / Math.tan(FIELD / 2);
     const projection = new Float32Array(16);
     projection.set([focal / (width / height), 0, 0, 0, 0, focal, 0, 0, 0, 0, (nearest + farthest) / (nearest - farthest), -1, 0, 0, (2 * nearest * farthest) / (nearest - farthest), 0]);
@@ -192,31 +289,43 @@ function showWorst(shown) {
     let view = multiply(orbit, shift);
     if (axes) view = multiply(view, axes);
 
-    const set = (made) => {
+    const set = (made, values) => {
       gl.useProgram(made);
       gl.uniformMatrix4fv(gl.getUniformLocation(made, "view"), false, view);
       gl.uniformMatrix4fv(gl.getUniformLocation(made, "projection"), false, projection);
-      gl.uniform1f(gl.getUniformLocation(made, "time"), state.time);
+      for (const [name, value] of Object.entries(values)) {
+        const place = gl.getUniformLocation(made, name);
+        if (Array.isArray(value)) gl[`uniform${value.length}fv`](place, value);
+        else gl.uniform1f(place, value);
+      }
     };
-    set(triangles);
     gl.enable(gl.POLYGON_OFFSET_FILL);
-    for (const [array, length, only, offset] of [[litFaces, lit.length, [...LIT_COLOR, 0.85], 0], [allFaces, faces.length, [0, 0, 0, 0], 1]]) {
+    for (const [part, length, only, offset] of [[shown.some, shown.lit.length, [...LIT_COLOR, 0.85], 0], [shown.all, shown.faces.length, [0, 0, 0, 0], 1]]) {
       gl.polygonOffset(offset, offset);
-      gl.uniform4fv(gl.getUniformLocation(triangles, "only"), only);
-      gl.bindVertexArray(array);
+      set(triangles, { time: state.time, only });
+      gl.bindVertexArray(part.array);
       gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
     }
-    set(points);
-    // Many contacts would hide one another, and all else.
-    gl.uniform1f(gl.getUniformLocation(points, "size"), Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, toi.length)) ** 1.4) * scale);
-    gl.uniform1f(gl.getUniformLocation(points, "core"), toi.length > 300 ? 2 : 0.68);
-    gl.bindVertexArray(dots);
+    gl.disable(gl.POLYGON_OFFSET_FILL);
     gl.depthMask(false);
-    // Contacts behind a surface shine through it faintly.
+    // What is behind a surface shines through it faintly. Cut curves belong to one end of the interval.
+    const end = state.time < 0.5 ? 0 : 1;
+    // Many contacts would hide one another, and all else.
+    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, shown.toi.length)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
-      gl.uniform1f(gl.getUniformLocation(points, "fade"), fade);
-      gl.drawArrays(gl.POINTS, 0, toi.length);
+      set(lines, { pixel: [(2 * scale) / width, (2 * scale) / height], color: [...CURVE_COLOR, fade] });
+      gl.bindVertexArray(shown.cuts[end].array);
+      gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
+      set(points, { time: state.time, fade, size, core: shown.toi.length > 300 ? 2 : 0.68 });
+      gl.bindVertexArray(shown.dots.array);
+      gl.drawArrays(gl.POINTS, 0, shown.toi.length);
+    }
+    if (state.chosen) {
+      gl.depthFunc(gl.ALWAYS);
+      set(points, { time: state.time, fade: 1, size: 16 * scale, core: 0.6 });
+      gl.bindVertexArray(state.chosen.array);
+      gl.drawArrays(gl.POINTS, 0, 1);
     }
     gl.depthFunc(gl.LESS);
     gl.depthMask(true);
@@ -224,17 +333,31 @@ function showWorst(shown) {
   }
 
   function ask() {
-    if (state.asked) return;
+    if (state.asked || !gl) return;
     state.asked = true;
     requestAnimationFrame(draw);
   }
 
   function showTime() {
+    const [from, to] = data.intervals[state.index];
     byId("time").value = Math.round(1000 * state.time);
-    byId("time-label").textContent = `time ${short(shown.from + state.time * (shown.to - shown.from))}`;
+    byId("time-label").textContent = `time ${short(from + state.time * (to - from))}`;
   }
 
-  const held = new Map();
+  function turn(dx, dy) {
+    camera.yaw -= 0.1 * dx;
+    camera.pitch = Math.max(-1.55, Math.min(1.55, camera.pitch + 0.1 * dy));
+    ask();
+  }
+
+  function move(dx, dy) {
+    const step = (2 * camera.distance * Math.tan(FIELD / 2)) / canvas.clientHeight;
+    const [cy, sy, cp, sp] = [Math.cos(camera.yaw), Math.sin(camera.yaw), Math.cos(camera.pitch), Math.sin(camera.pitch)];
+    const [right, up] = [[cy, 0, -sy], [-sy * sp, cp, -cy * sp]];
+    camera.center = camera.center.map((value, axis) => value - step * (dx * right[axis] - dy * up[axis]));
+  }
+
+  const held = new Map(); // pointers that are down, by their last events
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, event);
@@ -242,18 +365,16 @@ function showWorst(shown) {
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => held.delete(event.pointerId));
   canvas.addEventListener("pointermove", (event) => {
     const last = held.get(event.pointerId);
-    if (!last || held.size > 1) return;
+    if (!last) return;
     const [dx, dy] = [event.clientX - last.clientX, event.clientY - last.clientY];
     held.set(event.pointerId, event);
-    if (event.shiftKey || event.buttons === 2) {
-      const step = (2 * camera.distance * Math.tan(FIELD / 2)) / canvas.clientHeight;
-      const [cy, sy, cp, sp] = [Math.cos(camera.yaw), Math.sin(camera.yaw), Math.cos(camera.pitch), Math.sin(camera.pitch)];
-      const [right, up] = [[cy, 0, -sy], [-sy * sp, cp, -cy * sp]];
-      camera.center = camera.center.map((value, axis) => value - step * (dx * right[axis] - dy * up[axis]));
-    } else {
-      camera.yaw -= dx * 0.008;
-      camera.pitch = Math.max(-1.55, Math.min(1.55, camera.pitch + dy * 0.008));
-    }
+    if (held.size === 2) {
+      const other = [...held.values()].find(({ pointerId }) => pointerId !== event.pointerId);
+      const from = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY) || 1;
+      camera.distance *= from(last) / from(event);
+      move(dx / 2, dy / 2);
+    } else if (event.shiftKey || event.buttons === 2) move(dx, dy);
+    else turn(dx * 0.08, dy * 0.08);
     ask();
   });
   canvas.addEventListener("wheel", (event) => {
@@ -262,14 +383,6 @@ function showWorst(shown) {
     ask();
   }, { passive: false });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("keydown", (event) => {
-    const steps = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
-    if (!steps) return;
-    event.preventDefault();
-    camera.yaw -= steps[0];
-    camera.pitch = Math.max(-1.55, Math.min(1.55, camera.pitch + steps[1]));
-    ask();
-  });
   byId("time").addEventListener("input", (event) => { state.time = event.target.value / 1000; showTime(); ask(); });
   byId("play").addEventListener("click", () => {
     state.playing = !state.playing;
@@ -277,10 +390,8 @@ function showWorst(shown) {
     byId("play").textContent = state.playing ? "Pause" : "Play";
     ask();
   });
-  byId("frame-all").addEventListener("click", () => frame(all));
-  byId("frame-contacts").addEventListener("click", () => frame(near));
+  byId("frame-all").addEventListener("click", () => { if (state.shown) frame({ center: state.shown.whole.center, radius: 1.15 * state.shown.whole.radius }); });
+  byId("frame-contacts").addEventListener("click", () => { if (state.shown) frame(state.shown.near); });
   new ResizeObserver(ask).observe(canvas);
-  state.time = shown.at;
-  showTime();
-  frame(toi.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : all);
+  return { show, turn };
 }

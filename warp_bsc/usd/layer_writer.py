@@ -1,0 +1,221 @@
+"""Writes a layer of shining prims over a scene, whose time samples are never all in memory."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import errno
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["SHAPES", "LayerContent", "LayerPrim", "write_binary_layer", "write_text_layer"]
+
+SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
+"""Type and number of the components of a row, by the type of an attribute."""
+
+_SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
+_TEXT_ROWS = 4096  # rows of an array that are text at once
+
+
+@dataclass(frozen=True)
+class LayerPrim:
+    """A prim of a layer.
+
+    Attributes:
+        name: Its name.
+        kind: ``"Mesh"``, ``"PointInstancer"`` or ``"BasisCurves"``. The instances are of an octahedron.
+        attributes: Types of its attributes that have time samples, by their names.
+        color: The colour of the light that it emits.
+        width: Width of the octahedron or of the curves.
+    """
+
+    name: str
+    kind: str
+    attributes: dict[str, str]
+    color: tuple[float, float, float]
+    width: float = 0.0
+
+
+@dataclass(frozen=True)
+class LayerContent:
+    """All that a layer holds.
+
+    Attributes:
+        metadata: Metadata of the layer, by name.
+        documentation: Text for people.
+        custom: Values for programs, by name.
+        sublayer: Path of the layer that it lies over, from its own folder on. It is not read.
+        root: Path of the prim that all prims are below, of purpose guide.
+        strings: Attributes of that prim, lists of texts, by name.
+        prims: The prims.
+        samples: Yields the time samples of an attribute in order, given its prim and its name: time codes and arrays of
+            :data:`SHAPES`.
+    """
+
+    metadata: dict[str, Any]
+    documentation: str
+    custom: dict[str, Any]
+    sublayer: str
+    root: str
+    strings: dict[str, list[str]]
+    prims: list[LayerPrim]
+    samples: Callable[[str, str], Iterable[tuple[float, np.ndarray]]]
+
+
+def write_binary_layer(content: LayerContent, path: Path) -> None:
+    """Writes a layer in USD's binary format, which can save samples and drop them from memory.
+
+    Args:
+        content: The content.
+        path: A file that is not there yet, with any name. After an error it is not there either.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
+
+    try:
+        layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(path))
+        _define_prims(layer, content)
+        _describe(layer, content)
+        waiting = 0
+        for prim, attribute, value_type in _attributes(content):
+            for time, value in content.samples(prim, attribute):
+                layer.SetTimeSample(f"{content.root}/{prim}.{attribute}", time, _to_vt(value_type, value))
+                waiting += value.nbytes
+                if waiting > _SAVED:
+                    layer.Save()
+                    waiting = 0
+        layer.Save()
+    except BaseException as error:
+        path.unlink(missing_ok=True)
+        if isinstance(error, Tf.ErrorException):
+            raise _as_os_error(error) from error
+        raise
+
+
+def write_text_layer(content: LayerContent, write: Callable[[str], None]) -> None:
+    """Writes a layer in USD's text format, sample by sample into the text of a layer without samples.
+
+    Args:
+        content: The content.
+        write: Writes a part of the text.
+    """
+    from pxr import Sdf  # noqa: PLC0415 (slow)
+
+    head, body = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
+    _describe(head, content)
+    _define_prims(body, content)
+    attributes = list(_attributes(content))
+    for number, (prim, attribute, value_type) in enumerate(attributes):  # a sample at the time of its number
+        body.SetTimeSample(f"{content.root}/{prim}.{attribute}", number, _to_vt(value_type, None))
+    write(head.ExportToString().rstrip("\n"))
+    # Text, number of the attribute, text, number, ...: no name of a prim has a line break in it.
+    parts = re.split(r"\n *(\d+): \[\],\n", body.ExportToString().removeprefix("#usda 1.0"))
+    for part, number in zip(parts[::2], [*parts[1::2], None], strict=True):
+        write(part + "\n")
+        if number is not None:
+            prim, attribute, _ = attributes[int(number)]
+            for time, value in content.samples(prim, attribute):
+                write(f"{time!r}: [")
+                for start in range(0, len(value), _TEXT_ROWS):
+                    write(", " * bool(start) + _to_text(value[start : start + _TEXT_ROWS]))
+                write("],\n")
+
+
+def _describe(layer, content):
+    """Sets the metadata of a layer."""
+    layer.customLayerData = content.custom
+    layer.documentation = content.documentation
+    for name, value in content.metadata.items():
+        layer.pseudoRoot.SetInfo(name, value)
+    layer.subLayerPaths.append(content.sublayer)
+
+
+def _define_prims(layer, content):
+    """Defines the prims of a layer, without time samples."""
+    from pxr import Sdf, Usd, UsdGeom, UsdShade  # noqa: PLC0415 (slow)
+
+    stage = Usd.Stage.Open(layer)
+    root = UsdGeom.Scope.Define(stage, content.root)
+    root.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    for name, texts in content.strings.items():
+        root.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.StringArray).Set(texts)
+    UsdGeom.Scope.Define(stage, f"{content.root}/Materials")
+    for part in content.prims:
+        prim = stage.DefinePrim(f"{content.root}/{part.name}", part.kind)
+        for attribute, type_name in part.attributes.items():
+            value_type = Sdf.ValueTypeNames.Find(type_name)
+            if attribute.startswith("primvars:"):
+                interpolation = UsdGeom.Tokens.uniform if part.kind == "BasisCurves" else UsdGeom.Tokens.vertex
+                UsdGeom.PrimvarsAPI(prim).CreatePrimvar(attribute, value_type, interpolation)
+            else:
+                prim.CreateAttribute(attribute, value_type, False)
+        shown = prim
+        if part.kind == "Mesh":
+            UsdGeom.Mesh(prim).CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        elif part.kind == "BasisCurves":
+            UsdGeom.BasisCurves(prim).CreateTypeAttr(UsdGeom.Tokens.linear)
+            UsdGeom.BasisCurves(prim).CreateWidthsAttr([part.width])
+            UsdGeom.BasisCurves(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
+        else:
+            shown = _define_marker(stage, prim, part.width / 2)
+        # The same colour where a program shows no materials.
+        UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([part.color])
+        material = UsdShade.Material.Define(stage, f"{content.root}/Materials/{part.name}")
+        shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
+        shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(part.color)
+        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+        material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+        UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
+
+
+def _define_marker(stage, instancer, radius):
+    """Defines an octahedron that an instancer places, and returns its prim."""
+    from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+    marker = UsdGeom.Mesh.Define(stage, f"{instancer.GetPath()}/Marker")
+    marker.CreatePointsAttr([tuple(point) for point in (radius * np.concatenate([np.eye(3), -np.eye(3)])).tolist()])
+    marker.CreateExtentAttr([(-radius,) * 3, (radius,) * 3])
+    marker.CreateFaceVertexCountsAttr([3] * 8)
+    sides = [[(0, 1, 2), (3, 1, 2), (0, 4, 2), (0, 1, 5)], [(3, 4, 5), (0, 4, 5), (3, 1, 5), (3, 4, 2)]]
+    marker.CreateFaceVertexIndicesAttr([corner for side in sides for face in side for corner in face])
+    marker.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    UsdGeom.PointInstancer(instancer).CreatePrototypesRel().SetTargets([marker.GetPath()])
+    return marker.GetPrim()
+
+
+def _attributes(content) -> Iterator[tuple[str, str, str]]:
+    """Yields all attributes with time samples: the names of their prims, their own, and their types."""
+    return ((prim.name, name, value_type) for prim in content.prims for name, value_type in prim.attributes.items())
+
+
+def _to_vt(value_type, array):
+    """Returns an array as a value of USD, an empty one for None."""
+    from pxr import Vt  # noqa: PLC0415 (slow)
+
+    types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
+    types |= {"int[]": Vt.IntArray, "int2[]": Vt.Vec2iArray}
+    return types[value_type]() if array is None else types[value_type].FromNumpy(array)
+
+
+def _to_text(rows) -> str:
+    """Returns rows of an array in the syntax of USD's text format."""
+    number = "{:.9g}" if rows.dtype.kind == "f" else "{}"
+    row = number if rows.ndim == 1 else "(" + ", ".join([number] * rows.shape[1]) + ")"
+    return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
+
+
+def _as_os_error(error) -> Exception:
+    """Returns the system's error in an error of OpenUSD, such as a full disk, or the error itself if there is none."""
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if os.strerror(number) in str(error):
+            return OSError(number, os.strerror(number))
+    return error
