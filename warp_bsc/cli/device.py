@@ -60,8 +60,11 @@ def loading_kernels(device: wp.Device) -> Iterator[None]:
         timer.cancel()
 
 
-def load_detector(method: str, dtype: npt.DTypeLike, device: wp.Device) -> None:
-    """Loads the detector's kernels for one type of position; compiles them if need be."""
+def load_detector(method: str, dtype: npt.DTypeLike, device: wp.Device, *, intersections: bool = False) -> None:
+    """Loads the detector's kernels for one type of position, those for intersections if wanted; may compile them."""
     triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)
-    CollisionDetector(triangles, method=method).detect(points, points)
+    detector = CollisionDetector(triangles, method=method)
+    detector.detect(points, points)
+    if intersections:
+        detector.find_intersections(points)

@@ -210,7 +210,7 @@ def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
     device = find_device(arguments.device)
     with loading_kernels(device):
-        load_detector(arguments.method, scene.dtype, device)
+        load_detector(arguments.method, scene.dtype, device, intersections=arguments.intersections)
     return run_replay(scene, arguments, device)
 
 

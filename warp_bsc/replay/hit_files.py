@@ -156,64 +156,57 @@ class HitsCsv(RecordFile):
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)
 
 
-def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], Iterable[dict]]) -> Iterator[str | bytes]:
+def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]]) -> Iterator[str | bytes]:
     """Yields a member of a JSON object: the list of all pairs."""
     yield f', "{name}": ['
     for number, rows in enumerate(pairs.chunks()):
-        yield (b", " if number else b"") + orjson.dumps(list(to_rows(pairs, rows)))[1:-1]
+        yield (b", " if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
     yield "]"
 
 
-def _contact_rows(contacts: SceneContacts, rows: slice) -> Iterator[dict]:
-    """Yields the fields of some contacts."""
-    measures = contacts.kind, contacts.time, contacts.toi, contacts.position, contacts.normal
-    columns = [*_names(contacts, rows), *(column[rows].tolist() for column in measures)]
-    compared = [{}] * len(columns[0])
+def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
+    """Returns the fields of some contacts."""
+    fields = {
+        "kind": [KINDS[kind] for kind in contacts.kind[rows].tolist()],
+        **_names(contacts, rows),
+        "time": contacts.time[rows].tolist(),
+        "toi": contacts.toi[rows].tolist(),
+        "position": contacts.position[rows].tolist(),
+        "normal": contacts.normal[rows].tolist(),
+    }
     if contacts.phase is not None and contacts.separate is not None:
-        phases, separate = contacts.phase[rows].tolist(), contacts.separate[rows].tolist()
-        compared = [{"phase": PHASES[p], "separate": s} for p, s in zip(phases, separate, strict=True)]
-    for meshes, prims, elements, indices, kind, time, toi, position, normal, more in zip(
-        *columns, compared, strict=True
-    ):
-        yield {
-            "kind": KINDS[kind],
-            "meshes": meshes,
-            "prims": prims,
-            "elements": elements,
-            "indices": indices,
-            "time": time,
-            "toi": toi,
-            "position": position,
-            "normal": normal,
-            **more,
+        fields["phase"] = [PHASES[phase] for phase in contacts.phase[rows].tolist()]
+        fields["separate"] = contacts.separate[rows].tolist()
+    return _to_rows(fields)
+
+
+def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[dict]:
+    """Returns the fields of some intersections."""
+    crosses = intersections.crosses[rows].tolist()
+    return _to_rows(
+        {
+            "kind": ["edge-face"] * len(crosses),
+            **_names(intersections, rows),
+            "time": [intersections.time] * len(crosses),
+            "position": intersections.position[rows].tolist(),
+            "phase": ["crosses" if passes else "touches" for passes in crosses],
         }
+    )
 
 
-def _intersection_rows(intersections: SceneIntersections, rows: slice) -> Iterator[dict]:
-    """Yields the fields of some intersections."""
-    columns = *_names(intersections, rows), intersections.position[rows].tolist(), intersections.crosses[rows].tolist()
-    for meshes, prims, elements, indices, position, crosses in zip(*columns, strict=True):
-        yield {
-            "kind": "edge-face",
-            "meshes": meshes,
-            "prims": prims,
-            "elements": elements,
-            "indices": indices,
-            "time": intersections.time,
-            "position": position,
-            "phase": "crosses" if crosses else "touches",
-        }
-
-
-def _names(pairs: ScenePairs, rows: slice) -> tuple[list, list, list, list]:
+def _names(pairs: ScenePairs, rows: slice) -> dict[str, list]:
     """Returns names of meshes, paths of prims, names of elements and their indices for some pairs."""
-    paths = [mesh.path for mesh in pairs.segment.meshes]
-    prims = [(paths[first], paths[second]) for first, second in pairs.meshes[rows].tolist()]
-    indices = [
-        (first if first[1] >= 0 else first[:1], second if second[1] >= 0 else second[:1])
-        for first, second in pairs.indices[rows].tolist()
-    ]
-    return pairs.mesh_names(rows), prims, pairs.element_names(rows), indices
+    return {
+        "meshes": pairs.mesh_names(rows),
+        "prims": pairs.mesh_paths(rows),
+        "elements": pairs.element_names(rows),
+        "indices": pairs.element_indices(rows),
+    }
+
+
+def _to_rows(fields: dict[str, list]) -> list[dict]:
+    """Returns columns as rows."""
+    return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
 
 
 def _csv_values(row: dict) -> list:

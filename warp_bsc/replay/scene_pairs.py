@@ -60,22 +60,41 @@ class ScenePairs:
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the names of the two meshes of some pairs."""
-        names = [mesh.name for mesh in self.segment.meshes]
-        return [(names[first], names[second]) for first, second in self.meshes[rows].tolist()]
+        return self._of_meshes([mesh.name for mesh in self.segment.meshes], rows)
+
+    def mesh_paths(self, rows: slice) -> list[tuple[str, str]]:
+        """Returns the paths of the prims of the two meshes of some pairs."""
+        return self._of_meshes([mesh.path for mesh in self.segment.meshes], rows)
 
     def element_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
-
-        def name(element, indices):
-            first, second = indices
-            return f"{_WORDS[element]} {first}" if second < 0 else f"{_WORDS[element]} {first}-{second}"
-
-        return [
-            (name(first, first_indices), name(second, second_indices))
-            for (first, second), (first_indices, second_indices) in zip(
-                self.elements[rows].tolist(), self.indices[rows].tolist(), strict=True
-            )
+        sides = [
+            [
+                f"{_WORDS[kind]} {first}" if second < 0 else f"{_WORDS[kind]} {first}-{second}"
+                for kind, first, second in zip(
+                    self.elements[rows, side].tolist(), *self.indices[rows, side].T.tolist(), strict=True
+                )
+            ]
+            for side in range(2)
         ]
+        return list(zip(*sides, strict=True))
+
+    def element_indices(self, rows: slice) -> list[tuple[list[int], list[int]]]:
+        """Returns the indices of the two elements of some pairs in their prims, one or two numbers each."""
+        sides = [
+            [
+                [first] if second < 0 else [first, second]
+                for first, second in zip(*self.indices[rows, side].T.tolist(), strict=True)
+            ]
+            for side in range(2)
+        ]
+        return list(zip(*sides, strict=True))
+
+    def _of_meshes(self, texts, rows) -> list[tuple[str, str]]:
+        """Returns the texts of the two meshes of some pairs; pairs of the same meshes share them."""
+        keys, places = np.unique(self.meshes[rows] @ np.array([len(texts), 1]), return_inverse=True)
+        pairs = [(texts[key // len(texts)], texts[key % len(texts)]) for key in keys.tolist()]
+        return [pairs[place] for place in places.tolist()]
 
     def mesh_keys(self) -> np.ndarray:
         """Returns a number for the two meshes of each pair, whatever their order, shape [n]."""

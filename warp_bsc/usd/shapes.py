@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-import trimesh.creation
 from pxr import Usd, UsdGeom
 
 from .stage import may_jump
@@ -128,17 +127,19 @@ def is_shape(prim: Usd.Prim) -> bool:
 @functools.cache
 def _unit_shape(type_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns points, numbers of corners and corners of a shape of radius, height and size 1, its axis along z."""
+    from trimesh import creation  # noqa: PLC0415 (slow)
+
     if type_name == "Cube":
         return np.array(_CUBE), np.full(6, 4), np.ravel(_CUBE_SIDES)
     if type_name == "Plane":
         return np.array(_SQUARE), np.full(1, 4), np.arange(4)
     if type_name == "Sphere":
-        mesh = trimesh.creation.icosphere(subdivisions=3)
+        mesh = creation.icosphere(subdivisions=3)
     elif type_name == "Capsule":
-        mesh = trimesh.creation.capsule(radius=1.0, height=1.0, count=[_SECTIONS // 2, _SECTIONS])
+        mesh = creation.capsule(radius=1.0, height=1.0, count=[_SECTIONS // 2, _SECTIONS])
     elif type_name == "Cylinder":
-        mesh = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SECTIONS)
+        mesh = creation.cylinder(radius=1.0, height=1.0, sections=_SECTIONS)
     else:
-        mesh = trimesh.creation.cone(radius=1.0, height=1.0, sections=_SECTIONS)
+        mesh = creation.cone(radius=1.0, height=1.0, sections=_SECTIONS)
         mesh.apply_translation([0.0, 0.0, -0.5])
     return np.array(mesh.vertices), np.full(len(mesh.faces), 3), mesh.faces.ravel()
