@@ -189,6 +189,7 @@ class ReportPage(RecordFile):
 
     def _placed(self, positions: np.ndarray) -> np.ndarray:
         """Returns positions from the page's center on, in single precision."""
+        assert self._center is not None  # since the first interval
         return (positions.astype(np.float64) - self._center).astype(np.float32)
 
     def _notes(self, summary: Summary, rows: list[tuple[int, int]]) -> list[str]:

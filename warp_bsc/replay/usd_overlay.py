@@ -264,18 +264,18 @@ class Overlay:
     def _store(self, value_type, array) -> "_Place":
         data = np.ascontiguousarray(array, dtype=SHAPES[value_type][0])
         place = _Place(self._spool.tell(), data.nbytes)
-        rest = memoryview(data).cast("B")
+        rest = memoryview(data.tobytes())
         while rest:
             rest = rest[self._spool.write(rest) :]
         return place
 
     def _load(self, value_type, place) -> np.ndarray:
         dtype, width = SHAPES[value_type]
-        data = np.empty(place.size, np.uint8)
         self._spool.seek(place.offset)
-        if self._spool.readinto(data) != place.size:
+        data = self._spool.read(place.size)
+        if len(data) != place.size:
             raise RuntimeError("the spool of the overlay is cut off")
-        return data.view(dtype).reshape((-1, width) if width > 1 else -1)
+        return np.frombuffer(data, dtype).reshape((-1, width) if width > 1 else -1)
 
     def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
         """Yields the time samples of an attribute up to the end of the last interval, in order."""

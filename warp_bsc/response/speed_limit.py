@@ -20,7 +20,7 @@ def has_speed_limit(solver: SolverBase) -> bool:
 
 
 @contextlib.contextmanager
-def without_speed_limit(solver: SolverVBD):
+def without_speed_limit(solver: SolverBase):
     """Lets VBD step with the forces of its self-contact, but without its cuts of displacements.
 
     The solver cuts nothing where it has no self-contact, so that it has none for the time of a cut. Cuts before rigid
