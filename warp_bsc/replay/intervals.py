@@ -210,7 +210,8 @@ class _SegmentReplay:
         detector = self._detector
         start = self.find(interval.x0, interval.start, selection) if self._finder else None
         if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
-            detector = CollisionDetector(CollisionMesh(np.empty((0, 3), int), 0, device=self._mesh.device), method=detector.method)
+            nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self._mesh.device)
+            detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)

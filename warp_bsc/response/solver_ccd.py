@@ -211,13 +211,13 @@ class SolverCCD(SolverBase):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
         self._response.prepare(self._motion)
         self._recount_crossings()
-        self._lifts = respond and lift_speed_limit and has_speed_limit(solver)
+        self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
             self._coupling = Coupling(self._step_inner, solver, mesh, self._motion, self._response, coupling)
         self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._lifts)
+        self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._limited is not None)
 
     def _friction(self, friction):
         """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
@@ -288,8 +288,7 @@ class SolverCCD(SolverBase):
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
-        lifted = without_speed_limit(self.solver) if self._lifts else contextlib.nullcontext()
-        with lifted:
+        with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
             self.solver.step(*arguments, **options)
 
     def _inspect(self, particle_q, particle_qd, body_q, dt):

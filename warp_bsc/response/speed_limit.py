@@ -1,6 +1,7 @@
 """The speed limit of VBD's self-contact, lifted where the collision stage certifies the motion instead."""
 
 import contextlib
+from typing import TypeGuard
 
 from newton.solvers import SolverBase, SolverVBD
 
@@ -10,7 +11,7 @@ _TRUNCATION = "_penetration_free_truncation"
 """Method of Newton 1.8 that cuts displacements; without self-contact it cuts none. It has no public name."""
 
 
-def has_speed_limit(solver: SolverBase) -> bool:
+def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
     """Returns whether a solver is VBD with self-contact, which cuts the path of every particle, near something or not.
 
     The path between two detections is at most ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at
@@ -20,7 +21,7 @@ def has_speed_limit(solver: SolverBase) -> bool:
 
 
 @contextlib.contextmanager
-def without_speed_limit(solver: SolverBase):
+def without_speed_limit(solver: SolverVBD):
     """Lets VBD step with the forces of its self-contact, but without its cuts of displacements.
 
     The solver cuts nothing where it has no self-contact, so that it has none for the time of a cut. Cuts before rigid
