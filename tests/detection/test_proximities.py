@@ -163,7 +163,7 @@ def test_a_distance_that_single_precision_would_round_down():
     below, above = -(2.0**-25), 1.0
     x = [[0, 0, below], [2, 0, below], [0, 2, below], [0.5, 0.5, above], [3, 3, 2], [3, 2, 2]]
     mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)
-    assert np.float32((above - below) / 2) < (above - below) / 2
+    assert float(np.float32((above - below) / 2)) < (above - below) / 2
     found = ProximityFinder(mesh, above - below).find(np.array(x, np.float32))
     assert found.vertex_face.tolist() == [[3, 0]]
 

@@ -127,8 +127,8 @@ def add_to(commands: Commands) -> None:
         type=positive_number,
         metavar="D",
         help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
-        "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Nothing is said about "
-        "distances between the samples",
+        "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
+        "samples are not checked; an edge through a face is an intersection, however far their vertices are",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"

@@ -224,7 +224,8 @@ def replay(
         min_distance: Distance up to which elements are found to be near each other at each time, in the scene's unit of
             length: a vertex and a face, or two edges, that share no vertex and that no edge joins. No such pair is
             missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found between the
-            times. None to look for none.
+            times, and where an edge passes through a face, both may be far from each other's borders: these are
+            intersections. None to look for none.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
