@@ -128,7 +128,8 @@ def add_to(commands: Commands) -> None:
         metavar="D",
         help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
         "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
-        "samples are not checked; an edge through a face is an intersection, however far their vertices are",
+        "samples are not checked; an edge through a face is an intersection, however far their vertices are. Listed in "
+        "the tables, --json and --csv",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
