@@ -13,7 +13,7 @@ _FLAT = wp.constant(wp.float64(1.0e-24))
 
 
 @wp.func
-def _ratio(x: wp.float64, y: wp.float64) -> wp.float64:
+def ratio(x: wp.float64, y: wp.float64) -> wp.float64:
     """Returns x / y, clamped to [0, 1]; 0 where y is zero, the squared length of a collapsed edge."""
     if y > _ZERO:
         return wp.clamp(x / y, _ZERO, _ONE)
@@ -29,9 +29,9 @@ def _closest_vertex_face(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
     nn = wp.dot(n, n)
     if nn > _ZERO and beta >= _ZERO and gamma >= _ZERO and beta + gamma <= nn:
         return wp.vec2d(beta / nn, gamma / nn)
-    s_u = _ratio(wp.dot(w, u), wp.dot(u, u))
-    s_v = _ratio(wp.dot(w, v), wp.dot(v, v))
-    s_uv = _ratio(wp.dot(w - u, v - u), wp.dot(v - u, v - u))
+    s_u = ratio(wp.dot(w, u), wp.dot(u, u))
+    s_v = ratio(wp.dot(w, v), wp.dot(v, v))
+    s_uv = ratio(wp.dot(w - u, v - u), wp.dot(v - u, v - u))
     to_u = wp.length_sq(w - s_u * u)
     to_v = wp.length_sq(w - s_v * v)
     to_uv = wp.length_sq(w - u - s_uv * (v - u))
@@ -50,9 +50,9 @@ def _closest_edge_edge(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.vec2d:
     uv = wp.dot(u, v)
     uw = wp.dot(u, w)
     vw = wp.dot(v, w)
-    s = _ratio(uw * vv - uv * vw, uu * vv - uv * uv)
-    r = _ratio(uv * s - vw, vv)
-    return wp.vec2d(_ratio(uv * r + uw, uu), r)
+    s = ratio(uw * vv - uv * vw, uu * vv - uv * uv)
+    r = ratio(uv * s - vw, vv)
+    return wp.vec2d(ratio(uv * r + uw, uu), r)
 
 
 @wp.func

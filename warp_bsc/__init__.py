@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .replay.intervals import IntervalResult, IntervalSummary, replay
     from .replay.scene_contacts import SceneContacts
     from .replay.scene_intersections import SceneIntersections
+    from .replay.scene_proximities import SceneProximities
     from .response.captured_steps import CapturedSteps
     from .response.report import SolverReport
     from .response.solver_ccd import CollisionMonitor, SolverCCD
@@ -58,6 +59,7 @@ _MODULES = {
     "Scene": "usd.scene",
     "SceneContacts": "replay.scene_contacts",
     "SceneIntersections": "replay.scene_intersections",
+    "SceneProximities": "replay.scene_proximities",
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
@@ -83,6 +85,7 @@ __all__ = [
     "Scene",
     "SceneContacts",
     "SceneIntersections",
+    "SceneProximities",
     "Selection",
     "SolverCCD",
     "SolverReport",

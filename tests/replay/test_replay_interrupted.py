@@ -70,7 +70,7 @@ def read_left(folder, reason):
     if rows != "old":
         last = rows.splitlines()[-1]
         counts[1] = int(re.match("# " + partial, last).group(1)) if last.startswith("#") else FRAMES - 1
-        assert {len(row.split(",")) for row in rows.splitlines() if not row.startswith("#")} == {24}
+        assert {len(row.split(",")) for row in rows.splitlines() if not row.startswith("#")} == {25}
     if overlay != "old":
         data = Sdf.Layer.FindOrOpen(str(folder / "overlay.usda")).customLayerData["collisions"]
         counts[2] = data["intervals"]

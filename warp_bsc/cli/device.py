@@ -12,6 +12,7 @@ import warp as wp
 
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..detection.proximities import ProximityFinder
 from .tables import Console
 
 __all__ = ["find_device", "load_detector", "loading_kernels"]
@@ -60,11 +61,20 @@ def loading_kernels(device: wp.Device) -> Iterator[None]:
         timer.cancel()
 
 
-def load_detector(method: str, dtype: npt.DTypeLike, device: wp.Device, *, intersections: bool = False) -> None:
-    """Loads the detector's kernels for one type of position, those for intersections if wanted; may compile them."""
+def load_detector(
+    method: str,
+    dtype: npt.DTypeLike,
+    device: wp.Device,
+    *,
+    intersections: bool = False,
+    proximities: bool = False,
+) -> None:
+    """Loads the detector's kernels for one type of position, other finders' if wanted; may compile them."""
     triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)
     detector = CollisionDetector(triangles, method=method)
     detector.detect(points, points)
     if intersections:
         detector.find_intersections(points)
+    if proximities:
+        ProximityFinder(triangles, 1.0).find(points)

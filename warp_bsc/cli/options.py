@@ -1,6 +1,7 @@
 """What several commands share: options, their types, and the parts of the help texts."""
 
 import argparse
+import math
 from collections.abc import Callable
 
 from ..detection.settings import METHODS
@@ -119,6 +120,18 @@ def add_threads(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--threads", type=positive, metavar="N", help="number of CPU cores to use, on Linux only (default: all)"
     )
+
+
+def positive_number(text: str) -> float:
+    """The finite number that an argument holds.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is not finite or not more than 0.
+    """
+    number = float(text)
+    if not 0.0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
+    return number
 
 
 def positive(text: str) -> int:

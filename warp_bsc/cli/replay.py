@@ -9,6 +9,7 @@ import os
 import shlex
 import time
 from collections.abc import Generator
+from typing import Any
 
 import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -34,6 +35,7 @@ from .options import (
     add_command,
     add_detection_options,
     positive,
+    positive_number,
 )
 from .replay_tables import print_new, print_replay
 from .tables import Console, say
@@ -60,6 +62,7 @@ examples:
   warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
   warp-bsc replay cloth.usd --device cpu --method conservative
   warp-bsc replay cloth.usd --json > collisions.json
+  warp-bsc replay cloth.usd --min-distance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
 
@@ -118,6 +121,15 @@ def add_to(commands: Commands) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="find the edges that pass through faces or touch them at the time samples themselves (default: yes)",
+    )
+    which.add_argument(
+        "--min-distance",
+        type=positive_number,
+        metavar="D",
+        help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
+        "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
+        "samples are not checked; an edge through a face is an intersection, however far their vertices are. Listed in "
+        "the tables, --json and --csv",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
@@ -201,7 +213,7 @@ def add_to(commands: Commands) -> None:
         default=frozenset(),
         metavar="WHAT",
         help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces), "
-        "collisions, new (what --baseline does not have)",
+        "collisions, distance (what --min-distance finds), new (what --baseline does not have)",
     )
     add_detection_options(command, method="exact")
 
@@ -210,7 +222,13 @@ def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
     device = find_device(arguments.device)
     with loading_kernels(device):
-        load_detector(arguments.method, scene.dtype, device, intersections=arguments.intersections)
+        load_detector(
+            arguments.method,
+            scene.dtype,
+            device,
+            intersections=arguments.intersections,
+            proximities=arguments.min_distance is not None,
+        )
     return run_replay(scene, arguments, device)
 
 
@@ -231,6 +249,8 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
+    if "distance" in arguments.fail_on and arguments.min_distance is None:
+        raise ValueError("--fail-on distance needs --min-distance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
         raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
     if outputs.count(STDOUT) > 1:
@@ -282,7 +302,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
         ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
             disk, as far as it has space.
     """
-    settings = {"method": arguments.method, "device": str(device)}
+    settings = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
     baseline = Baseline(arguments.baseline) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
         outputs = _open_outputs(stack, scene, arguments, settings)
@@ -344,6 +364,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
     fails = {
         "intersections": any(sample.crossings for sample in summary.intersections),
         "collisions": summary.hits > 0,
+        "distance": bool(summary.nearest),
         "new": baseline is not None and bool(baseline.new_in(summary)),
     }
     if any(fails[reason] for reason in arguments.fail_on):
@@ -393,7 +414,7 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
 
 
 def _open_outputs(
-    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, settings: dict[str, str]
+    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, settings: dict[str, Any]
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
@@ -457,6 +478,7 @@ def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Ge
             device=device,
             intersections=arguments.intersections,
             ignore_initial=arguments.ignore_initial,
+            min_distance=arguments.min_distance,
             validate_most=arguments.validate,
         ):
             yield result
@@ -465,9 +487,9 @@ def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Ge
 
 def _reasons(text: str) -> frozenset[str]:
     reasons = frozenset(text.split(","))
-    if unknown := reasons - {"intersections", "collisions", "new"}:
+    if unknown := reasons - {"intersections", "collisions", "distance", "new"}:
         raise argparse.ArgumentTypeError(
-            f"must be of intersections, collisions, new, not {', '.join(sorted(unknown))!r}"
+            f"must be of intersections, collisions, distance, new, not {', '.join(sorted(unknown))!r}"
         )
     return reasons
 

@@ -56,6 +56,8 @@ def print_replay(console: Console, summary: Summary) -> None:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
     if summary.intersections:
         _print_intersections(console, summary)
+    if summary.min_distance is not None:
+        _print_proximities(console, summary, summary.min_distance)
     if summary.ignored:
         ignored = sum(hits for _, hits in summary.ignored)
         say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
@@ -205,6 +207,34 @@ def _print_intersections(console: Console, summary: Summary) -> None:
             f"Of the collisions, {separate:,} are of meshes that were separate before. The surfaces around them: "
             f"{', '.join(f'{phase} {number:,}' for phase, number in zip(PHASES, phases, strict=True))}.",
         )
+
+
+def _print_proximities(console: Console, summary: Summary, min_distance: float) -> None:
+    """Prints which meshes come nearer each other than the distance at the times themselves, and where most."""
+    samples, nearest = summary.proximities, summary.nearest
+    times = f"{count(len(samples), 'time')}; between times, distances are not checked"
+    if not nearest:
+        say(console, f"No elements are at most {min_distance:g} apart, at {times}.")
+        return
+    near = sum(bool(sample.pairs) for sample in samples)
+    worst = max(samples, key=lambda sample: sample.pairs)
+    say(
+        console,
+        f"Elements are at most {min_distance:g} apart at {near:,} of {times}. The least distance is "
+        f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}.",
+    )
+    table = make_table("Nearest elements", "Distance", "Time", "x", "y", "z", caption="The nearest of all times.")
+    for found in nearest[:LONGEST]:
+        (first, second), (element, other) = found.meshes, found.elements
+        table.add_row(
+            Text(f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"),
+            f"{found.distance:.6g}",
+            f"{found.time:g}",
+            *(f"{coordinate:.4g}" for coordinate in found.position),
+        )
+    console.print(table)
+    if len(nearest) > LONGEST:
+        say(console, f"  and {len(nearest) - LONGEST} more pairs of meshes; --json has all.")
 
 
 def _edges(crossings: int, touches: int) -> str:

@@ -45,6 +45,7 @@ class BroadPhase(Protocol):
         *,
         refit: bool = False,
         changed: wp.array | None = None,
+        keep_separated: bool = False,
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
 
@@ -59,6 +60,7 @@ class BroadPhase(Protocol):
                 nothing is allocated on a GPU. A CPU sorts the tree anew where its boxes have become much larger.
             changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all. More pairs may be
                 found than wanted.
+            keep_separated: Whether to enqueue all candidates.
         """
         ...
 

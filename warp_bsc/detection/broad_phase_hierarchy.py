@@ -589,10 +589,11 @@ class BroadPhaseHierarchy:
         *,
         refit: bool = False,
         changed: wp.array | None = None,
+        keep_separated: bool = False,
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
         self._pair_faces(x0, x1, changed)
-        self._pair_elements(False, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_elements(keep_separated, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array

@@ -320,11 +320,12 @@ class BroadPhaseSimd:
         *,
         refit: bool = False,
         changed: wp.array | None = None,
+        keep_separated: bool = False,
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates."""
         self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge)
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=keep_separated)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=keep_separated)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array

@@ -13,9 +13,10 @@ import orjson
 from ..usd.scene import Scene
 from .intervals import IntersectionSummary, IntervalResult
 from .outputs import RecordFile
-from .scene_contacts import KINDS, PHASES, SceneContacts
+from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import ScenePairs
+from .scene_pairs import KINDS, ScenePairs
+from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["HitsCsv", "HitsJson"]
@@ -24,10 +25,12 @@ __all__ = ["HitsCsv", "HitsJson"]
 class HitsJson(RecordFile):
     """A JSON file: facts of the scene, every interval with its contacts and intersections, then the sums.
 
-    An interval lists the intersections at its start; the last one lists those at its end as well.
+    An interval lists the intersections and proximities at its start; the last one lists those at its end as well.
     """
 
-    def __init__(self, path: str | os.PathLike, *, scene: Scene, method: str, device: str):
+    def __init__(
+        self, path: str | os.PathLike, *, scene: Scene, method: str, device: str, min_distance: float | None = None
+    ):
         """Opens the file.
 
         Args:
@@ -35,6 +38,7 @@ class HitsJson(RecordFile):
             scene: The scene.
             method: Method of detection.
             device: Name of the Warp device.
+            min_distance: As of :class:`Summary`.
 
         Raises:
             OSError: If it cannot be written.
@@ -45,6 +49,7 @@ class HitsJson(RecordFile):
             "scene": scene.path,
             "method": method,
             "device": device,
+            "min_distance": min_distance,
             "time_codes_per_second": scene.time_codes_per_second,
             "meters_per_unit": scene.meters_per_unit,
             "up_axis": scene.up_axis,
@@ -79,6 +84,8 @@ class HitsJson(RecordFile):
             fields["separate_hits"] = interval.separate_hits
             fields["phases"] = dict(zip(PHASES, interval.phases or (), strict=True))
             fields["intersections"] = {"start": _numbers(start), "end": _numbers(end)}
+        if interval.proximities:
+            fields["proximities"] = dict(zip(("start", "end"), map(asdict, interval.proximities), strict=True))
         yield ("," if self.record_count else "") + "\n" + json.dumps(fields, allow_nan=False)[:-1]
         yield from _list("contacts", contacts, _contact_rows)
         if result.intersections:
@@ -86,6 +93,11 @@ class HitsJson(RecordFile):
             yield from _list("edges_through_faces", start, _intersection_rows)
             if interval.index == self._last_index:
                 yield from _list("edges_through_faces_at_end", end, _intersection_rows)
+        if result.proximities:
+            start, end = result.proximities
+            yield from _list("near_pairs", start, _proximity_rows)
+            if interval.index == self._last_index:
+                yield from _list("near_pairs_at_end", end, _proximity_rows)
         yield "}"
 
     def tail(self, summary: Summary) -> str:
@@ -103,23 +115,24 @@ class HitsJson(RecordFile):
             "collision_spans": [asdict(span) for span in summary.collision_spans],
             "ignored": _mesh_pairs_to_list(summary.ignored),
             "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
+            "nearest": [asdict(nearest) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
         return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact and each intersection, and a last line beginning with # if some are missing.
+    """A CSV file: a row for each contact, intersection and proximity, and a last line with # if some are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
-    start, in the last interval its end too.
+    start, in the last interval its end too. The same holds for proximities, which have the phase "near" and a distance.
     """
 
     _COLUMNS = (
         "interval", "start", "end", "kind",
         "first_mesh", "first_prim", "first_element", "first_index", "first_index_2",
         "second_mesh", "second_prim", "second_element", "second_index", "second_index_2",
-        "time", "toi", "x", "y", "z", "normal_x", "normal_y", "normal_z", "phase", "separate",
+        "time", "toi", "x", "y", "z", "normal_x", "normal_y", "normal_z", "phase", "separate", "distance",
     )  # fmt: skip
 
     def __init__(self, path: str | os.PathLike, *, scene: Scene):
@@ -139,12 +152,10 @@ class HitsCsv(RecordFile):
         """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
-        for rows in contacts.chunks():
-            yield _to_csv([*where, *_csv_values(row)] for row in _contact_rows(contacts, rows))
-        if result.intersections:
-            for intersections in result.intersections[: 2 if interval.index == self._last_index else 1]:
-                for rows in intersections.chunks():
-                    yield _to_csv([*where, *_csv_values(row)] for row in _intersection_rows(intersections, rows))
+        times = 2 if interval.index == self._last_index else 1
+        yield from _csv_rows(where, [contacts], _contact_rows)
+        yield from _csv_rows(where, (result.intersections or ())[:times], _intersection_rows)
+        yield from _csv_rows(where, (result.proximities or ())[:times], _proximity_rows)
 
     def tail(self, summary: Summary) -> str:
         """Returns a line on the missing intervals, empty if there are none."""
@@ -162,6 +173,13 @@ def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict
     for number, rows in enumerate(pairs.chunks()):
         yield (b", " if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
     yield "]"
+
+
+def _csv_rows(where: list, found: Iterable[_Pairs], to_rows: Callable[[_Pairs, slice], list[dict]]) -> Iterator[str]:
+    """Yields rows of a CSV file: an interval's columns, then those of each pair."""
+    for pairs in found:
+        for rows in pairs.chunks():
+            yield _to_csv([*where, *_csv_values(row)] for row in to_rows(pairs, rows))
 
 
 def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
@@ -194,6 +212,21 @@ def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[d
     )
 
 
+def _proximity_rows(proximities: SceneProximities, rows: slice) -> list[dict]:
+    """Returns the fields of some proximities."""
+    kinds = proximities.kind[rows].tolist()
+    return _to_rows(
+        {
+            "kind": [KINDS[kind] for kind in kinds],
+            **_names(proximities, rows),
+            "time": [proximities.time] * len(kinds),
+            "position": proximities.position[rows].tolist(),
+            "phase": ["near"] * len(kinds),
+            "distance": proximities.distance[rows].tolist(),
+        }
+    )
+
+
 def _names(pairs: ScenePairs, rows: slice) -> dict[str, list]:
     """Returns names of meshes, paths of prims, names of elements and their indices for some pairs."""
     return {
@@ -215,7 +248,7 @@ def _csv_values(row: dict) -> list:
     pair = [value for mesh, prim, element, of in sides for value in (mesh, prim, element, of[0], [*of, ""][1])]
     normal = row.get("normal", ("", "", ""))
     measures = row["time"], row.get("toi", ""), *row["position"], *normal
-    return [row["kind"], *pair, *measures, row.get("phase", ""), row.get("separate", "")]
+    return [row["kind"], *pair, *measures, row.get("phase", ""), row.get("separate", ""), row.get("distance", "")]
 
 
 def _to_csv(rows: Iterable[list]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from ..detection.collisions import Collisions, DetectionStats
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..detection.proximities import ProximityFinder
 from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment
@@ -16,10 +17,20 @@ from ..usd.selection import Selection
 from .scene_contacts import PHASES, SceneContacts, find_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_pairs import count_by_meshes
+from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
 from .validation import Validation, validate
 
-__all__ = ["TOI_BINS", "Contact", "IntersectionSummary", "IntervalResult", "IntervalSummary", "replay"]
+__all__ = [
+    "TOI_BINS",
+    "Contact",
+    "IntersectionSummary",
+    "IntervalResult",
+    "IntervalSummary",
+    "Nearest",
+    "ProximitySummary",
+    "replay",
+]
 
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
@@ -61,6 +72,42 @@ class IntersectionSummary:
 
 
 @dataclass(frozen=True)
+class Nearest:
+    """The nearest two elements of two meshes at one time, or of a mesh and itself, in words.
+
+    Attributes:
+        meshes: Names of the two meshes.
+        elements: The two elements, as of :class:`Contact`.
+        time: Time code.
+        distance: Distance of the elements, in the scene's unit of length.
+        position: Point halfway between their closest points, in world space.
+        pairs: Number of pairs of elements of the two meshes that are near at that time.
+    """
+
+    meshes: tuple[str, str]
+    elements: tuple[str, str]
+    time: float
+    distance: float
+    position: tuple[float, float, float]
+    pairs: int
+
+
+@dataclass(frozen=True)
+class ProximitySummary:
+    """The pairs of elements that are near each other at one time of a scene, in numbers.
+
+    Attributes:
+        time: Time code.
+        pairs: Number of pairs.
+        nearest: The nearest elements of each two meshes that are near each other, the nearest first.
+    """
+
+    time: float
+    pairs: int
+    nearest: tuple[Nearest, ...]
+
+
+@dataclass(frozen=True)
 class IntervalSummary:
     """The collisions between two consecutive times of a scene, in numbers.
 
@@ -83,6 +130,8 @@ class IntervalSummary:
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
         ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
         phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
+        proximities: The proximities at the start and at the end, as ``intersections``; None if they were not looked
+            for.
     """
 
     index: int
@@ -100,6 +149,7 @@ class IntervalSummary:
     ignored: dict[tuple[str, str], int]
     separate_hits: int | None
     phases: tuple[int, ...] | None
+    proximities: tuple[ProximitySummary, ProximitySummary] | None
 
     @property
     def hits(self) -> int:
@@ -126,11 +176,13 @@ class IntervalResult:
         contacts: Every pair that collides, and the positions of all vertices.
         intersections: Every edge that meets a face, at the start of the interval and at its end; None if they were not
             looked for. Where nothing jumps, those at the end are the next interval's at its start, the same object.
+        proximities: The pairs of elements that are near each other, at both times, as ``intersections``.
     """
 
     summary: IntervalSummary
     contacts: SceneContacts
     intersections: tuple[SceneIntersections, SceneIntersections] | None
+    proximities: tuple[SceneProximities, SceneProximities] | None
 
 
 def replay(
@@ -140,6 +192,7 @@ def replay(
     device: Any = None,
     intersections: bool = True,
     ignore_initial: bool = False,
+    min_distance: float | None = None,
     validate_most: int | None = 0,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
@@ -168,6 +221,11 @@ def replay(
         intersections: Whether to find the intersections at each time.
         ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
             themselves then: their collisions and intersections are only counted.
+        min_distance: Distance up to which elements are found to be near each other at each time, in the scene's unit of
+            length: a vertex and a face, or two edges, that share no vertex and that no edge joins. No such pair is
+            missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found between the
+            times, and where an edge passes through a face, both may be far from each other's borders: these are
+            intersections. None to look for none.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
 
@@ -176,8 +234,8 @@ def replay(
         next interval meanwhile.
 
     Raises:
-        ValueError: If the positions at some time are broken, there is no such method, or initial intersections are to
-            be ignored and none are to be found.
+        ValueError: If the positions at some time are broken, there is no such method, initial intersections are to be
+            ignored and none are to be found, or the distance is no finite number more than 0.
     """
     if ignore_initial and not intersections:
         raise ValueError("what crosses at first can be ignored only if intersections are found")
@@ -185,7 +243,9 @@ def replay(
     for interval in read_ahead(scene):
         if segment_replay is None or interval.segment is not segment_replay.segment:
             is_first, segment_replay = segment_replay is None, None  # before the next is made, to free its memory
-            segment_replay = _SegmentReplay(interval.segment, scene.is_still, method, device, intersections)
+            segment_replay = _SegmentReplay(
+                interval.segment, scene.is_still, method, device, intersections, min_distance
+            )
             if is_first and ignore_initial:
                 at_first = _summarize_intersections(segment_replay.find(interval.x0, interval.start, selection))
                 crossing = {tuple(sorted(names)) for names, (crossings, _) in at_first.mesh_pairs.items() if crossings}
@@ -197,13 +257,23 @@ def replay(
 class _SegmentReplay:
     """Checks the intervals of one segment."""
 
-    def __init__(self, segment: Segment, is_still: bool, method: str, device: Any, intersections: bool):
+    def __init__(
+        self,
+        segment: Segment,
+        is_still: bool,
+        method: str,
+        device: Any,
+        intersections: bool,
+        min_distance: float | None,
+    ):
         self.segment = segment
         self._is_still = is_still
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=device)
         self._detector = CollisionDetector(self._mesh, method=method)
         self._finder = self._detector.intersection_finder() if intersections else None
         self._last: SceneIntersections | None = None  # those found last
+        self._proximity_finder = None if min_distance is None else ProximityFinder(self._mesh, min_distance)
+        self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
 
     def check(self, interval: Interval, selection: Selection, validate_most: int | None) -> IntervalResult:
         """Returns the collisions of an interval."""
@@ -219,6 +289,10 @@ class _SegmentReplay:
         intersections = None
         if start is not None:
             intersections = start, self.find(interval.x1, interval.end, selection, is_end=not self._is_still)
+        proximities = None
+        if self._proximity_finder:
+            near = self._find_near(interval.x0, interval.start, selection)
+            proximities = near, self._find_near(interval.x1, interval.end, selection)
         contacts = find_contacts(interval, self._mesh, collisions, selection, intersections)
         validation = None
         if validate_most != 0:
@@ -231,8 +305,8 @@ class _SegmentReplay:
                 seed=interval.index,
                 counted=contacts.counted,
             )
-        summary = _summarize(contacts, collisions, intersections, validation)
-        return IntervalResult(summary, contacts, intersections)
+        summary = _summarize(contacts, collisions, intersections, proximities, validation)
+        return IntervalResult(summary, contacts, intersections, proximities)
 
     def find(self, x: np.ndarray, time: float, selection: Selection, *, is_end: bool = False) -> SceneIntersections:
         """Returns the intersections at a time, those found last if these are the ones.
@@ -250,12 +324,23 @@ class _SegmentReplay:
             self._last = last = name_intersections(self.segment, self._mesh, found, x, time, selection)
         return last
 
+    def _find_near(self, x: np.ndarray, time: float, selection: Selection) -> SceneProximities:
+        """Returns the proximities at a time, those found last if these are the ones."""
+        if self._last_near:
+            last_x, last = self._last_near
+            if last.time == time and (last_x is x or np.array_equal(last_x, x)):
+                return last
+        assert self._proximity_finder
+        found = name_proximities(self.segment, self._mesh, self._proximity_finder.find(x), time, selection)
+        self._last_near = x, found
+        return found
+
     def forget(self) -> None:
         """Forgets what was found last: another selection counts."""
         self._last = None
 
 
-def _summarize(contacts, collisions, intersections, validation) -> IntervalSummary:
+def _summarize(contacts, collisions, intersections, proximities, validation) -> IntervalSummary:
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
@@ -270,6 +355,10 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
     if intersections:
         start, end = map(_summarize_intersections, intersections)
         at_rest = start, end
+    near = None
+    if proximities:
+        start, end = map(_summarize_proximities, proximities)
+        near = start, end
     hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
     edge_edge = int(contacts.kind.sum())
     return IntervalSummary(
@@ -288,6 +377,7 @@ def _summarize(contacts, collisions, intersections, validation) -> IntervalSumma
         ignored=contacts.ignored,
         separate_hits=int(contacts.separate.sum()) if intersections else None,
         phases=tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()) if intersections else None,
+        proximities=near,
     )
 
 
@@ -296,3 +386,24 @@ def _summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
     return IntersectionSummary(
         found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
     )
+
+
+def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
+    order = np.argsort(found.distance, kind="stable")
+    _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
+    nearest = []
+    for place in np.argsort(firsts).tolist():
+        row = int(order[firsts[place]])
+        rows = slice(row, row + 1)
+        x, y, z = found.position[row].tolist()
+        nearest.append(
+            Nearest(
+                found.mesh_names(rows)[0],
+                found.element_names(rows)[0],
+                found.time,
+                float(found.distance[row]),
+                (x, y, z),
+                int(numbers[place]),
+            )
+        )
+    return ProximitySummary(found.time, len(found), tuple(nearest))

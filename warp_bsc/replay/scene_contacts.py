@@ -9,12 +9,9 @@ from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
-from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, count_by_meshes
+from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
 
-__all__ = ["KINDS", "PHASES", "SceneContacts", "find_contacts"]
-
-KINDS = ("vertex-face", "edge-edge")
-"""Labels of the kinds of contact, by their numbers."""
+__all__ = ["PHASES", "SceneContacts", "find_contacts"]
 
 PHASES = ("passes", "enters", "leaves", "stays")
 """Whether the surfaces at two elements cross at the end of the interval, plus twice whether they do at its start.
@@ -29,7 +26,7 @@ class SceneContacts(ScenePairs):
 
     Attributes:
         interval: The interval.
-        kind: Index in :data:`KINDS`, shape [n].
+        kind: Index in :data:`~warp_bsc.replay.scene_pairs.KINDS`, shape [n].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
@@ -88,9 +85,8 @@ def find_contacts(
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
-    n_vertex_face, n_edge_edge = len(vertices), len(ends)
-    n = n_vertex_face + n_edge_edge
-    if not n:
+    n_vertex_face = len(vertices)
+    if not n_vertex_face + len(ends):
         none = np.zeros(0, dtype=np.int64)
         return SceneContacts(
             segment,
@@ -106,23 +102,8 @@ def find_contacts(
             phase=none if intersections else None,
         )
 
-    kind = np.repeat([0, 1], [n_vertex_face, n_edge_edge])
-    elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])
-    meshes = np.zeros((n, 2), dtype=np.int64)
-    indices = np.full((n, 2, 2), -1, dtype=np.int64)
-    all_vertices = np.full((n, 2, 2), -1, dtype=np.int64)
-    all_faces = np.full((n, 2), -1, dtype=np.int64)
-
-    rows = slice(0, n_vertex_face)
-    meshes[rows, 0], indices[rows, 0, 0] = segment.locate_vertices(vertices)
-    meshes[rows, 1], indices[rows, 1, 0] = segment.locate_faces(faces)
-    all_vertices[rows, 0, 0], all_faces[rows, 1] = vertices, faces
-    rows = slice(n_vertex_face, n)
-    for side in range(2):
-        meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(ends[:, side])
-        elements[rows, side][diagonal] = DIAGONAL
-    all_vertices[rows] = ends
-
+    named = name_elements(segment, vertices, faces, ends)
+    meshes = named["meshes"]
     toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
     normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
 
@@ -138,16 +119,10 @@ def find_contacts(
 
     moves = np.array([part.moves for part in segment.meshes])
     counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
-    counted &= ~_are_stiff(segment, vertices, meshes[:n_vertex_face, 1], ends)
+    counted &= ~are_stiff_pairs(segment, vertices, meshes[:n_vertex_face, 1], ends)
     ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
     counted &= ~ignored
-    arrays = {
-        "kind": kind,
-        "elements": elements,
-        "meshes": meshes,
-        "indices": indices,
-        "vertices": all_vertices,
-        "faces": all_faces,
+    arrays = named | {
         "toi": toi,
         "time": interval.start + toi * (interval.end - interval.start),
         "position": position,
@@ -179,12 +154,3 @@ def _compare(contacts: SceneContacts, start: SceneIntersections, end: SceneInter
             crosses = [np.isin(intersections.pair_keys(pair), tangled) for pair in pairs]
             phase += weight * np.any(crosses, axis=0)
     return replace(contacts, separate=~np.isin(contacts.mesh_keys(), start.mesh_keys()), phase=phase)
-
-
-def _are_stiff(segment, vertices, face_meshes, ends) -> np.ndarray:
-    """Returns which pairs are of a mesh with itself that only its transform moves: vertices and faces, then edges."""
-    rows, meshes = segment.meshes_at_edges(ends[:, 1])
-    of_edges = segment.are_stiff(ends[rows, 0], meshes)
-    edges = np.zeros(len(ends), dtype=bool)
-    edges[rows[of_edges]] = True
-    return np.concatenate([segment.are_stiff(vertices, face_meshes), edges])

@@ -6,7 +6,21 @@ import numpy as np
 
 from ..usd.segment import Segment
 
-__all__ = ["DIAGONAL", "EDGE", "FACE", "NO_PAIRS", "VERTEX", "ScenePairs", "count_by_meshes"]
+__all__ = [
+    "DIAGONAL",
+    "EDGE",
+    "FACE",
+    "KINDS",
+    "NO_PAIRS",
+    "VERTEX",
+    "ScenePairs",
+    "are_stiff_pairs",
+    "count_by_meshes",
+    "name_elements",
+]
+
+KINDS = ("vertex-face", "edge-edge")
+"""Labels of the kinds of pair that collide or are near, by their numbers."""
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
@@ -123,3 +137,48 @@ def count_by_meshes(
         (names[pair // len(names)], names[pair % len(names)]): tuple(row)
         for pair, row in zip(pairs.tolist(), sums.tolist(), strict=True)
     }
+
+
+def name_elements(segment: Segment, vertices: np.ndarray, faces: np.ndarray, ends: np.ndarray) -> dict[str, np.ndarray]:
+    """Names vertex-face pairs, then edge-edge pairs: all arrays of :class:`ScenePairs` but positions, and the kind.
+
+    Args:
+        segment: The segment.
+        vertices: Vertices of the vertex-face pairs, shape [n].
+        faces: Their faces, shape [n].
+        ends: Vertices at both ends of both edges of the edge-edge pairs, the smaller first, shape [m, 2, 2].
+    """
+    n_vertex_face, n = len(vertices), len(vertices) + len(ends)
+    kind = np.repeat([0, 1], [n_vertex_face, len(ends)])
+    elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])
+    meshes = np.zeros((n, 2), dtype=np.int64)
+    indices = np.full((n, 2, 2), -1, dtype=np.int64)
+    all_vertices = np.full((n, 2, 2), -1, dtype=np.int64)
+    all_faces = np.full((n, 2), -1, dtype=np.int64)
+
+    rows = slice(0, n_vertex_face)
+    meshes[rows, 0], indices[rows, 0, 0] = segment.locate_vertices(vertices)
+    meshes[rows, 1], indices[rows, 1, 0] = segment.locate_faces(faces)
+    all_vertices[rows, 0, 0], all_faces[rows, 1] = vertices, faces
+    rows = slice(n_vertex_face, n)
+    for side in range(2):
+        meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(ends[:, side])
+        elements[rows, side][diagonal] = DIAGONAL
+    all_vertices[rows] = ends
+    return {
+        "kind": kind,
+        "elements": elements,
+        "meshes": meshes,
+        "indices": indices,
+        "vertices": all_vertices,
+        "faces": all_faces,
+    }
+
+
+def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Returns which pairs, as of :func:`name_elements`, are of a mesh with itself that only its transform moves."""
+    rows, meshes = segment.meshes_at_edges(ends[:, 1])
+    of_edges = segment.are_stiff(ends[rows, 0], meshes)
+    edges = np.zeros(len(ends), dtype=bool)
+    edges[rows[of_edges]] = True
+    return np.concatenate([segment.are_stiff(vertices, face_meshes), edges])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, Contact, IntersectionSummary, IntervalSummary
+from .intervals import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 
 __all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "Summary", "ValidationSummary"]
 
@@ -95,6 +95,8 @@ class Summary:
         device: Name of the Warp device.
         intervals: The finished intervals, in order.
         stopped: Why the replay ended before the scene did; empty if it did not.
+        min_distance: Distance up to which elements are near each other, in the scene's unit of length; None if
+            proximities were not looked for.
     """
 
     scene: Scene
@@ -102,6 +104,7 @@ class Summary:
     device: str
     intervals: list[IntervalSummary]
     stopped: str = ""
+    min_distance: float | None = None
 
     @property
     def is_complete(self) -> bool:
@@ -170,6 +173,22 @@ class Summary:
                 running.setdefault(meshes, []).append((sample.time, *numbers))
         spans += [_span(meshes, samples, True) for meshes, samples in running.items()]
         return sorted(spans, key=lambda span: (span.since, -span.most))
+
+    @cached_property
+    def proximities(self) -> list[ProximitySummary]:
+        """The proximities at all times of the finished intervals, in order; empty if they were not looked for."""
+        found = [interval.proximities for interval in self.intervals if interval.proximities]
+        return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+    @cached_property
+    def nearest(self) -> list[Nearest]:
+        """The nearest elements of each two meshes over all times, the first time if several, the nearest first."""
+        least: dict[tuple[str, ...], Nearest] = {}
+        for nearest in (nearest for sample in self.proximities for nearest in sample.nearest):
+            before = least.setdefault(tuple(sorted(nearest.meshes)), nearest)
+            if nearest.distance < before.distance:
+                least[tuple(sorted(nearest.meshes))] = nearest
+        return sorted(least.values(), key=lambda nearest: nearest.distance)
 
     @property
     def certified(self) -> bool:

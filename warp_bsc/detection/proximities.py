@@ -1,0 +1,270 @@
+"""Proximities of a mesh with itself in one configuration: pairs of elements that are at most some distance apart."""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .._arrays import check_finite
+from ..kernels.distance import closest_points
+from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.queues import is_filled, take_slot
+from ..kernels.polynomials import VERTEX_FACE
+from .broad_phase import make_broad_phase
+from .launch import launch_over_queue, retry_until_fits
+from .mesh import CollisionMesh
+from .settings import NO_GRADIENTS, Count, Counters, PairKind, capacity_for
+
+__all__ = ["Proximities", "ProximityFinder"]
+
+_FOUND = wp.constant(int(Count.FOUND))
+_QUEUED = wp.constant(int(Count.QUEUED))
+_LARGEST = 2.0**1000
+"""Largest coordinate: differences and their sums stay finite."""
+
+
+@wp.func
+def _are_joined(corners: wp.vec4i, firsts: int, starts: wp.array[int], neighbours: wp.array[int]) -> bool:
+    """Whether an edge of the mesh joins one of the first corners, 1 or 2, to one of the others."""
+    for first in range(firsts):
+        vertex = corners[first]
+        for i in range(starts[vertex], starts[vertex + 1]):
+            for second in range(firsts, 4):
+                if neighbours[i] == corners[second]:
+                    return True
+    return False
+
+
+@functools.cache
+def _keep_near(dtype: type) -> wp.Kernel:
+    """The kernel that keeps the pairs that are near and not joined, for one type of position."""
+
+    @wp.func
+    def point(x: wp.array[dtype], vertex: int) -> wp.vec3d:
+        return wp.vec3d(wp.float64(x[vertex][0]), wp.float64(x[vertex][1]), wp.float64(x[vertex][2]))
+
+    @wp.kernel(**NO_GRADIENTS)
+    def keep_near(
+        first: int,
+        # mesh
+        x: wp.array[dtype],
+        kind: int,
+        elements: wp.array2d[int],
+        starts: wp.array[int],
+        neighbours: wp.array[int],
+        # in
+        distance: wp.float64,
+        pairs: wp.array[wp.vec2i],
+        # in and out
+        counts: wp.array[wp.int64],
+        # out
+        kept: wp.array[wp.vec2i],
+        kept_distance: wp.array[wp.float64],
+        kept_position: wp.array[wp.vec3d],
+    ):
+        i = first + wp.tid()
+        if not is_filled(i, pairs, counts, _QUEUED):
+            return
+        corners = vertices_of_pair(kind, elements, pairs[i])
+        p = point(x, corners[0])
+        q = point(x, corners[1])
+        r = point(x, corners[2])
+        s = point(x, corners[3])
+        # vertex p with face q r s, or edge p q with edge r s
+        u = r - q
+        v = s - q
+        w = p - q
+        firsts = int(1)
+        if kind != VERTEX_FACE:
+            u = q - p
+            v = s - r
+            w = r - p
+            firsts = 2
+        coordinates, found, error = closest_points(kind, u, v, w)
+        if found > distance + error:
+            return
+        if _are_joined(corners, firsts, starts, neighbours):
+            return
+        slot = take_slot(counts, _FOUND)
+        if slot < wp.int64(kept.shape[0]):
+            one = p
+            other = q + coordinates[0] * u + coordinates[1] * v
+            if kind != VERTEX_FACE:
+                one = p + coordinates[0] * u
+                other = r + coordinates[1] * v
+            k = wp.int32(slot)
+            kept[k] = pairs[i]
+            kept_distance[k] = found
+            kept_position[k] = one + wp.float64(0.5) * (other - one)
+
+    return keep_near
+
+
+@dataclass(frozen=True, eq=False)
+class Proximities:
+    """The pairs of elements that are near each other in one configuration.
+
+    Attributes:
+        vertex_face: (vertex, face), sorted, int32, shape [n, 2].
+        edge_edge: (edge, edge), the smaller first, edges as in ``mesh.edges``, sorted, int32, shape [m, 2].
+        distance: Least distances of the vertex-face pairs, then of the edge-edge pairs, in the unit of the positions,
+            float64, shape [n + m].
+        position: Points halfway between the closest points, float64, shape [n + m, 3].
+    """
+
+    vertex_face: np.ndarray
+    edge_edge: np.ndarray
+    distance: np.ndarray
+    position: np.ndarray
+
+
+class _NearPairs:
+    """The queue of candidates of one kind, and those of them that are near."""
+
+    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, device: wp.Device):
+        self.kind, self.counts, self._device = kind, counts, device
+        self.queue = wp.empty(capacity, dtype=wp.vec2i, device=device)
+        self._allocate(capacity)
+        self._count = 0
+
+    def _allocate(self, capacity: int) -> None:
+        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self._device)
+        self.distance = wp.empty(capacity, dtype=wp.float64, device=self._device)
+        self.position = wp.empty(capacity, dtype=wp.vec3d, device=self._device)
+
+    def grow(self, queued: int, found: int) -> bool:
+        """Enlarges the buffers that were too small for some counts, and returns whether any was."""
+        self._count = found
+        grown = False
+        if queued > len(self.queue):
+            capacity = capacity_for(queued, f"{self.kind.display_name} candidates")
+            self.queue, grown = wp.empty(capacity, dtype=wp.vec2i, device=self._device), True
+        if found > len(self.pairs):
+            self._allocate(capacity_for(found, f"near {self.kind.display_name} pairs"))
+            grown = True
+        return grown
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns pairs, distances and positions, sorted by pair."""
+        pairs = self.pairs.numpy()[: self._count]
+        order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+        return pairs[order], self.distance.numpy()[: self._count][order], self.position.numpy()[: self._count][order]
+
+
+class ProximityFinder:
+    """Finds the pairs of elements that are near each other in one configuration after another, with the same buffers.
+
+    A pair is a vertex and a face, or two edges. Pairs that share a vertex or that an edge of the mesh joins are
+    excluded: neighbours are always near.
+    """
+
+    def __init__(self, mesh: CollisionMesh, distance: float):
+        """Allocates the buffers on the mesh's device.
+
+        Args:
+            mesh: The mesh.
+            distance: Distance up to which pairs are near, in the unit of the positions, more than 0.
+
+        Raises:
+            ValueError: If the distance is no finite number more than 0.
+        """
+        if not (math.isfinite(distance) and distance > 0.0):
+            raise ValueError(f"a distance must be a finite number more than 0, not {distance!r}")
+        self._mesh = mesh
+        self._distance = float(distance)
+        self._counters = Counters(mesh.device)
+        self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._near = [
+            _NearPairs(kind, counts, 2 * len(mesh.faces), mesh.device)
+            for kind, counts in (
+                (PairKind.VERTEX_FACE, self._counters.vertex_face),
+                (PairKind.EDGE_EDGE, self._counters.edge_edge),
+            )
+        ]
+        both = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
+        both = both[np.argsort(both[:, 0], kind="stable")]
+        starts = np.searchsorted(both[:, 0], np.arange(mesh.vertex_count + 1))
+        self._starts = wp.array(starts, dtype=int, device=mesh.device)
+        self._neighbours = wp.array(both[:, 1], dtype=int, device=mesh.device)
+        self._has_run = False
+
+    def find(self, x: np.ndarray | wp.array) -> Proximities:
+        """Returns the proximities of one configuration.
+
+        Distances are computed in double precision and off by at most 2^-40 of the largest component of the vectors
+        along both edges of the face or along the two edges, and between the first corners. Every pair whose distance
+        is at most the given one is found; pairs that are farther by no more than this error may be found too.
+
+        Args:
+            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array, taken as
+                exact. Those of vertices that no face uses may be anything.
+
+        Raises:
+            ValueError: If the positions have another shape or type, are not finite or more than 2^1000, or if the
+                distance added to them is out of the range of their type.
+        """
+        mesh = self._mesh
+        x = mesh.device_positions(x, "x")
+        positions = x.numpy()
+        check_finite(positions, "x", mesh.vertices)
+        largest = float(np.abs(positions[mesh.vertices]).max(initial=0.0))
+        if largest > _LARGEST:
+            raise ValueError(f"positions must be at most 2^1000 to have distances, not {largest:g}")
+        lower, upper = self._enlarge(positions)
+        retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
+        self._has_run = True
+        (vertex_face, *_), (edge_edge, *_) = found = [near.read() for near in self._near]
+        distance, position = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[1:])
+        return Proximities(vertex_face, edge_edge, distance, position)
+
+    def grow(self) -> bool:
+        """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
+        counts = self._counters.read()
+        grown = counts.face_pairs > self._broad_phase.capacity
+        self._broad_phase.grow(counts.face_pairs)
+        for near, of_kind in zip(self._near, (counts.vertex_face, counts.edge_edge), strict=True):
+            grown |= near.grow(of_kind.queued, of_kind.found)
+        return grown
+
+    def _enlarge(self, positions: np.ndarray) -> tuple[wp.array, wp.array]:
+        """Returns positions moved down and up along all axes, by half of the distance or slightly more.
+
+        The boxes of elements that move from one to the other are the boxes at rest, enlarged by as much on each side.
+        Those of two elements overlap if the elements are at most the distance apart: rounding keeps the order of sums,
+        if half of the distance is rounded up.
+        """
+        kind = positions.dtype.type
+        with np.errstate(over="ignore", invalid="ignore"):
+            pad = np.nextafter(kind(0.5 * self._distance), kind(np.inf))
+            moved = positions - pad, positions + pad
+        if not all(np.isfinite(x[self._mesh.vertices]).all() for x in moved):
+            raise ValueError(f"the distance {self._distance:g} is out of the range of the positions' type")
+        dtype = wp.vec3 if kind is np.float32 else wp.vec3d
+        lower, upper = (wp.array(x, dtype=dtype, device=self._mesh.device) for x in moved)
+        return lower, upper
+
+    def _launch(self, x: wp.array, lower: wp.array, upper: wp.array) -> None:
+        self._counters.array.zero_()
+        queues = [array for near in self._near for array in (near.counts, near.queue)]
+        # these move on the same way: axes that separate them at both ends do not keep enlarged boxes apart
+        self._broad_phase.pair_elements(lower, upper, *queues, refit=self._has_run, keep_separated=True)
+        mesh = self._mesh
+        for near in self._near:
+            launch_over_queue(
+                _keep_near(x.dtype),
+                near.queue,
+                near.counts,
+                Count.QUEUED,
+                inputs=[
+                    x,
+                    int(near.kind),
+                    mesh.device_elements(near.kind),
+                    self._starts,
+                    self._neighbours,
+                    wp.float64(self._distance),
+                    near.queue,
+                ],
+                outputs=[near.counts, near.pairs, near.distance, near.position],
+            )

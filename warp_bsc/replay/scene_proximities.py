@@ -1,0 +1,56 @@
+"""The pairs of elements that are near each other at one time of a scene."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..detection.mesh import CollisionMesh
+from ..detection.proximities import Proximities
+from ..usd.segment import Segment
+from ..usd.selection import Selection
+from .scene_pairs import NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements
+
+__all__ = ["SceneProximities", "name_proximities"]
+
+
+@dataclass(frozen=True)
+class SceneProximities(ScenePairs):
+    """The pairs of elements that are near each other at one time of a scene; positions are halfway between both.
+
+    Attributes:
+        time: Time code.
+        kind: Index in :data:`~warp_bsc.replay.scene_pairs.KINDS`, shape [n].
+        distance: Distances, in the scene's unit of length, shape [n].
+    """
+
+    time: float
+    kind: np.ndarray
+    distance: np.ndarray
+
+
+def name_proximities(
+    segment: Segment, mesh: CollisionMesh, found: Proximities, time: float, selection: Selection
+) -> SceneProximities:
+    """Names the proximities that count.
+
+    Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
+    moves it. Meshes that never move are checked.
+
+    Args:
+        segment: The segment.
+        mesh: The mesh of the segment in which they were found.
+        found: The proximities.
+        time: Time code.
+        selection: Which pairs of meshes count.
+    """
+    if not len(found.distance):
+        none = np.zeros(0, dtype=np.int64)
+        return SceneProximities(segment, **NO_PAIRS, time=time, kind=none, distance=np.zeros(0))
+    vertices, faces = found.vertex_face.T.astype(np.int64)
+    ends = mesh.edges[found.edge_edge].astype(np.int64)
+    named = name_elements(segment, vertices, faces, ends)
+    meshes = named["meshes"]
+    counted = selection.counted_pairs(segment.meshes, meshes) & ~selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~are_stiff_pairs(segment, vertices, meshes[: len(vertices), 1], ends)
+    arrays = named | {"position": found.position, "distance": found.distance}
+    return SceneProximities(segment, **{name: array[counted] for name, array in arrays.items()}, time=time)
