@@ -5,6 +5,10 @@ at all times of a linear motion. After the last projection, each contact that is
 vector between its elements at the start, and every vertex of the two is projected onto its side. Vertices that stand
 still are on their sides, so that there is a solution for the vertices of all contacts at once, each by itself. What
 slides along a plane goes on sliding, unlike what is truncated.
+
+References:
+    D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
+    Mathematical Programming 27, 1983, doi:10.1007/BF02591962.
 """
 
 import warp as wp
