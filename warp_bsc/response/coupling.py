@@ -334,9 +334,9 @@ class Coupling:
         response, mesh = self._response, self._mesh
         response.collect_near_pairs()
         self._is_coupled.zero_()
-        constraints, progress = response.constraints, response._progress
+        constraints, progress = response.constraints, response.progress
         inputs = [self._motion.vertices, constraints, self._is_coupled]
-        response._launch_over_constraints(_find_worlds, inputs)
+        response.launch_over_constraints(_find_worlds, inputs)
         outputs = [progress, self._detected, self._remaining]
         self._launch(_begin_substeps, response.worlds, [constraints, self.substeps, self._is_coupled], outputs)
         attributes = dict(vars(self._solver))
@@ -369,13 +369,13 @@ class Coupling:
         self._step(start, end, control, contacts, substep_dt)
         inputs = [motion.vertices, motion.planes.start, motion.planes.end, self.substeps, dt, self._remaining]
         inputs += [self._detected, end.particle_q, end.particle_qd]
-        outputs = [substep.vertices, response.constraints, response._progress]
+        outputs = [substep.vertices, response.constraints, response.progress]
         outputs += [substep.planes.start, substep.planes.end, response.vertices]
         self._launch(_start_substep, max(mesh.vertex_count, len(motion.planes.start)), inputs, outputs)
         response.collect_penetrations(substep)
-        constraints, progress = response.constraints, response._progress
+        constraints, progress = response.constraints, response.progress
         inputs = [substep.vertices, response.vertices, self._detected, constraints, progress]
-        response._launch_over_constraints(_reset_constraints, inputs)
+        response.launch_over_constraints(_reset_constraints, inputs)
         response.project(substep, substep_dt, 1.0 / self.substeps)  # creep adds up over substeps
         start.assign(self._start)
         outputs = [substep.vertices, particle_q, particle_qd]
@@ -384,7 +384,7 @@ class Coupling:
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""
         self._response.resolve(self._motion, dt)
-        self._launch(_restore_hits, 1, [self._detected], [self._response._progress])
+        self._launch(_restore_hits, 1, [self._detected], [self._response.progress])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._mesh.device)

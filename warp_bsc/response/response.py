@@ -107,6 +107,7 @@ class Response:
         status: What came of the last step, :class:`.buffers.SolveStatus`.
         vertices: The vertices as the last step left them, :class:`.buffers.Vertices`.
         constraints: The constraints of the last step, :class:`.buffers.Constraints`.
+        progress: The state of the iterations, :class:`.buffers.Progress`.
         separation: Distance that projection moves contacts apart [m].
         restitution: Share of the approaching velocity that comes back.
         worlds: Number of worlds.
@@ -140,7 +141,7 @@ class Response:
         self.status = name_elements(SolveStatus, self._status_values)
         sweep_values = wp.zeros(len(SweepStatus.vars), dtype=int, device=device)
         self._sweep = name_elements(SweepStatus, sweep_values)
-        self._progress = progress = Progress()
+        self.progress = progress = Progress()
         progress.status, progress.sweep = self.status, self._sweep
         progress.max_iterations = MAX_ITERATIONS
         for name in ("contact_iteration", "fast"):
@@ -165,11 +166,11 @@ class Response:
     @property
     def max_iterations(self) -> int:
         """Most iterations of detect and project; vertices that still collide are divided."""
-        return self._progress.max_iterations
+        return self.progress.max_iterations
 
     @max_iterations.setter
     def max_iterations(self, value: int) -> None:
-        self._progress.max_iterations = value
+        self.progress.max_iterations = value
 
     def prepare(self, motion: ModelMotion) -> None:
         """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
@@ -264,7 +265,7 @@ class Response:
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             self._record = recorder.begin()
         inputs = [motion.vertices, self.worlds]
-        outputs = [self.vertices, self.constraints, self._dividing_planes, self._progress]
+        outputs = [self.vertices, self.constraints, self._dividing_planes, self.progress]
         size = max(len(self.vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
         wp.capture_if(self.status.recount, self._count_crossings)
@@ -289,11 +290,11 @@ class Response:
         wp.capture_while(self.status.active, self._iterate, dt=dt)
         self._record_offsets(after=1)
         wp.capture_if(self.constraints.count, self._change_velocities, dt=dt)
-        self._launch_over_particles(freeze_undetected, [self._motion.vertices, self.vertices, self._progress])
+        self._launch_over_particles(freeze_undetected, [self._motion.vertices, self.vertices, self.progress])
 
     def _collect_penetrations(self, ahead):
         motion = self._motion
-        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._dividing, self._progress]
+        inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._dividing, self.progress]
         self._launch_over_particles(collect_penetrations, [*inputs, self.separation, ahead])
 
     def _collect_near_pairs(self):
@@ -311,7 +312,7 @@ class Response:
                 near.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
                 near.elements, near.pairs, near.counts = elements, narrow_phase.queue, narrow_phase.counts
             queues = [(near.pairs, near.counts, Count.QUEUED) for near in kinds]
-            inputs = [motion, vertices, *kinds, self.constraints, self._progress, self.separation]
+            inputs = [motion, vertices, *kinds, self.constraints, self.progress, self.separation]
             self._launch_over(collect_proximities, queues, inputs)
 
         retry_until_fits(collect, self, self.device)
@@ -322,16 +323,16 @@ class Response:
         """Records, if the step is recorded, where an iteration begins or where the last ended."""
         if self._recorder is not None:
             wp.launch(
-                record_offsets, 1, inputs=[self.constraints, self._progress, self._record, after], device=self.device
+                record_offsets, 1, inputs=[self.constraints, self.progress, self._record, after], device=self.device
             )
 
     def _sweep_positions(self, first=True, last=True, tolerance=None):
         """Sweeps over the constraints on positions once; the first sweep fills the active set, the last empties it."""
         constraints = self.constraints
-        inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
+        inputs = [self._motion.vertices, self.vertices, constraints, self.progress]
         if first:
             options = [self._tolerance if tolerance is None else tolerance]
-            self._launch_over_constraints(activate_position_constraints, [*inputs, *options])
+            self.launch_over_constraints(activate_position_constraints, [*inputs, *options])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, [*inputs, last])
@@ -339,16 +340,16 @@ class Response:
     def _sweep_velocities(self, dt, first=True, last=True):
         """Sweeps over the constraints on velocities once, like :meth:`_sweep_positions`."""
         constraints = self.constraints
-        inputs = [self._motion.vertices, self.vertices, constraints, self._progress]
+        inputs = [self._motion.vertices, self.vertices, constraints, self.progress]
         if first:
             options = [self.restitution, self._tolerance, dt]
-            self._launch_over_constraints(activate_velocity_constraints, [*inputs, *options])
+            self.launch_over_constraints(activate_velocity_constraints, [*inputs, *options])
         inputs = [*inputs, self._record, self.restitution]
         self._launch_over(project_velocities, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._update_velocities(last)
 
     def _update_velocities(self, last=True):
-        inputs = [self._motion.vertices, self.vertices, self.constraints, self._progress, self._record, last]
+        inputs = [self._motion.vertices, self.vertices, self.constraints, self.progress, self._record, last]
         self._launch_over_particles(update_velocities, inputs)
 
     def _project(self, sweep, **options):
@@ -369,12 +370,12 @@ class Response:
             self._record = self._recorder.reserve_entries(entries)
 
     def _start_sweeps(self):
-        wp.launch(start_sweeps, 1, inputs=[self._progress], device=self.device)
+        wp.launch(start_sweeps, 1, inputs=[self.progress], device=self.device)
 
     def _change_velocities(self, dt):
         """Solves the velocity constraints of all contacts that moved a vertex."""
         inputs = [self._motion.vertices, self.vertices]
-        self._launch_over_constraints(initialize_velocity_multipliers, [*inputs, self.constraints, dt])
+        self.launch_over_constraints(initialize_velocity_multipliers, [*inputs, self.constraints, dt])
         self._update_velocities()
         self._project(self._sweep_velocities, dt=dt)
         self._turn.zero_()
@@ -389,7 +390,7 @@ class Response:
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
             self._record = self._recorder.reserve_truncations(self._movable)
-        inputs = [self._motion.vertices, self.vertices, self._progress, self._record, self._dividing]
+        inputs = [self._motion.vertices, self.vertices, self.progress, self._record, self._dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._detect(refit=True)
@@ -397,7 +398,7 @@ class Response:
     def _detect(self, refit):
         """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again."""
         detector, motion, vertices = self.detector, self._motion.vertices, self.vertices
-        progress = self._progress
+        progress = self.progress
         changed = vertices.changed if refit else None
         retry_until_fits(
             lambda: detector.find_contacts(motion.x0, vertices.x1, refit=refit, changed=changed),
@@ -427,7 +428,7 @@ class Response:
         return not self._differentiable and isinstance(self.detector.broad_phase, BroadPhaseHierarchy)
 
     def _decide(self):
-        inputs = [self.constraints, self._progress, *self._fill_of_queues()]
+        inputs = [self.constraints, self.progress, *self._fill_of_queues()]
         wp.launch(decide, 1, inputs=inputs, device=self.device)
 
     def _fill_of_queues(self):
@@ -440,7 +441,7 @@ class Response:
         assert isinstance(broad_phase, BroadPhaseHierarchy)
         broad_phase.fit(motion.x0, self.vertices.x1)
         find_contacts_without_queues(
-            broad_phase, self._connectivity, motion, self.vertices, self._dividing, self._progress, self.separation
+            broad_phase, self._connectivity, motion, self.vertices, self._dividing, self.progress, self.separation
         )
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
@@ -511,7 +512,8 @@ class Response:
             entries = max(len(queue) for queue, _counts, _count in queues)
             wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._most_blocks)
 
-    def _launch_over_constraints(self, kernel, inputs):
+    def launch_over_constraints(self, kernel: wp.Kernel, inputs: list) -> None:
+        """Launches a kernel over the constraints, see :meth:`_launch_over`."""
         self._launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
 
     def _launch_over_particles(self, kernel, inputs):
