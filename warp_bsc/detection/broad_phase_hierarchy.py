@@ -376,7 +376,7 @@ def _pair_elements(
 ):
     """First finds all pairs, then takes slots for them: one atomic of a warp for 128 pairs of faces.
 
-    Atomics on one address take turns, and one for each 32 pairs of faces took most of the time.
+    Atomics on one address take turns, so that few of them are better.
     """
     i = wp.tid()
     first = (i / _WIDTH) * _PAIRS_OF_THREAD * _WIDTH + i % _WIDTH

@@ -68,7 +68,7 @@ _TOLERANCE = 0.1
 _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
 _DIVIDING_PLANES = 32
-"""Capacity for dividing planes, for each particle: piles of cloth take up to 9."""
+"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
 _ITERATIONS_RESERVED = 2
 """Iterations for whose contacts constraints are reserved."""
 
