@@ -45,7 +45,9 @@ _QUEUED = wp.constant(int(Count.QUEUED))
 _WIDTH = wp.constant(WIDTH)
 
 _PAIRS_OF_THREAD = wp.constant(4)
-"""Pairs of faces whose elements a thread pairs."""
+"""Most pairs of faces whose elements a thread pairs."""
+_PAIRS_AT_ONCE = wp.constant(wp.int64(1 << 17))
+"""Pairs of faces that a GPU works on at once, each by a thread of its own."""
 _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
 
@@ -368,22 +370,25 @@ def _pair_elements(
     mesh: FaceHierarchy,
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
+    threads: int,
     keep_separated: bool,
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """First finds all pairs, then takes slots for them: one atomic of a warp for 128 pairs of faces.
+    """First finds all pairs, then takes slots for them: where pairs of faces are many, one atomic of a warp for 128.
 
     Atomics on one address take turns, so that few of them are better.
     """
     i = wp.tid()
-    first = (i / _WIDTH) * _PAIRS_OF_THREAD * _WIDTH + i % _WIDTH
+    count = face_pair_count[0]
+    turns = int(wp.max((count - wp.int64(1)) / wp.int64(threads) + wp.int64(1), count / _PAIRS_AT_ONCE))
+    turns = wp.min(turns, _PAIRS_OF_THREAD)
+    first = (i / _WIDTH) * turns * _WIDTH + i % _WIDTH
     found = wp.uint64(0)
     candidates = wp.vec2i()  # vertex-face, edge-edge
     queued = wp.vec2i()
-    turns = int(_PAIRS_OF_THREAD)  # not a constant, as the body would be repeated
     for turn in range(turns):
         at = first + turn * _WIDTH
         if is_filled(at, face_pairs, face_pair_count, 0):
@@ -639,7 +644,7 @@ class BroadPhaseHierarchy:
     def _pair_elements(self, keep_separated, *queues):
         """Enqueues the pairs of elements of all pairs of faces."""
         threads = -(-self.capacity // (int(_PAIRS_OF_THREAD) * WIDTH)) * WIDTH
-        self._launch_over_pairs(_pair_elements, threads, keep_separated, *queues)
+        self._launch_over_pairs(_pair_elements, threads, threads, keep_separated, *queues)
 
     def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]

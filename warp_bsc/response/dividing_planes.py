@@ -13,6 +13,7 @@ References:
 
 import warp as wp
 
+from ..kernels.pipeline.queues import take_place
 from .buffers import Motion, Vertices
 from .constraints import LEAST_DISTANCE, to_double, to_single
 from .proximities import closest_direction
@@ -95,7 +96,7 @@ def add_plane(
         offset: Its coordinate along the normal [m].
         margin: Least distance from it after projection [m].
     """
-    plane = wp.atomic_add(planes.count, 0, 1)
+    plane = take_place(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal
@@ -163,7 +164,7 @@ def add_dividing_plane(
     edges: int,
     separation: wp.float64,
     planes: DividingPlanes,
-):
+) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
@@ -182,7 +183,7 @@ def add_dividing_plane(
         for j in range(4):
             if movable[j] >= 0:
                 _add_node(planes, movable[j], _INCOMPLETE)
-        return
+        return False
     margin = wp.where(distance < LEAST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
     least = margin + _ROOM * distance
     share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
@@ -191,6 +192,7 @@ def add_dividing_plane(
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin)
+    return above.end + below.end < margin
 
 
 @wp.func

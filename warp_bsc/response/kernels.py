@@ -8,13 +8,16 @@ from ..kernels.signs import FREE
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
+    EDGE_EDGE_PROXIMITY,
     NO_CONSTRAINT,
     PLANE_CONTACT,
     TIME_UNITS,
     TOUCH,
     VERTEX_FACE_CONTACT,
+    VERTEX_FACE_PROXIMITY,
     Contacts,
     add_constraint,
+    begins_dividing,
     contact_vertices,
     contact_weights,
     count_contact,
@@ -30,12 +33,14 @@ from .constraints import (
 )
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
 from .exclusion import crossed_at_start, is_movable
+from .projection import has_pushed
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = [
     "begin_step",
     "collect_contacts",
     "decide",
+    "divide_near_pairs",
     "drop_if_full",
     "freeze_undetected",
     "record_offsets",
@@ -190,6 +195,34 @@ def collect_contacts(
 
 
 @wp.kernel(**_KERNEL)
+def divide_near_pairs(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Adds dividing planes for all proximities of worlds in which division begins.
+
+    Vertices that are divided from one element then do not come into the next one, which would need another iteration.
+    """
+    i = wp.tid()
+    if i >= constraints.count[0]:
+        return
+    kind = constraints.kind[i]
+    if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
+        return
+    corners = constraints.vertices[i]
+    if not begins_dividing(progress, motion.world[corners[0]]):
+        return
+    edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing)
+    if meets and not has_pushed(constraints, i):
+        constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
+
+
+@wp.kernel(**_KERNEL)
 def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
     if constraints.count[0] > constraints.vertices.shape[0] - needed:
@@ -289,6 +322,14 @@ def truncate_vertices(
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
     if key == NEVER:
+        if dividing.first and motion.inverse_mass[vertex] > 0.0:
+            if dividing.first[vertex] >= 0:
+                x1 = vertices.x1[vertex]
+                moved, was_cut = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
+                if moved[0] != x1[0] or moved[1] != x1[1] or moved[2] != x1[2]:
+                    vertices.x1[vertex] = moved
+                    vertices.changed[vertex] = 1
+                    vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(was_cut, DIVIDED | TRUNCATED, DIVIDED)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:

@@ -28,6 +28,7 @@ from .kernels import (
     begin_step,
     collect_contacts,
     decide,
+    divide_near_pairs,
     drop_if_full,
     freeze_undetected,
     record_offsets,
@@ -131,7 +132,7 @@ class Response:
         self._differentiable = differentiable
         self.worlds = max(1, mesh.model.world_count)
         self._most_blocks = _BLOCKS * device.sm_count
-        self._summing_threads = 1 if device.is_cpu else 64 * device.sm_count
+        self._summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
         self._connectivity = connectivity = Connectivity()
@@ -390,6 +391,9 @@ class Response:
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
             self._record = self._recorder.reserve_truncations(self._movable)
+        if not self._differentiable:
+            inputs = [self._motion.vertices, self.vertices, self.constraints, self._dividing, self.progress]
+            self.launch_over_constraints(divide_near_pairs, [*inputs, self.separation])
         inputs = [self._motion.vertices, self.vertices, self.progress, self._record, self._dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
