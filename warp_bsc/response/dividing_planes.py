@@ -41,6 +41,7 @@ _NEAR_MARGIN = wp.constant(wp.float64(0.45))
 _ROOM = wp.constant(wp.float64(0.05))
 """How much farther than that both are from the plane at the start at least, as a share of their distance."""
 _ZERO = wp.constant(wp.float64(0.0))
+_HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _FAR = wp.constant(wp.float64(1.0e300))
 
@@ -132,6 +133,7 @@ class _Side:
     start: wp.float64  # at the start
     end: wp.float64  # at the end
     fixed: wp.float64  # those of its vertices that cannot be moved, at the end
+    reach: wp.float64  # wherever planes may take it
     inverse_mass: wp.float64  # sum over its vertices
 
 
@@ -139,15 +141,24 @@ class _Side:
 def _side(
     motion: Motion, vertices: Vertices, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d, normal: wp.vec3d
 ) -> _Side:
-    """Returns how far the vertices from ``begin`` to ``end`` reach against a normal."""
+    """Returns how far the vertices from ``begin`` to ``end`` reach against a normal.
+
+    Planes take a vertex no farther than the ball around its path: this is what projection onto a convex set does to the
+    end of a path that starts in it.
+    """
     side = _Side()
+    side.reach = _FAR
     side.start = _FAR
     side.end = _FAR
     side.fixed = _FAR
     for j in range(begin, end):
         vertex = corners[j]
-        x1 = wp.dot(normal, to_double(vertices.x1[vertex]) - origin)
-        side.start = wp.min(side.start, wp.dot(normal, to_double(motion.x0[vertex]) - origin))
+        start = to_double(motion.x0[vertex])
+        path = to_double(vertices.x1[vertex]) - start
+        x0 = wp.dot(normal, start - origin)
+        x1 = x0 + wp.dot(normal, path)
+        side.start = wp.min(side.start, x0)
+        side.reach = wp.min(side.reach, _HALF * (x0 + x1 - wp.length(path)))
         side.end = wp.min(side.end, x1)
         inverse_mass = wp.float64(motion.inverse_mass[vertex])
         side.inverse_mass += inverse_mass
@@ -164,11 +175,16 @@ def add_dividing_plane(
     edges: int,
     separation: wp.float64,
     planes: DividingPlanes,
+    is_contact: bool,
 ) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
-    vertex that cannot be moved. Elements that touch at the start have none.
+    vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
+    cannot bring together.
+
+    Returns:
+        Whether the elements meet at the end, or nearly, without planes.
     """
     normal = closest_direction(motion, corners, edges)
     origin = to_double(motion.x0[corners[3]])
@@ -176,6 +192,8 @@ def add_dividing_plane(
     above = _side(motion, vertices, corners, 0, split, origin, normal)
     below = _side(motion, vertices, corners, split, 4, origin, -normal)
     distance = above.start + below.start
+    if not is_contact and (distance <= _ZERO or above.reach + below.reach > _ZERO):
+        return False
     movable = wp.vec4i()
     for j in range(4):
         movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)

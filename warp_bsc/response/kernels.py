@@ -141,7 +141,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing, True)
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
@@ -217,7 +217,7 @@ def divide_near_pairs(
     if not begins_dividing(progress, motion.world[corners[0]]):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
 

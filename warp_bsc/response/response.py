@@ -70,7 +70,7 @@ _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
 _DIVIDING_PLANES = 32
 """Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
-_ITERATIONS_RESERVED = 2
+_ITERATIONS_RESERVED = 3
 """Iterations for whose contacts constraints are reserved."""
 
 
