@@ -203,9 +203,10 @@ def divide_near_pairs(
     progress: Progress,
     separation: wp.float64,
 ):
-    """Adds dividing planes for all proximities of worlds in which division begins.
+    """Adds dividing planes for the proximities of worlds in which division begins.
 
-    Vertices that are divided from one element then do not come into the next one, which would need another iteration.
+    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    A constraint whose elements would meet changes velocities too.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
@@ -303,6 +304,19 @@ def _record_truncation(
         record.normal[entry] = contacts.normal[i]
 
 
+@wp.func
+def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes, vertex: int):
+    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided."""
+    if motion.inverse_mass[vertex] == 0.0 or dividing.first[vertex] < 0:
+        return
+    x1 = vertices.x1[vertex]
+    end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
+    if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+
+
 @wp.kernel(**_KERNEL)
 def truncate_vertices(
     motion: Motion,
@@ -314,7 +328,7 @@ def truncate_vertices(
     edge_edge: Contacts,
     dt: wp.float64,
 ):
-    """Moves each vertex of a contact that is left onto its side, or truncates its path before its first contact.
+    """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
     Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
     ``max_truncations`` iterations vertices that still collide are frozen.
@@ -322,14 +336,8 @@ def truncate_vertices(
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
     if key == NEVER:
-        if dividing.first and motion.inverse_mass[vertex] > 0.0:
-            if dividing.first[vertex] >= 0:
-                x1 = vertices.x1[vertex]
-                moved, was_cut = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
-                if moved[0] != x1[0] or moved[1] != x1[1] or moved[2] != x1[2]:
-                    vertices.x1[vertex] = moved
-                    vertices.changed[vertex] = 1
-                    vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(was_cut, DIVIDED | TRUNCATED, DIVIDED)
+        if dividing.first:
+            _keep_on_sides(motion, vertices, dividing, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
