@@ -517,17 +517,8 @@ def _track(
     scene: Scene, arguments: argparse.Namespace, earlier: EarlierReplay | None
 ) -> Generator[IntervalResult, None, None]:
     """Yields the intervals of an earlier replay, then the others as they are found; shows progress and time left."""
-    first = 0
-    if earlier:
-        with _Progress("Reading earlier results") as progress:
-            for result in earlier.results(scene):
-                yield result
-                first = result.summary.index + 1
-                progress.show(first, len(scene))
-        if first == len(scene):
-            return
     with _Progress("Replaying") as progress:
-        progress.show(0, len(scene) - first)
+        progress.show(0, len(scene))
         for result in replay(
             scene,
             method=arguments.method,
@@ -536,12 +527,12 @@ def _track(
             ignore_initial=arguments.ignore_initial,
             min_distance=arguments.min_distance,
             validate_most=arguments.validate,
-            first=first,
+            earlier=earlier.results(scene) if earlier else (),
             workers=arguments.workers,
             scheduler=arguments.scheduler,
         ):
             yield result
-            progress.show(result.summary.index + 1 - first, len(scene) - first, f"time {result.summary.end:g}")
+            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:

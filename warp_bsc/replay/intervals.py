@@ -1,14 +1,14 @@
 """Replays a USD scene: finds the collisions between each two consecutive times, in one process or in several."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
-from .workers import Cluster, LocalWorkers, check_in_workers
+from .workers import Cluster, LocalWorkers, check_in_workers, initial_crossings_in_workers
 
 __all__ = ["replay"]
 
@@ -22,7 +22,7 @@ def replay(
     ignore_initial: bool = False,
     min_distance: float | None = None,
     validate_most: int | None = 0,
-    first: int = 0,
+    earlier: Iterable[IntervalResult] = (),
     workers: int = 1,
     scheduler: str | None = None,
 ) -> Iterator[IntervalResult]:
@@ -59,7 +59,8 @@ def replay(
             intersections. None to look for none.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
-        first: Number of the first interval.
+        earlier: Results of the first intervals, in order, that an earlier replay has found: they are yielded, and the
+            replay goes on after them. They are taken after what crosses at first has been found.
         workers: Number of processes on this machine that check intervals; 1 for this process alone. Each uses its share
             of the cores, or where ``device`` is ``"cuda"`` or None, one GPU. A program that uses more than one must
             have ``if __name__ == "__main__":`` around its statements, as all with :mod:`multiprocessing`.
@@ -87,13 +88,23 @@ def replay(
         min_distance=min_distance,
         validate_most=validate_most,
     )
-    if scheduler is None and workers == 1:
+    with contextlib.ExitStack() as stack:
+        processes = None
+        if scheduler is not None or workers > 1:
+            processes = LocalWorkers(workers) if scheduler is None else Cluster(scheduler)
+            stack.enter_context(contextlib.closing(processes))
         if ignore_initial:
-            crossing = IntervalChecker(scene, checks).initial_crossings()
+            if processes:
+                crossing = initial_crossings_in_workers(scene, checks, processes)
+            else:
+                crossing = IntervalChecker(scene, checks).initial_crossings()
             selection = replace(scene.selection, ignored_names=scene.selection.ignored_names | crossing)
             checks = replace(checks, selection=selection)
-        yield from IntervalChecker(scene, checks).check(first, len(scene))
-        return
-    processes = LocalWorkers(workers) if scheduler is None else Cluster(scheduler)
-    with contextlib.closing(processes):
-        yield from check_in_workers(scene, checks, processes, first=first, ignore_initial=ignore_initial)
+        first = 0
+        for result in earlier:
+            yield result
+            first = result.summary.index + 1
+        if processes:
+            yield from check_in_workers(scene, checks, processes, first)
+        else:
+            yield from IntervalChecker(scene, checks).check(first, len(scene))

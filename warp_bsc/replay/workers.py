@@ -30,12 +30,21 @@ from typing import Any, Protocol
 from .. import __version__
 from ..detection.launch import cores
 from ..detection.start import find_device, gpu_count
+from ..usd.interval import ReadingNotes
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
 
-__all__ = ["Cluster", "LocalWorkers", "Workers", "check_in_workers", "device_of_cluster", "device_of_worker"]
+__all__ = [
+    "Cluster",
+    "LocalWorkers",
+    "Workers",
+    "check_in_workers",
+    "device_of_cluster",
+    "device_of_worker",
+    "initial_crossings_in_workers",
+]
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
 _MOST_INTERVALS = 16  # in a chunk; the first of a chunk costs reading and checking a time more
@@ -151,30 +160,32 @@ class Cluster:
         self._client.close()
 
 
-def check_in_workers(
-    scene: Scene, checks: Checks, workers: Workers, *, first: int = 0, ignore_initial: bool = False
-) -> Iterator[IntervalResult]:
+def initial_crossings_in_workers(scene: Scene, checks: Checks, workers: Workers) -> frozenset[tuple[str, str]]:
+    """Returns the names of the meshes that cross at the first time, each pair sorted.
+
+    Arguments and errors are those of :func:`check_in_workers`.
+    """
+    call = _Call("they checked the first time", _find_initial_crossings, (_pack(scene, checks),))
+    (crossing,) = _in_order(workers, deque([call]))
+    return crossing
+
+
+def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int = 0) -> Iterator[IntervalResult]:
     """Checks intervals in other processes and yields the results in order.
 
     Args:
-        scene: The scene. All intervals before ``first`` have been read.
+        scene: The scene. All intervals before the first have been read.
         checks: What to look for.
         workers: The processes.
         first: Number of the first interval.
-        ignore_initial: As of :func:`~warp_bsc.replay.intervals.replay`.
 
     Raises:
         ChildProcessError: If worker after worker dies while it checks the same intervals.
         Exception: What checking raises, after all results before.
     """
-    if ignore_initial:
-        call = _Call("the first time was checked", _find_initial_crossings, (_pack(scene, checks),))
-        (crossing,) = _in_order(workers, deque([call]))
-        selection = checks.selection
-        checks = replace(checks, selection=replace(selection, ignored_names=selection.ignored_names | crossing))
     job = _pack(scene, checks)
     calls = deque(
-        _Call(f"time {scene.times[start]:g} to {scene.times[stop]:g} was checked", _check_chunk, (job, start, stop))
+        _Call(f"they checked time {scene.times[start]:g} to {scene.times[stop]:g}", _check_chunk, (job, start, stop))
         for start, stop in _cut(scene, first, workers.count)
     )
     for found in _in_order(workers, calls):
@@ -322,11 +333,11 @@ def _begin_local_worker(lifeline: multiprocessing.connection.Connection, counter
 
 def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
     """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them."""
-    global _opened
+    global _opened  # noqa: PLW0603
     stream = io.BytesIO()
     pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
     with _ONE_CHUNK:
-        error = None
+        checker = None
         try:
             checker = _open(job)
             with cores(_core_count()):
@@ -336,8 +347,10 @@ def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
                     pickler.dump((pickler.index, result.contacts.interval.notes))
                     pickler.dump(result)
         except Exception as raised:
-            _opened, error = None, _portable(raised)
-        pickler.dump(error)
+            _opened = None
+            pickler.dump((first, checker.scene.take_notes() if checker else ReadingNotes()))
+            pickler.dump(_portable(raised))
+        pickler.dump(None)
     return stream.getvalue()
 
 
@@ -425,8 +438,9 @@ class _Unpickler(pickle.Unpickler):
 def _unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
     """Yields the results of a chunk, raises what stopped it, and notes in the scene what reading it has revealed."""
     unpickler = _Unpickler(io.BytesIO(found), scene)  # it remembers what consecutive intervals share
-    while (head := unpickler.load()) is not None:
-        if isinstance(head, Exception):
-            raise head
-        scene.note(*head)
-        yield unpickler.load()
+    while notes := unpickler.load():
+        scene.note(*notes)
+        result = unpickler.load()
+        if isinstance(result, Exception):
+            raise result
+        yield result

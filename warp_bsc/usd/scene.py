@@ -232,6 +232,7 @@ class Scene:
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
             self._parts: list[LeftOutMesh] = []  # left out after the file was opened
+            self._noted = 0, 0  # numbers of these and of messages that notes contain
             self._welds = {}  # by span
             for part in revealed.left_out:
                 self._left_out.reasons.append(part.reason)
@@ -292,12 +293,12 @@ class Scene:
             IndexError: If there is no such interval.
             ValueError: As of :meth:`interval`.
         """
-        parts, messages = len(self._parts), len(self._messages)
-        if first and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
-            self.interval(first - 1)
-        for index in range(first, len(self) if stop is None else stop):
-            yield self._read(index, parts, messages)
-            parts, messages = len(self._parts), len(self._messages)
+        self.take_notes()
+        stop = len(self) if stop is None else stop
+        if 0 < first < stop and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
+            self._read_positions(first - 1)
+        for index in range(first, stop):
+            yield self._read(index)
 
     def interval(self, index: int) -> Interval:
         """Reads the motion from one time to the next.
@@ -309,7 +310,8 @@ class Scene:
             IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
-        return self._read(index, len(self._parts), len(self._messages))
+        self.take_notes()
+        return self._read(index)
 
     def segment(self, index: int, progress: Callable[[int, int], None] | None = None) -> Segment:
         """Returns the segment that an interval is in: the one in memory if possible.
@@ -337,6 +339,12 @@ class Scene:
                 self._welded = max(self._welded, self._segment.welded)
         return self._segment
 
+    def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
+        """Returns what reading has revealed since this was called last, or since the scene was opened; and jumps."""
+        parts, messages = self._noted
+        self._noted = len(self._parts), len(self._messages)
+        return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
+
     def note(self, index: int, notes: ReadingNotes) -> None:
         """Records what reading an interval has revealed in another process, as if this scene had read it.
 
@@ -351,8 +359,15 @@ class Scene:
         for name in notes.jumps:
             self._jump_times.setdefault(name, set()).add(self.times[index])
 
-    def _read(self, index, parts, messages) -> Interval:
-        """Reads an interval, which notes the parts left out and the messages from these numbers on."""
+    def _read(self, index) -> Interval:
+        """Reads an interval, with all that reading has revealed since notes were taken last."""
+        segment, x0, x1, jumps = self._read_positions(index)
+        start, end = self.times[index : index + 2]
+        is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
+
+    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
+        """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
@@ -370,9 +385,7 @@ class Scene:
         jumps = self._find_jumps(index, segment, x0, x1)
         for name in jumps:
             self._jump_times.setdefault(name, set()).add(start)
-        notes = ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
-        is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
-        return Interval(index, start, end, segment, x0, x1, is_joined, notes)
+        return segment, x0, x1, jumps
 
     def _contents(self) -> tuple:
         """Returns facts of the scene that another process must find, too."""
