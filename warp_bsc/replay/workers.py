@@ -10,8 +10,8 @@ that yet: their results are dropped, and the chunks are checked again.
 
 import contextlib
 import io
+import itertools
 import multiprocessing
-import multiprocessing.connection
 import os
 import pickle
 import signal
@@ -20,10 +20,11 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -56,8 +57,8 @@ class Workers(Protocol):
     """Processes to which functions can be submitted.
 
     Attributes:
-        died: The errors that a future of :meth:`submit` has, and submitting raises, if a process has died.
-        attempts: How often a chunk is submitted whose worker dies.
+        died: The error that a future of :meth:`submit` has if the process that called the function has died.
+        attempts: How often a function is to be submitted if its process dies.
     """
 
     died: type[Exception]
@@ -72,19 +73,19 @@ class Workers(Protocol):
         """Returns a future of the function's result in one of the processes."""
         ...
 
-    def restart(self) -> None:
-        """Replaces processes that have died."""
-        ...
-
     def close(self) -> None:
         """Ends the work at once, finished or not."""
         ...
 
 
 class LocalWorkers:
-    """Processes on this machine, which end when this one ends, however it does."""
+    """Processes on this machine, which end when this one ends, however it does.
 
-    died: type[Exception] = BrokenProcessPool
+    Each has a pipe of its own and a thread here that waits for it. (The pool of Python's ``concurrent.futures`` has one
+    pipe for all results: it waits for ever if a process is killed while it writes there.)
+    """
+
+    died: type[Exception] = ChildProcessError
     attempts = 3
 
     def __init__(self, count: int):
@@ -94,28 +95,60 @@ class LocalWorkers:
             count: Number of processes, at least 1.
         """
         self.count = count
-        self._start()
+        self._numbers = itertools.count()
+        self._of_thread = threading.local()
+        self._processes: dict[int, SpawnProcess] = {}  # by number
+        self._is_closed = False
+        self._threads = ThreadPoolExecutor(count, "worker", self._begin_thread)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Returns a future of the function's result in one of the processes."""
-        with _interrupt_blocked():  # which a process that starts now inherits
-            return self._pool.submit(function, *arguments)
-
-    def restart(self) -> None:
-        """Ends all processes and starts others."""
-        self.close()
-        self._start()
+        return self._threads.submit(self._call, function, arguments)
 
     def close(self) -> None:
         """Ends all processes at once."""
-        self._lifeline.close()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._is_closed = True
+        for process in list(self._processes.values()):
+            process.kill()
+        self._threads.shutdown(cancel_futures=True)
 
-    def _start(self) -> None:
+    def _begin_thread(self) -> None:
+        self._of_thread.number, self._of_thread.connection = next(self._numbers), None
+        if hasattr(
+            signal, "pthread_sigmask"
+        ):  # a process that this thread starts inherits it, and is never interrupted
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+    def _call(self, function: Callable[..., Any], arguments: tuple) -> Any:
+        """Returns the function's result in the process of this thread.
+
+        Raises:
+            ChildProcessError: If the process dies. The next call starts another one.
+        """
+        own = self._of_thread
+        own.connection = own.connection or self._start(own.number)
+        try:
+            own.connection.send((function, arguments))
+            result, error = own.connection.recv()
+        except (EOFError, OSError) as error:
+            own.connection.close()
+            own.connection = None
+            raise ChildProcessError("a worker died") from error
+        if error:
+            raise error
+        return result
+
+    def _start(self, number: int) -> Connection:
+        """Starts a process and returns the connection to it."""
         context = multiprocessing.get_context("spawn")  # Warp's threads do not survive a fork
-        end, self._lifeline = context.Pipe(duplex=False)
-        arguments = end, context.Value("i", 0), self.count
-        self._pool = ProcessPoolExecutor(self.count, context, _begin_local_worker, arguments)
+        connection, other = context.Pipe()
+        process = context.Process(target=_serve, args=(other, number, self.count), daemon=True)
+        process.start()
+        other.close()  # so that the connection ends when the process does
+        self._processes[number] = process
+        if self._is_closed:
+            process.kill()
+        return connection
 
 
 class Cluster:
@@ -152,9 +185,6 @@ class Cluster:
         """Returns a future of the function's result in one of the workers."""
         return self._client.submit(function, *arguments, pure=False)
 
-    def restart(self) -> None:
-        """Does nothing: a cluster replaces its workers itself."""
-
     def close(self) -> None:
         """Disconnects from the cluster, which drops the work that is waiting."""
         self._client.close()
@@ -165,7 +195,7 @@ def initial_crossings_in_workers(scene: Scene, checks: Checks, workers: Workers)
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
-    call = _Call("they checked the first time", _find_initial_crossings, (_pack(scene, checks),))
+    call = _Call("checked the first time", _find_initial_crossings, (_pack(scene, checks),))
     (crossing,) = _in_order(workers, deque([call]))
     return crossing
 
@@ -185,7 +215,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
     """
     job = _pack(scene, checks)
     calls = deque(
-        _Call(f"they checked time {scene.times[start]:g} to {scene.times[stop]:g}", _check_chunk, (job, start, stop))
+        _Call(f"checked time {scene.times[start]:g} to {scene.times[stop]:g}", _check_chunk, (job, start, stop))
         for start, stop in _cut(scene, first, workers.count)
     )
     for found in _in_order(workers, calls):
@@ -237,12 +267,14 @@ class _Call:
         function: The function.
         arguments: Its arguments.
         future: Future of its result.
+        deaths: How many workers have died that made it.
     """
 
     what: str
     function: Callable[..., Any]
     arguments: tuple
     future: Any = None
+    deaths: int = 0
 
     def withdraw(self) -> None:
         """Forgets the future."""
@@ -259,25 +291,18 @@ def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
         calls: The calls, which are removed when their result is there. Between two results, those that remain may be
             withdrawn and changed.
     """
-    deaths = 0
     while calls:
-        # After a death the next call is made alone: if its worker dies again, it is the one that kills workers.
-        at_once = 1 if deaths else 2 * workers.count
+        for call in islice(calls, 2 * workers.count):
+            call.future = call.future or workers.submit(call.function, *call.arguments)
+        call = calls[0]
         try:
-            for call in islice(calls, at_once):
-                call.future = call.future or workers.submit(call.function, *call.arguments)
-            result = calls[0].future.result()
+            result = call.future.result()
         except workers.died as error:
-            deaths += 1
-            if deaths == workers.attempts:
-                tries = f"{deaths} workers, one after the other," if deaths > 1 else "too many workers"
-                raise ChildProcessError(f"{tries} died while {calls[0].what}: out of memory?") from error
-            for call in calls:
-                if call.future and not (call.future.done() and not call.future.exception()):
-                    call.future = None
-            workers.restart()
+            call.future = None
+            call.deaths += 1
+            if call.deaths == workers.attempts:
+                raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
             continue
-        deaths = 0
         calls.popleft()
         yield result
 
@@ -289,19 +314,6 @@ def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int
     size = max(1, min(for_all, _MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
     for start in range(first, len(scene), size):
         yield start, min(start + size, len(scene))
-
-
-@contextlib.contextmanager
-def _interrupt_blocked() -> Iterator[None]:
-    """Blocks SIGINT in this thread. A process that is started within never gets it; this one does at the end."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # In the worker ---------------------------------------------------------------------------------------------------
@@ -316,19 +328,27 @@ _opened: tuple[bytes, IntervalChecker] | None = None
 """What this worker has checked last, and the checker."""
 
 
-def _begin_local_worker(lifeline: multiprocessing.connection.Connection, counter: Any, count: int) -> None:
-    """Prepares a process on this machine, which ends as soon as the other end of its lifeline is closed."""
+def _serve(connection: Connection, number: int, count: int) -> None:
+    """Calls the functions that come through a connection until it is closed: all that a process on this machine does."""
     global _local  # noqa: PLW0603 (one for the process)
+    _local = number, count
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the first one ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            function, arguments = connection.recv()
+            try:
+                answer = function(*arguments), None
+            except Exception as error:
+                answer = None, _portable(error)
+            connection.send(answer)
 
-    def follow() -> None:
-        lifeline.poll(None)
-        os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
-    with counter.get_lock():
-        _local = counter.value, count
-        counter.value += 1
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent
+    parent.join()
+    os._exit(1)
 
 
 def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
