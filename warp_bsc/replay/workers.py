@@ -114,9 +114,7 @@ class LocalWorkers:
 
     def _begin_thread(self) -> None:
         self._of_thread.number, self._of_thread.connection = next(self._numbers), None
-        if hasattr(
-            signal, "pthread_sigmask"
-        ):  # a process that this thread starts inherits it, and is never interrupted
+        if hasattr(signal, "pthread_sigmask"):  # inherited by the processes that it starts
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
     def _call(self, function: Callable[..., Any], arguments: tuple) -> Any:
@@ -329,7 +327,7 @@ _opened: tuple[bytes, IntervalChecker] | None = None
 
 
 def _serve(connection: Connection, number: int, count: int) -> None:
-    """Calls the functions that come through a connection until it is closed: all that a process on this machine does."""
+    """Calls the functions that come through a connection until it is closed: the program of a local worker."""
     global _local  # noqa: PLW0603 (one for the process)
     _local = number, count
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the first one ends the others
@@ -376,8 +374,11 @@ def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
 
 def _find_initial_crossings(job: bytes) -> frozenset[tuple[str, str]]:
     """Returns the names of the meshes that cross at the first time."""
-    with _ONE_CHUNK, cores(_core_count()):
-        return _open(job).initial_crossings()
+    try:
+        with _ONE_CHUNK, cores(_core_count()):
+            return _open(job).initial_crossings()
+    except Exception as error:
+        raise _portable(error) from None
 
 
 def _name_device(name: str | None) -> str:
