@@ -26,7 +26,7 @@ from .summary import Summary
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
 NAME = f"{__name__}:Collisions"
-"""Name of the rule. Its errors are ``Collision`` and ``Intersection``; ``Unreadable`` is a stage that is not checked."""
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
@@ -35,8 +35,8 @@ PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
     """Returns an error for each time in which two meshes collide or cross, or a mesh collides with or crosses itself.
 
-    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device; what the session layer
-    changes is not seen.
+    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the session
+    layer are not seen.
 
     Args:
         stage: The stage.
