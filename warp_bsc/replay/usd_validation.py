@@ -35,8 +35,8 @@ PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
     """Returns an error for each time in which two meshes collide or cross, or a mesh collides with or crosses itself.
 
-    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the session
-    layer are not seen.
+    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the
+    session layer are not seen.
 
     Args:
         stage: The stage.
