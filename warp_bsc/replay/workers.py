@@ -20,7 +20,7 @@ import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -301,6 +301,8 @@ def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
             if call.deaths == workers.attempts:
                 raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
             continue
+        except CancelledError as error:  # not by this module, which forgets the futures that it cancels
+            raise ConnectionError("the connection to the scheduler of the cluster was lost") from error
         calls.popleft()
         yield result
 
