@@ -33,7 +33,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.mesh import CollisionMesh
     from .detection.query import QueryResult, query_edge_edge, query_vertex_face
     from .detection.query_points import query_points
-    from .replay.intervals import IntervalResult, IntervalSummary, replay
+    from .replay.intervals import replay
+    from .replay.results import IntervalResult, IntervalSummary
     from .replay.scene_contacts import SceneContacts
     from .replay.scene_intersections import SceneIntersections
     from .replay.scene_proximities import SceneProximities
@@ -53,8 +54,8 @@ _MODULES = {
     "Collisions": "detection.collisions",
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.scene",
-    "IntervalResult": "replay.intervals",
-    "IntervalSummary": "replay.intervals",
+    "IntervalResult": "replay.results",
+    "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
     "Scene": "usd.scene",
     "SceneContacts": "replay.scene_contacts",
