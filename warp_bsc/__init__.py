@@ -31,7 +31,13 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.detector import CollisionDetector
     from .detection.differentiable import CollisionArrays
     from .detection.mesh import CollisionMesh
-    from .detection.query import QueryResult, query_edge_edge, query_vertex_face
+    from .detection.query import (
+        QueryResult,
+        query_edge_edge,
+        query_vertex_edge,
+        query_vertex_face,
+        query_vertex_vertex,
+    )
     from .detection.query_points import query_points
     from .replay.intervals import IntervalResult, IntervalSummary, replay
     from .replay.scene_contacts import SceneContacts
@@ -65,7 +71,9 @@ _MODULES = {
     "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
+    "query_vertex_edge": "detection.query",
     "query_vertex_face": "detection.query",
+    "query_vertex_vertex": "detection.query",
     "replay": "replay.intervals",
 }
 
@@ -92,7 +100,9 @@ __all__ = [
     "checker",
     "query_edge_edge",
     "query_points",
+    "query_vertex_edge",
     "query_vertex_face",
+    "query_vertex_vertex",
     "replay",
 ]
 

@@ -162,9 +162,16 @@ def reached(rng, n, kind):
     return points[exact], (height * _LENGTHS[frame])[exact]
 
 
-def nudged(rng, distance):
-    """Returns distances as they are, next to them, or off by 2^-40 of them, and whether they are no less."""
-    how = rng.integers(0, 5, len(distance))
+def nudged(rng, distance, by="all"):
+    """Returns distances that are changed a little or not at all, and whether they are no less.
+
+    Args:
+        rng: Random generator.
+        distance: Distances, shape (n,).
+        by: "ulp": as they are, or next to them in floating point; "2^-40": off by as much of them; "all": either.
+    """
+    first, last = {"ulp": (0, 3), "2^-40": (3, 5), "all": (0, 5)}[by]
+    how = rng.integers(first, last, len(distance))
     changed = np.select(
         [how == 1, how == 2, how == 3, how == 4],
         [
