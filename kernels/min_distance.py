@@ -39,7 +39,7 @@ With a roundoff of 0 the bounds are zero, and the status is the one that floatin
 import warp as wp
 
 from .closest import between, contact_at
-from .culling import gaps_along
+from .culling import centroid_direction, gaps_along
 from .distance import nearest_pair
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity, cross_middle
 from .signs import FREE, HIT, UNDERFLOW, UNSURE
@@ -101,6 +101,12 @@ def _direction_clears(part: Motion, direction: wp.vec3d, distance: wp.float64) -
     low, high, bound = gaps_along(part, direction)
     needed = distance * _norm(direction)
     return low - bound > needed or -high - bound > needed
+
+
+@wp.func
+def centroids_clear(motion: Motion, distance: wp.float64) -> bool:
+    """Returns whether the direction through the centroids keeps the features of a motion apart: the first cull."""
+    return _direction_clears(motion, _unit_scale(centroid_direction(motion)), wp.max(distance, _SMALLEST))
 
 
 @wp.func

@@ -8,10 +8,11 @@ import warp as wp
 from .._arrays import check_finite, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
 from .contact_buffer import HostContacts, read_contacts
-from .distance_query import DistanceKind, answer_at_distance, checked_distance
+from .distance_phase import checked_distance, decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
-from .settings import TOLERANCE, Count, PairCounts, PairKind, check_method, check_tolerance
+from .rings import Rings
+from .settings import TOLERANCE, Count, DistanceKind, PairCounts, PairKind, check_method, check_tolerance
 from .stage_timer import StageTimer
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
@@ -182,51 +183,32 @@ def _query(
     check_finite(points, "points")
     distance = checked_distance(min_distance, (n,))
     device = wp.get_device(device)
-    if kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any():
-        return _query_contact(PairKind(kind), points, method, timed, tolerance, device)
-    options = {"method": method, "timed": timed, "tolerance": tolerance, "device": device}
-    hit, status, answers = answer_at_distance(kind, points, np.broadcast_to(distance, n), **options)
-    return _result(hit, status, timed, hit, answers.toi[hit], answers.coordinates[hit], answers.normal[hit])
-
-
-def _result(
-    hit: np.ndarray,
-    status: np.ndarray,
-    timed: bool,
-    rows: np.ndarray,
-    times: np.ndarray,
-    at: np.ndarray,
-    directions: np.ndarray,
-) -> QueryResult:
-    """Returns a result from the times, coordinates and normals of some rows, those of the hits."""
-    if not timed:
-        return QueryResult(hit, status, None, None, None)
-    n = len(hit)
-    toi, coordinates, normal = np.full(n, 2.0), np.full((n, 3), np.nan), np.full((n, 3), np.nan)
-    toi[rows], coordinates[rows], normal[rows] = times, at, directions
-    return QueryResult(hit, status, toi, coordinates, normal)
-
-
-def _query_contact(
-    kind: PairKind, points: np.ndarray, method: str, timed: bool, tolerance: float, device: wp.Device
-) -> QueryResult:
-    """Returns which features touch: the minimum distance is 0."""
-    n = len(points)
-    # a mesh in which each query has four vertices of its own
+    # a mesh in which each query has vertices of its own
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
-    x0 = wp.array(np.ascontiguousarray(points[:, :4]).reshape(-1, 3), dtype=dtype, device=device)
-    x1 = wp.array(np.ascontiguousarray(points[:, 4:]).reshape(-1, 3), dtype=dtype, device=device)
-    vertices = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
+    half = kind.points
+    x0 = wp.array(np.ascontiguousarray(points[:, :half]).reshape(-1, 3), dtype=dtype, device=device)
+    x1 = wp.array(np.ascontiguousarray(points[:, half:]).reshape(-1, 3), dtype=dtype, device=device)
+    vertices = np.arange(half * n, dtype=np.int32).reshape(n, half)
     rows = np.arange(n, dtype=np.int32)
-    if kind == PairKind.VERTEX_FACE:
-        elements, pairs = vertices[:, 1:], np.stack([4 * rows, rows], axis=1)
-    else:
+    if kind == DistanceKind.EDGE_EDGE:
         elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
+    else:
+        elements, pairs = vertices[:, 1:], np.stack([vertices[:, 0], rows], axis=1)
+        if kind == DistanceKind.VERTEX_VERTEX:
+            pairs = vertices
     elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)
     all_queued = PairCounts(queued=n).values()
+    # without a distance: the narrow phase of contacts
+    contact = kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any()
+    radius = np.zeros((n, half))
+    radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
+    if kind == DistanceKind.EDGE_EDGE:
+        radius[:, 1] = distance
+    radius = radius.ravel()
+    device_radius = None if contact else wp.array(radius, dtype=wp.float64, device=device)
 
     def solve(method: str) -> tuple[HostContacts, np.ndarray]:
         """The contacts by a method, and the query of each."""
@@ -236,7 +218,10 @@ def _query_contact(
         def launch() -> None:
             counts.assign(all_queued)
             options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
-            narrow_phase.run(x0, x1, elements, **options)
+            if contact:
+                narrow_phase.run(x0, x1, elements, **options)
+            else:
+                run_distance_phases([(narrow_phase, elements)], x0, x1, device_radius, Rings(), **options)
 
         retry_until_fits(launch, narrow_phase, device)
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
@@ -247,9 +232,11 @@ def _query_contact(
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":
                 left |= contacts.decided == UNSURE
-            decide_on_host(kind, x0, x1, elements, contacts, left, timed=timed)
-        rows = contacts.pairs[:, 1] if kind == PairKind.VERTEX_FACE else contacts.pairs[:, 0] // 2
-        return contacts, rows
+            if contact:
+                decide_on_host(PairKind(kind), x0, x1, elements, contacts, left, timed=timed)
+            else:
+                decide_distances_on_host(kind, x0, x1, elements, radius, contacts, left, timed=timed)
+        return contacts, contacts.pairs[:, 0] // (2 if kind == DistanceKind.EDGE_EDGE else half)
 
     certified, certified_rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)
@@ -259,12 +246,12 @@ def _query_contact(
     decided_rows = decided_rows[found]
     hit = np.zeros(n, dtype=bool)
     hit[decided_rows] = True
-    return _result(
-        hit,
-        status,
-        timed,
-        decided_rows,
-        decided.toi[found],
-        decided.coordinates[found],
-        decided.normal[found],
-    )
+    if not timed:
+        return QueryResult(hit, status, None, None, None)
+    toi = np.full(n, 2.0)
+    coordinates = np.full((n, 3), np.nan)
+    normal = np.full((n, 3), np.nan)
+    toi[decided_rows] = decided.toi[found]
+    coordinates[decided_rows] = decided.coordinates[found]
+    normal[decided_rows] = decided.normal[found]
+    return QueryResult(hit, status, toi, coordinates, normal)
