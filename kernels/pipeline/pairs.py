@@ -6,7 +6,7 @@ have representatives with overlapping boxes, so that one traversal over faces fi
 
 import warp as wp
 
-from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE
+from ..polynomials import VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 
 @wp.func
@@ -37,8 +37,8 @@ def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.v
 
     Elements are faces, or edges for (edge, edge) and (vertex, edge); (vertex, vertex) has none.
     """
-    if kind == VERTEX_FACE or kind == EDGE_EDGE:
-        return vertices_of_pair(kind, elements, pair)
     if kind == VERTEX_EDGE:
         return wp.vec4i(pair[0], elements[pair[1], 0], elements[pair[1], 1], elements[pair[1], 0])
-    return wp.vec4i(pair[0], pair[1], pair[1], pair[1])
+    if kind == VERTEX_VERTEX:
+        return wp.vec4i(pair[0], pair[1], pair[1], pair[1])
+    return vertices_of_pair(kind, elements, pair)

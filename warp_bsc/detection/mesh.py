@@ -9,7 +9,7 @@ import warp as wp
 
 from .._arrays import checked_shape
 from .face_order import order_faces
-from .settings import PairKind
+from .settings import DistanceKind, PairKind
 
 __all__ = ["CollisionMesh"]
 
@@ -113,12 +113,39 @@ class CollisionMesh:
             self.world = self._checked_world(world)
 
     @functools.cached_property
-    def face_order(self) -> np.ndarray:
-        """Face at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
-        return order_faces(self.faces, None if self.world is None else self.world[self.faces[:, 0]])
+    def cells(self) -> np.ndarray:
+        """Vertices of the faces, then of the free edges as faces a b b, then of the points, int32, shape [n, 3]."""
+        edges, points = self.edges[self.free_edges], self.points
+        return np.concatenate([self.faces, edges[:, [0, 1, 1]], np.stack([points] * 3, axis=1)]).astype(np.int32)
 
-    def device_elements(self, kind: PairKind) -> wp.array:
-        """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int."""
+    @functools.cached_property
+    def cell_edges(self) -> np.ndarray:
+        """Edges of the cells, as ``face_edges``, int32, shape [n, 3]."""
+        cell_edges = np.full((len(self.cells), 3), -1, dtype=np.int32)
+        cell_edges[: len(self.faces)] = self.face_edges
+        cell_edges[len(self.faces) : len(self.faces) + len(self.free_edges), 0] = self.free_edges
+        return cell_edges
+
+    @functools.cached_property
+    def cell_owned(self) -> np.ndarray:
+        """What each cell is the representative of, as ``owned``, int32, shape [n]."""
+        first, last = len(self.faces), len(self.faces) + len(self.free_edges)
+        owned = np.concatenate([self.owned, np.full(last - first, 8), np.ones(len(self.points))]).astype(np.int32)
+        ends, first_ends = np.unique(self.cells[first:last, :2], return_index=True)
+        first_ends = first_ends[~np.isin(ends, self.faces)]
+        np.bitwise_or.at(owned, first + first_ends // 2, 1 << (first_ends % 2))
+        return owned
+
+    @functools.cached_property
+    def face_order(self) -> np.ndarray:
+        """Cell at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
+        return order_faces(self.cells, None if self.world is None else self.world[self.cells[:, 0]])
+
+    def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
+        """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.
+
+        Those of two points are not used, and are the edges here.
+        """
         return self.device_faces if kind == PairKind.VERTEX_FACE else self.device_edges
 
     def device_positions(self, x: np.ndarray | wp.array, name: str) -> wp.array:
@@ -153,10 +180,14 @@ class CollisionMesh:
         if elements.shape == (0,):
             elements = np.empty(shape, np.int32)
         if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:
-            raise ValueError(f"{name}s must have shape {f'(n, {corners})' if corners > 1 else '(n,)'}, not {elements.shape}")
+            raise ValueError(
+                f"{name}s must have shape {f'(n, {corners})' if corners > 1 else '(n,)'}, not {elements.shape}"
+            )
         if not np.issubdtype(elements.dtype, np.integer):
             raise ValueError(f"{name}s must be integers, not {elements.dtype}")
-        bad = np.flatnonzero(((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), -1).any(axis=1))
+        bad = np.flatnonzero(
+            ((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), corners).any(axis=1)
+        )
         if len(bad):
             raise ValueError(
                 f"{name} {bad[0]} is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
