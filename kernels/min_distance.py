@@ -21,10 +21,10 @@ short as the gap where features turn; the others lose the square of their length
 features whose distance is certainly at most d are a HIT.
 
 The search goes through the step from part to part: after a part that is free comes one twice as long, and a part that
-nothing decides is halved. Once a time is known at which the distance is reached, a part ends half the tolerance before
-the first such time, as far as linear interpolation shows it. The search ends at the first part as short as
-:data:`SHORTEST` that nothing decides, or after :data:`MAX_VISITS` parts. The start of the last part is a lower bound of
-the time at which the distance is reached.
+nothing decides is halved. Newton's method proposes a time, half the tolerance after the one at which the distance is
+about reached; if the distance is certainly reached there, the next part ends within the tolerance before it. The search
+ends at the first part as short as :data:`SHORTEST` that nothing decides, or after :data:`MAX_VISITS` parts. The start
+of the last part is a lower bound of the time at which the distance is reached.
 
 **Bounds.** r is the roundoff, U the sum of the sizes of u, v and w, component by component. Components of u, v and w
 at a time have at most 4 roundings: 1 of the difference of points, 3 of the interpolation between both ends; times are
@@ -52,11 +52,13 @@ MAX_VISITS = wp.constant(128)
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
+_AHEAD = wp.constant(wp.float64(0.75))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
 _FOUR = wp.constant(wp.float64(4.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
+_NEWTON_STEPS = wp.constant(3)
 _SMALLEST = wp.constant(wp.float64(2.0**-400))
 _INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
 _POINT_ERROR = wp.constant(wp.float64(12.0))
@@ -104,12 +106,6 @@ def _direction_clears(part: Motion, direction: wp.vec3d, distance: wp.float64) -
 
 
 @wp.func
-def centroids_clear(motion: Motion, distance: wp.float64) -> bool:
-    """Returns whether the direction through the centroids keeps the features of a motion apart: the first cull."""
-    return _direction_clears(motion, _unit_scale(centroid_direction(motion)), wp.max(distance, _SMALLEST))
-
-
-@wp.func
 def _plane_clears(part: Motion, distance: wp.float64) -> bool:
     """Returns whether the plane of the polygon stays farther away than a distance.
 
@@ -131,6 +127,13 @@ def _plane_clears(part: Motion, distance: wp.float64) -> bool:
         wp.min(wp.min(above[0], above[1]), wp.min(above[2], above[3])) > bound
         or wp.min(wp.min(below[0], below[1]), wp.min(below[2], below[3])) > bound
     )
+
+
+@wp.func
+def clears_at_once(motion: Motion, distance: wp.float64) -> bool:
+    """Returns whether the direction through the centroids, or the plane, keeps the features of a motion apart."""
+    far = wp.max(distance, _SMALLEST)
+    return _direction_clears(motion, _unit_scale(centroid_direction(motion)), far) or _plane_clears(motion, far)
 
 
 @wp.func
@@ -346,6 +349,43 @@ def _nearest_at(motion: Motion, time: wp.float64):
 
 
 @wp.func
+def _about_reached(
+    motion: Motion,
+    distance: wp.float64,
+    start: wp.float64,
+    end: wp.float64,
+    time: wp.float64,
+    at: wp.vec2d,
+    gap: wp.vec3d,
+) -> wp.float64:
+    """Returns about when a distance is reached between two times, by Newton's method from a time of a part.
+
+    Args:
+        motion: The motion.
+        distance: The distance.
+        start: Start of the part.
+        end: Its end.
+        time: Time from which to search.
+        at: Coordinates of the closest points at that time.
+        gap: The vector between them.
+
+    Returns:
+        The time; 2 if that is not between both.
+    """
+    for _ in range(_NEWTON_STEPS):
+        velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+        size = wp.length(gap)
+        slope = wp.dot(gap, velocity)
+        if slope == _ZERO:
+            return _TWO
+        time += (distance - size) * size / slope
+        if not (time >= start and time <= end):
+            return _TWO
+        at, gap = _nearest_at(motion, time)
+    return time
+
+
+@wp.func
 def _is_within(motion: Motion, gap: wp.vec3d, distance: wp.float64) -> bool:
     """Returns whether the vector between two points of the features is certainly no longer than a distance.
 
@@ -409,20 +449,16 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
     start = _ZERO
     width = _ONE
     limit = _ONE  # end of what is to be searched
-    inside = _ZERO  # distance at the limit
     found = bool(False)  # whether the distance is certainly reached at the limit
-    aimed = bool(False)  # whether the part ends half the tolerance before the distance is about reached
-    probing = bool(False)  # whether the part is the one after that
+    aimed = bool(False)  # whether the part ends within the tolerance before the limit
     status = int(UNSURE)
     for visit in range(MAX_VISITS):
         end = wp.min(start + width, limit)
         span = end - start
-        time = wp.where(probing, end, start + SHORTEST * wp.floor(_HALF * span / SHORTEST))
-        probing = False
+        time = start + SHORTEST * wp.floor(_HALF * span / SHORTEST)
         at, gap = _nearest_at(motion, time)
         if _is_within(motion, gap, near):
             limit = time
-            inside = wp.length(gap)
             found = True
             aimed = False
             if time == start:  # in a shortest part
@@ -431,8 +467,7 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
             part = restrict_motion(motion, start, end)
             if _direction_clears(part, _unit_scale(gap), far) or _polygon_clears(kind, part, at, far):
                 start = end
-                width = wp.where(aimed, length, _TWO * width)
-                probing = aimed
+                width = _TWO * width
                 aimed = False
                 if end == limit:
                     if not found:
@@ -441,23 +476,26 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
             elif span <= SHORTEST:
                 break
             else:
-                outside = wp.length(gap)
+                reached = _about_reached(motion, distance, start, limit, time, at, gap)
+                if reached < limit:
+                    reached = wp.min(SHORTEST * wp.floor((reached + _HALF * length) / SHORTEST), limit)
+                    at, gap = _nearest_at(motion, reached)
+                    if _is_within(motion, gap, near):
+                        found = True
+                        limit = reached
                 if visit == 0:
                     at, gap = _nearest_at(motion, _ONE)
-                    found = _is_within(motion, gap, near)
-                    inside = wp.length(gap)
+                    found = found or _is_within(motion, gap, near)
                     at, gap = _nearest_at(motion, _ZERO)
                     if _is_within(motion, gap, near):
                         found = True
                         limit = _ZERO
                         break
                 width = wp.max(_HALF * power_of_two(span), SHORTEST)
-                aimed = not aimed and found and outside > inside
-                if aimed:
-                    reached = time + (limit - time) * (outside - distance) / (outside - inside) - _HALF * length
-                    before = SHORTEST * wp.floor((reached - start) / SHORTEST)
-                    aimed = before > _ZERO and before < span
-                    width = wp.where(aimed, before, width)
+                before = limit - _AHEAD * length - start
+                before = SHORTEST * wp.floor(before / SHORTEST)
+                aimed = found and not aimed and before > _ZERO and before < span
+                width = wp.where(aimed, before, width)
         if found and (not timed or limit - start <= length):
             break
     if status == FREE:

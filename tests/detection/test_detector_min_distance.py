@@ -204,6 +204,30 @@ def test_detection_in_a_graph(device):
             assert np.array_equal(getattr(replayed, name + suffix), getattr(expected, name + suffix))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_proximities_of_one_configuration(dtype):
+    arguments, radius, x, _ = scene(dtype, seed=3)
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(**arguments, radius=radius))
+    for distance, rings in ((0.001, 1), (0.003, 2)):
+        found = detector.find_proximities(x, distance, rings=rings)
+        expected = all_pairs(detector.mesh, np.full(len(x), 0.5 * distance), x, x, rings)
+        for label, (pairs, _) in expected.items():
+            np.testing.assert_array_equal(getattr(found, label), pairs, err_msg=label)
+        assert len(found.distance) == len(found.position) == sum(len(pairs) for pairs, _ in expected.values())
+        assert (found.distance <= distance * (1.0 + 2.0**-38)).all()
+    assert min(len(pairs) for pairs, _ in expected.values()) > 0
+
+
+def test_proximities_are_exact_to_the_last_bit():
+    x = np.array([[0, 0, 0.1], [0, 0, 0], [2, 0, 0], [-1, 1, 0], [-1, -1, 0]])
+    mesh = bsc.CollisionMesh([[2, 3, 4]], 5, points=[0, 1])
+    detector = bsc.CollisionDetector(mesh)
+    for distance, hits in ((0.1, [[0, 1]]), (np.nextafter(0.1, 0.0), [])):
+        found = detector.find_proximities(x, float(distance))
+        assert found.vertex_vertex.tolist() == hits
+        assert found.vertex_face.tolist() == [[0, 0]] * len(hits) + [[1, 0]]
+
+
 def test_elements_of_a_mesh():
     mesh = bsc.CollisionMesh([[0, 1, 2]], 9, edges=[[1, 0], [5, 4], [2, 4]], points=[8, 4, 7, 0], radius=0.5)
     assert mesh.edges.tolist() == [[0, 1], [0, 2], [1, 2], [2, 4], [4, 5]]

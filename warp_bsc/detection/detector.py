@@ -15,6 +15,7 @@ from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .narrow_phase import decide_on_host
 from .pipeline import DetectionPipeline
+from .proximities import Proximities, ProximityFinder
 from .settings import TOLERANCE, Counts, DistanceKind, PairKind
 from .stage_timer import StageTimer
 
@@ -145,6 +146,24 @@ class CollisionDetector:
             ValueError: If the positions have another shape or type, or are not finite.
         """
         return find_intersections(self.mesh, x)
+
+    def find_proximities(self, x: np.ndarray | wp.array, distance: float, *, rings: int = 1) -> Proximities:
+        """Returns the pairs of elements that are near each other in one configuration, exactly.
+
+        Pairs are those of :meth:`detect`, points included, whether or not the detector has a minimum distance. Radii of
+        the mesh are not counted.
+
+        Args:
+            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
+                vertices that take no part may be anything.
+            distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
+            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
+
+        Raises:
+            ValueError: If the positions have another shape or type, are not finite or more than 2^1000, the distance is
+                no finite number more than 0 or out of the range of their type, or the rings are less than 0.
+        """
+        return ProximityFinder(self.mesh, distance, rings=rings).find(x)
 
     def intersection_finder(self) -> IntersectionFinder:
         """Returns a finder of intersections that shares trees with this detector on a CPU."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from .. import checker
 from ..kernels.ccd import impact_at_distance
-from ..kernels.min_distance import centroids_clear, closest_at
+from ..kernels.min_distance import clears_at_once, closest_at
 from ..kernels.motion import motion_and_distance, relative_motion
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
@@ -97,7 +97,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         distance = _distance(kind, v, radius)
         motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
-        if centroids_clear(motion, scaled) or are_within_rings(v, _firsts(kind), rings):
+        if clears_at_once(motion, scaled) or are_within_rings(v, _firsts(kind), rings):
             return
         append(pair, stages.survivors, stages.counts, _SURVIVORS)
 

@@ -73,6 +73,11 @@ class DistanceKind(enum.IntEnum):
         return self.name.lower()
 
     @property
+    def display_name(self) -> str:
+        """The name in messages: "vertex-face" and so on."""
+        return self.label.replace("_", "-")
+
+    @property
     def point_order(self) -> list[int]:
         """The point of the pair at each of the four places that kernels take: p a b a, p q q q."""
         if self == DistanceKind.VERTEX_EDGE:
