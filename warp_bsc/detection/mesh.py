@@ -173,10 +173,10 @@ class CollisionMesh:
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def _checked_indices(self, elements: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
+    def _checked_indices(self, given: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
         """Returns the vertex indices of elements, int32, shape [n, corners], or [n] for points."""
         shape = (0,) if corners == 1 else (0, corners)
-        elements = np.asarray(elements.numpy() if isinstance(elements, wp.array) else elements)
+        elements: np.ndarray = np.asarray(given.numpy() if isinstance(given, wp.array) else given)
         if elements.shape == (0,):
             elements = np.empty(shape, np.int32)
         if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:

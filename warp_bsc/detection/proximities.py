@@ -208,10 +208,13 @@ class ProximityFinder:
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True
         found = [self._exactly(near, positions, largest) for near in self._near]
-        pairs, distance, position = zip(*found, strict=True)
-        return Proximities(*pairs, np.concatenate(distance), np.concatenate(position))
+        vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
+        distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
+        return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position)
 
-    def _exactly(self, near: "_NearPairs", positions: np.ndarray, largest: float) -> tuple[np.ndarray, ...]:
+    def _exactly(
+        self, near: _NearPairs, positions: np.ndarray, largest: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns pairs, distances and positions of a kind, without the pairs that are farther than the distance."""
         pairs, distance, position = near.read()
         # differences of positions are at most twice the largest coordinate

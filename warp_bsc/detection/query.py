@@ -208,7 +208,7 @@ def _query(
     if kind == DistanceKind.EDGE_EDGE:
         radius[:, 1] = distance
     radius = radius.ravel()
-    device_radius = None if contact else wp.array(radius, dtype=wp.float64, device=device)
+    device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
     def solve(method: str) -> tuple[HostContacts, np.ndarray]:
         """The contacts by a method, and the query of each."""
