@@ -264,6 +264,8 @@ def test_bad_detectors_are_refused():
             bsc.CollisionDetector(mesh, min_distance=distance)
     with pytest.raises(ValueError, match="at least 2"):
         bsc.CollisionDetector(mesh, min_distance=5e-324)
+    with pytest.raises(ValueError, match="at most 2"):
+        bsc.CollisionDetector(bsc.CollisionMesh([], 1, radius=1e308))
     with pytest.raises(ValueError, match="rings must be"):
         bsc.CollisionDetector(mesh, min_distance=1.0, rings=-1)
     x = wp.zeros(3, dtype=wp.vec3, requires_grad=True)

@@ -57,7 +57,7 @@ class CollisionDetector:
                 computes, "conservative" counts them as hits, "exact" decides them exactly.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, beside the radii of the mesh, in the unit of the
-                positions: 0, or at least 2^-1021. With 0 and without radii pairs collide that touch.
+                positions: 0, or from 2^-1021 to 2^1000. With 0 and without radii pairs collide that touch.
             rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
                 a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
                 rest has no collisions at a distance below half of its shortest edge.

@@ -9,7 +9,7 @@ from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import checked_distance, run_distance_phases
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
-from .rings import make_rings
+from .rings import Rings, make_rings
 from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, check_method, check_tolerance
 from .stage_timer import StageTimer
 
@@ -17,6 +17,9 @@ __all__ = ["DetectionPipeline"]
 
 LEAST_CAPACITY = 4096
 """Least capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
+
+_LARGEST_RADIUS = 2.0**1000
+"""The sum of two is finite."""
 
 _UNTIMED = StageTimer(None)
 
@@ -47,9 +50,14 @@ def _radius(mesh: CollisionMesh, min_distance: float) -> np.ndarray | None:
     """Returns the radius of each vertex with half of the minimum distance, float64; None if all are 0."""
     if min_distance > 0.0 and 2.0 * (0.5 * min_distance) != min_distance:
         raise ValueError(f"min_distance must be 0 or at least 2^-1021, not {min_distance!r}")
-    if mesh.radius is None:
-        return np.full(mesh.vertex_count, 0.5 * min_distance) if min_distance else None
-    return mesh.radius + 0.5 * min_distance
+    if mesh.radius is None and min_distance == 0.0:
+        return None
+    radius = np.full(mesh.vertex_count, 0.5 * min_distance)
+    if mesh.radius is not None:
+        radius += mesh.radius
+    if radius.max(initial=0.0) > _LARGEST_RADIUS:
+        raise ValueError(f"radii and half of min_distance must be at most 2^1000 together, not {radius.max():g}")
+    return radius
 
 
 def _queues(*narrow_phases: NarrowPhase) -> list[wp.array]:
@@ -126,7 +134,7 @@ class DetectionPipeline:
         self.counts = self.counters.read()
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
         self.radius = _radius(mesh, float(checked_distance(min_distance)))
-        self._rings = make_rings(mesh, rings)
+        self._rings = Rings() if self.radius is None else make_rings(mesh, rings)
         self._radius = padding = None
         if self.radius is not None:
             self._radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
