@@ -271,3 +271,20 @@ def test_bad_detectors_are_refused():
     x = wp.zeros(3, dtype=wp.vec3, requires_grad=True)
     with pytest.raises(ValueError, match="no gradients"):
         bsc.CollisionDetector(mesh, min_distance=1.0).detect(x, x)
+
+
+def test_edges_and_points_without_a_distance():
+    """A strand falls across the side of a face, a point onto its inside; another strand passes through it at rest."""
+    x0 = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, -1, 1], [1, 1, 1], [2, 1, 3], [1, 2, -1], [1, 2, 1]], float)
+    x1 = x0.copy()
+    x1[3:6, 2] -= 4.0
+    mesh = bsc.CollisionMesh([[0, 1, 2]], 8, edges=[[3, 4], [6, 7]], points=[5])
+    detector = bsc.CollisionDetector(mesh, method="exact")
+    found = detector.detect(x0, x1)
+    strand, passing = mesh.free_edges.tolist()
+    side = mesh.edges.tolist().index([0, 1])
+    assert found.vertex_face.tolist() == [[4, 0], [5, 0]]
+    assert found.vertex_face_toi == pytest.approx([0.25, 0.75], abs=2.0**-20)
+    assert found.edge_edge.tolist() == [sorted([side, strand])]
+    assert len(found.vertex_edge) == len(found.vertex_vertex) == 0
+    assert detector.find_intersections(x0).tolist() == [[passing, 0]]
