@@ -60,7 +60,8 @@ class CollisionDetector:
                 positions: 0, or from 2^-1021 to 2^1000. With 0 and without radii pairs collide that touch.
             rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
                 a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
-                rest has no collisions at a distance below half of its shortest edge.
+                rest has no collisions at a distance below half of its shortest edge; triangles much thinner than their
+                edges are long need more.
 
         Raises:
             ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
