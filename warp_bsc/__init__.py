@@ -31,7 +31,13 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.detector import CollisionDetector
     from .detection.differentiable import CollisionArrays
     from .detection.mesh import CollisionMesh
-    from .detection.query import QueryResult, query_edge_edge, query_vertex_face
+    from .detection.query import (
+        QueryResult,
+        query_edge_edge,
+        query_vertex_edge,
+        query_vertex_face,
+        query_vertex_vertex,
+    )
     from .detection.query_points import query_points
     from .replay.intervals import replay
     from .replay.results import IntervalResult, IntervalSummary
@@ -66,7 +72,9 @@ _MODULES = {
     "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
+    "query_vertex_edge": "detection.query",
     "query_vertex_face": "detection.query",
+    "query_vertex_vertex": "detection.query",
     "replay": "replay.intervals",
 }
 
@@ -93,7 +101,9 @@ __all__ = [
     "checker",
     "query_edge_edge",
     "query_points",
+    "query_vertex_edge",
     "query_vertex_face",
+    "query_vertex_vertex",
     "replay",
 ]
 
