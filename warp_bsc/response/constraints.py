@@ -35,6 +35,7 @@ __all__ = [
     "is_dividing",
     "is_excluded",
     "is_projecting",
+    "is_pushing",
     "is_slow",
     "longest_path",
     "relative",
@@ -48,8 +49,8 @@ __all__ = [
 MAX_ITERATIONS = 40
 """Iterations of detect and project, after which the paths of vertices that still collide are truncated."""
 MAX_SLOW_ITERATIONS = 1
-"""Iterations of detect and project in worlds whose contacts are all of slow elements. Vertices that then still collide
-are divided, which hardly moves them, and costs no sweeps."""
+"""Iterations of detect and project in worlds without fast contacts. Vertices that then still collide are divided, which
+hardly moves them, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.dividing_planes`."""
 MAX_TRUNCATIONS = wp.constant(8)
@@ -122,11 +123,11 @@ def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
 
 @wp.func
 def begins_dividing(progress: Progress, world: int) -> bool:
-    """Returns whether this iteration is the first that divides vertices of a world."""
+    """Returns whether this iteration is the first that divides vertices of a world without fast contacts."""
     last = progress.status.iteration[0] - 1
-    if progress.contact_iteration[world] != last:
+    if progress.contact_iteration[world] != last or progress.fast[world] == 1:
         return False
-    return is_dividing(progress, world, last) and not is_dividing(progress, world, last - 1)
+    return last == progress.max_slow_iterations
 
 
 @wp.func
@@ -219,6 +220,24 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
     else:
         size = wp.min(size, _side(motion, corners[1], corners[2]))
     return wp.where(longest_path(motion, corners) <= _SLOW * size, 1, 0)
+
+
+@wp.func
+def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d) -> bool:
+    """Returns whether two elements in contact would meet even if all that can be moved stood still.
+
+    Dividing planes, which let vertices stand still, are then no way out.
+    """
+    end = wp.vec3d()
+    moves = bool(False)
+    for j in range(4):
+        vertex = corners[j]
+        x = motion.x0[vertex]
+        if motion.inverse_mass[vertex] == 0.0:
+            moves = moves or wp.length_sq(motion.x1[vertex] - x) > 0.0
+            x = motion.x1[vertex]
+        end += weights[j] * to_double(x)
+    return moves and wp.dot(normal, end) <= _ZERO
 
 
 @wp.func

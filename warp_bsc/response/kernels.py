@@ -24,6 +24,7 @@ from .constraints import (
     feasible_in_contact,
     has_overflowed,
     is_dividing,
+    is_pushing,
     is_slow,
     to_double,
     to_single,
@@ -132,10 +133,11 @@ def _collect_contact(
         vertices.changed[corners[j]] = 1
     iteration = progress.status.iteration[0]
     slow = is_slow(motion, corners, contacts.edges)
-    if iteration == 0 and slow == 0:
+    weights = contact_weights(contacts.edges, contacts.coordinates[i])
+    normal = contacts.normal[i]
+    if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal)):
         progress.fast[world] = 1
     multiplier = wp.vec3d()
-    normal = contacts.normal[i]
     if is_dividing(progress, world, iteration):
         for j in range(4):
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
@@ -146,7 +148,6 @@ def _collect_contact(
     else:
         progress.status.projecting[0] = 1
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
-    weights = contact_weights(contacts.edges, contacts.coordinates[i])
     target = widened(separation, progress)
     if slow == 1:
         target = feasible_in_contact(motion, corners, weights, normal, target, separation)
