@@ -208,6 +208,17 @@ def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch,
     assert pytest.approx(0.8925) == program.LIMIT
 
 
+def test_a_cylinder_widens_a_sleeve():
+    """No vertex is left standing where the cylinder comes, and none is stretched as if it were."""
+    program = load_module(FOLDER / "coupling.py")
+    scene = program.Sleeve()
+    scene.duration = 0.2
+    run = program.Run(scene, 1.0 / 240.0, None).simulate()
+    report = run.solver.report
+    assert report.uncertified_steps == report.frozen_steps == report.truncated_steps == 0
+    assert 0.3 < run.stretch() < 1.0 and report.hits > 100
+
+
 def test_the_coupling_of_three_scenes_is_measured(monkeypatch, capsys):
     program = load_module(FOLDER / "coupling.py")
     for scene in program.SCENES.values():

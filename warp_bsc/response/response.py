@@ -96,9 +96,10 @@ class Response:
 
     Iterations of detection and projection come first: each contact is moved apart at the end of the step, and the new
     motion is detected again, as far as it changed. Vertices that still collide after ``max_iterations``, or after one
-    iteration in worlds whose contacts are all of slow elements that nothing pushes, are divided, see :mod:`.dividing_planes`, and if that
-    is not enough, frozen. This ends, because vertices that stood apart and stand still do not collide. A detection
-    whose queues are too small in a CUDA graph is completed without queues, see :mod:`.queueless`.
+    iteration in worlds whose contacts are all of slow elements that nothing immovable pushes, are divided, see
+    :mod:`.dividing_planes`, and if that is not enough, frozen. This ends, because vertices that stood apart and stand
+    still do not collide. A detection whose queues are too small in a CUDA graph is completed without queues, see
+    :mod:`.queueless`.
 
     If the response is differentiable, paths are truncated before their first contact instead of divided, and a
     detection whose queues are too small freezes all vertices, uncertified.
