@@ -30,6 +30,7 @@ __all__ = [
     "feasible_in_contact",
     "gap",
     "has_overflowed",
+    "inverse_mass_of",
     "is_dividing",
     "is_excluded",
     "is_projecting",
@@ -132,6 +133,16 @@ def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -
         if counts[i] > capacities[i]:
             return True
     return False
+
+
+@wp.func
+def inverse_mass_of(motion: Motion, vertex: int) -> float:
+    """Returns the inverse mass of a vertex, or of the body that it moves with [1/kg]; 0 where nothing can move it."""
+    if motion.bodies.of_vertex:
+        body = motion.bodies.of_vertex[vertex]
+        if body >= 0:
+            return motion.bodies.inverse_mass[body]
+    return motion.inverse_mass[vertex]
 
 
 @wp.func

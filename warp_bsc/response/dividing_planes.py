@@ -14,7 +14,7 @@ References:
 import warp as wp
 
 from .buffers import Motion, Vertices
-from .constraints import LEAST_DISTANCE, to_double, to_single
+from .constraints import LEAST_DISTANCE, inverse_mass_of, to_double, to_single
 from .proximities import closest_direction
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "allocate_dividing_planes",
     "has_all_planes",
     "position_on_sides",
+    "share_of_path",
 ]
 
 _NONE = wp.constant(-1)
@@ -148,7 +149,7 @@ def _side(
         x1 = wp.dot(normal, to_double(vertices.x1[vertex]) - origin)
         side.start = wp.min(side.start, wp.dot(normal, to_double(motion.x0[vertex]) - origin))
         side.end = wp.min(side.end, x1)
-        inverse_mass = wp.float64(motion.inverse_mass[vertex])
+        inverse_mass = wp.float64(inverse_mass_of(motion, vertex))
         side.inverse_mass += inverse_mass
         if inverse_mass == _ZERO:
             side.fixed = wp.min(side.fixed, x1)
@@ -177,7 +178,7 @@ def add_dividing_plane(
     distance = above.start + below.start
     movable = wp.vec4i()
     for j in range(4):
-        movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)
+        movable[j] = wp.where(inverse_mass_of(motion, corners[j]) > 0.0, corners[j], -1)
     if distance <= _ZERO:
         for j in range(4):
             if movable[j] >= 0:
@@ -302,7 +303,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
+def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
     """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = _ONE
     node = planes.first[vertex]
@@ -330,7 +331,7 @@ def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.v
         return end, False
     start = to_double(x0)
     x = to_double(end)
-    end = to_single(start + _share_of_path(planes, vertex, start, x) * (x - start))
+    end = to_single(start + share_of_path(planes, vertex, start, x) * (x - start))
     if _is_above(planes, vertex, to_double(end)):
         return end, True
     return x0, True

@@ -30,6 +30,12 @@ def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True
+    if not motion.bodies.of_vertex:
+        return False
+    for side in range(2):
+        body = motion.bodies.of_vertex[corners[3 * side]]
+        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+            return corners[3 - 3 * side] < motion.bodies.particle_count  # a particle that is held
     return False
 
 

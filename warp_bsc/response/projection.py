@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
+from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_final_velocity
 from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
@@ -68,17 +69,28 @@ def _excess_speed(
 
 
 @wp.func
-def _effective_inverse_mass(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, relaxation: wp.float64
-) -> wp.float64:
-    """Returns the inverse mass of a constraint [1/kg], whose vertices are split among their active constraints."""
+def _effective_inverse_masses(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    x: wp.array[wp.vec3],
+    relaxation: wp.float64,
+):
+    """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
+
+    Its vertices and bodies are split among their active constraints.
+    """
     inverse_mass = _ZERO
     for j in range(4):
         vertex = constraints.vertices[i][j]
         parts = wp.max(wp.float64(vertices.active[vertex]) / relaxation, _ONE)
         share = wp.float64(motion.inverse_mass[vertex]) * parts
         inverse_mass += constraints.weights[i][j] * constraints.weights[i][j] * share
-    return inverse_mass
+    if not motion.bodies.of_vertex:
+        return inverse_mass, inverse_mass
+    along, across = body_inverse_masses(motion, vertices, constraints, i, x, relaxation)
+    return inverse_mass + along, inverse_mass + across
 
 
 @wp.func
@@ -87,16 +99,17 @@ def _multiplier_after(
     normal: wp.vec3d,
     excess: wp.float64,
     motion: wp.vec3d,
-    inverse_mass: wp.float64,
+    inverse_mass_along: wp.float64,
+    inverse_mass_across: wp.float64,
     friction: wp.float64,
 ) -> wp.vec3d:
     """Returns a multiplier after a step towards no excess along the normal and no motion across it.
 
     Along the normal it only pushes; across, it is limited by friction (Coulomb).
     """
-    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass, _ZERO)
+    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass_along, _ZERO)
     across = multiplier - wp.dot(multiplier, normal) * normal
-    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass
+    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass_across
     length = wp.length(across)
     if length > friction * along:
         across = across * (friction * along / length)
@@ -149,11 +162,13 @@ def _is_held(
 
 
 @wp.func
-def _activate(vertices: Vertices, constraints: Constraints, i: int):
-    """Adds a constraint to the active set, and counts it for its vertices."""
+def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
+    """Adds a constraint to the active set, and counts it for its vertices and bodies."""
     constraints.active_set[int(take_slot(constraints.active_count, 0))] = i
     for j in range(4):
         wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+    if motion.bodies.of_vertex:
+        activate_bodies(motion, vertices, constraints, i)
 
 
 @wp.func
@@ -234,7 +249,7 @@ def activate_position_constraints(
             path = _path(motion, vertices, constraints, i)
             active = distance > tolerance or not _is_held(multiplier, constraints.normal[i], path, friction, tolerance)
     if active:
-        _activate(vertices, constraints, i)
+        _activate(motion, vertices, constraints, i)
 
 
 @wp.func
@@ -244,15 +259,15 @@ def position_multiplier_after(
     """Returns the position multiplier of a constraint after a sweep, without momentum."""
     old = constraints.position_multiplier[i]
     relaxation = wp.where(pushes_only, _RELAXATION, _ONE)
-    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, relaxation)
-    if inverse_mass <= _ZERO:
+    along, across = _effective_inverse_masses(motion, vertices, constraints, i, motion.x1, relaxation)
+    if along <= _ZERO:
         return old
     excess = gap(vertices, constraints, i)
     if pushes_only and excess >= _ZERO:
         return old
     path = _path(motion, vertices, constraints, i)
     friction = wp.float64(constraints.friction[i])
-    return _multiplier_after(old, constraints.normal[i], excess, path, inverse_mass, friction)
+    return _multiplier_after(old, constraints.normal[i], excess, path, along, across, friction)
 
 
 @wp.func
@@ -261,13 +276,13 @@ def velocity_multiplier_after(
 ) -> wp.vec3d:
     """Returns the velocity multiplier of a constraint after a sweep, without momentum."""
     old = constraints.velocity_multiplier[i]
-    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, _ONE)
-    if inverse_mass <= _ZERO:
+    along, across = _effective_inverse_masses(motion, vertices, constraints, i, vertices.x1, _ONE)
+    if along <= _ZERO:
         return old
     excess = _excess_speed(motion, vertices, constraints, i, restitution)
     velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
     friction = wp.float64(constraints.friction[i])
-    return _multiplier_after(old, constraints.normal[i], excess, velocity, inverse_mass, friction)
+    return _multiplier_after(old, constraints.normal[i], excess, velocity, along, across, friction)
 
 
 @wp.kernel(**_KERNEL)
@@ -299,6 +314,8 @@ def project_positions(
     constraints.previous_multiplier[i] = multiplier
     constraints.position_multiplier[i] = new
     add_delta(motion, constraints, i, new - old, vertices.particle_delta_x)
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, new - old, motion.x1, vertices.bodies.delta_x)
 
 
 @wp.kernel(**_KERNEL)
@@ -345,6 +362,10 @@ def initialize_velocity_multipliers(motion: Motion, vertices: Vertices, constrai
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         add_delta(motion, constraints, i, constraints.velocity_multiplier[i], vertices.particle_delta_v)
+        if motion.bodies.of_vertex:
+            activate_bodies(motion, vertices, constraints, i)
+            impulse = constraints.velocity_multiplier[i]
+            add_body_delta(motion, vertices, constraints, i, impulse, vertices.x1, vertices.bodies.delta_v)
     constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
     constraints.last_sweep[i] = -2
 
@@ -381,7 +402,7 @@ def activate_velocity_constraints(
         friction = wp.float64(constraints.friction[i])
         active = excess > tolerance or not _is_held(multiplier, normal, velocity, friction, tolerance)
     if active:
-        _activate(vertices, constraints, i)
+        _activate(motion, vertices, constraints, i)
 
 
 @wp.kernel(**_KERNEL)
@@ -409,6 +430,8 @@ def project_velocities(
     constraints.previous_multiplier[i] = multiplier
     constraints.velocity_multiplier[i] = new
     add_delta(motion, constraints, i, new - old, vertices.particle_delta_v)
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, new - old, vertices.x1, vertices.bodies.delta_v)
 
 
 @wp.kernel(**_KERNEL)

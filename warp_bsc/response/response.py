@@ -11,13 +11,25 @@ from ..detection.launch import retry_until_fits
 from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import Count, PairKind, capacity_for
 from .adjoint_kernels import count_grazing
-from .angular_momentum import SUMS, sum_moments, sum_torques, turn_vertices
+from .angular_momentum import SUMS, sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
+from .bodies import (
+    begin_bodies,
+    change_body_velocities,
+    cut_bodies,
+    find_body_shares,
+    freeze_undetected_bodies,
+    move_bodies,
+    move_to_end,
+    place_vertices,
+    set_vertex_velocities,
+)
 from .buffers import (
     Constraints,
     Progress,
     SolveStatus,
     SweepStatus,
     Vertices,
+    allocate_bodies,
     allocate_constraints,
     allocate_vertices,
 )
@@ -114,7 +126,15 @@ class Response:
         device: The device.
     """
 
-    def __init__(self, mesh: ModelMesh, *, separation: float, restitution: float, differentiable: bool):
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        *,
+        separation: float,
+        restitution: float,
+        differentiable: bool,
+        moves_bodies: bool = False,
+    ):
         """Allocates buffers.
 
         Args:
@@ -123,6 +143,7 @@ class Response:
             restitution: Share of the approaching velocity that comes back, in [0, 1].
             differentiable: Whether all sweeps are made and paths are truncated, not divided, as the adjoint has it:
                 whether a constraint is active would otherwise depend on tiny changes, and results would jump.
+            moves_bodies: Whether motions have bodies that can be moved.
         """
         self.device = device = mesh.device
         self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
@@ -134,6 +155,9 @@ class Response:
         self._summing_threads = 1 if device.is_cpu else 64 * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
+        self._bodies = mesh.model.body_count if moves_bodies else 0
+        self.vertices.bodies = allocate_bodies(self._bodies, device)
+        self._shape_vertices = mesh.vertex_count - self._movable
         self._connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = mesh.device_faces, mesh.device_edges
         connectivity.vertex_edges, connectivity.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
@@ -268,6 +292,7 @@ class Response:
         outputs = [self.vertices, self.constraints, self._dividing_planes, self.progress]
         size = max(len(self.vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
+        self._launch_over_bodies(begin_bodies)
         wp.capture_if(self.status.recount, self._count_crossings)
 
     def _count_crossings(self):
@@ -291,6 +316,8 @@ class Response:
         self._record_offsets(after=1)
         wp.capture_if(self.constraints.count, self._change_velocities, dt=dt)
         self._launch_over_particles(freeze_undetected, [self._motion.vertices, self.vertices, self.progress])
+        self._launch_over_bodies(freeze_undetected_bodies, self.progress)
+        self._launch_over_shape_vertices(place_vertices)
 
     def _collect_penetrations(self, ahead):
         motion = self._motion
@@ -336,6 +363,8 @@ class Response:
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, [*inputs, last])
+        self._launch_over_bodies(move_bodies, last)
+        self._launch_over_shape_vertices(place_vertices)
 
     def _sweep_velocities(self, dt, first=True, last=True):
         """Sweeps over the constraints on velocities once, like :meth:`_sweep_positions`."""
@@ -351,6 +380,8 @@ class Response:
     def _update_velocities(self, last=True):
         inputs = [self._motion.vertices, self.vertices, self.constraints, self.progress, self._record, last]
         self._launch_over_particles(update_velocities, inputs)
+        self._launch_over_bodies(change_body_velocities, last)
+        self._launch_over_shape_vertices(set_vertex_velocities)
 
     def _project(self, sweep, **options):
         """Sweeps until no constraint is active, or MAX_SWEEPS times; not at all if vertices are to be divided."""
@@ -375,6 +406,7 @@ class Response:
     def _change_velocities(self, dt):
         """Solves the velocity constraints of all contacts that moved a vertex."""
         inputs = [self._motion.vertices, self.vertices]
+        self._launch_over_bodies(move_to_end)
         self.launch_over_constraints(initialize_velocity_multipliers, [*inputs, self.constraints, dt])
         self._update_velocities()
         self._project(self._sweep_velocities, dt=dt)
@@ -382,7 +414,9 @@ class Response:
         threads = self._summing_threads
         for kernel, arguments in ((sum_torques, [self.constraints]), (sum_moments, [self._movable])):
             wp.launch(kernel, threads, inputs=[*inputs, *arguments, threads, self._turn], device=self.device)
+        self._launch_over_bodies(sum_body_moments, self._turn)
         self._launch_over_particles(turn_vertices, [*inputs, self._turn])
+        self._launch_over_bodies(turn_bodies, self._turn)
 
     def _iterate(self, dt):
         """Projects or truncates once, and detects the new motion."""
@@ -393,6 +427,9 @@ class Response:
         inputs = [self._motion.vertices, self.vertices, self.progress, self._record, self._dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
+        self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing)
+        self._launch_over_bodies(cut_bodies, self.progress, dt)
+        self._launch_over_shape_vertices(place_vertices)
         self._detect(refit=True)
 
     def _detect(self, refit):
@@ -518,3 +555,14 @@ class Response:
 
     def _launch_over_particles(self, kernel, inputs):
         wp.launch(kernel, self._movable, inputs=inputs, device=self.device)
+
+    def _launch_over_bodies(self, kernel, *options):
+        if self._bodies:
+            inputs = [self._motion.vertices, self.vertices, *options]
+            wp.launch(kernel, self._bodies, inputs=inputs, device=self.device)
+
+    def _launch_over_shape_vertices(self, kernel, *options):
+        """Launches a kernel over the vertices of shapes, if bodies can be moved."""
+        if self._bodies:
+            inputs = [self._motion.vertices, self.vertices, *options]
+            wp.launch(kernel, self._shape_vertices, inputs=inputs, device=self.device)

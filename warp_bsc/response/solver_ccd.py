@@ -2,15 +2,17 @@
 
 import contextlib
 import time
+from typing import NamedTuple
 
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase
+from newton import BodyFlags
+from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
-from .buffers import FROZEN, LOST, TRUNCATED, SolveStatus
+from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
 from .coupling import Coupling
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
@@ -51,6 +53,34 @@ def _write_back(
         status.frozen[0] = 1
     if outcome[particle] & LOST != 0:
         wp.atomic_add(status.lost, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def _write_back_bodies(
+    # in
+    bodies: MovedBodies,
+    # out
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_q_prev: wp.array[wp.transform],
+    status: SolveStatus,
+):
+    """Writes the bodies that the response changed; the others keep every bit of what they are.
+
+    VBD takes the velocity of its next step from ``body_q_prev``, where it has that array.
+    """
+    body = wp.tid()
+    outcome = bodies.outcome[body]
+    if outcome == 0:
+        return
+    body_q[body] = bodies.pose[body]
+    body_qd[body] = bodies.velocity[body]
+    if body_q_prev:
+        body_q_prev[body] = bodies.pose[body]
+    if outcome & TRUNCATED != 0:
+        status.truncated[0] = 1
+    if outcome & FROZEN != 0:
+        status.frozen[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -95,6 +125,19 @@ def _count_record(counts: RecordCounts, complete: wp.array[int], totals: StepTot
     """Adds the record of a step to the totals."""
     totals.grazing[0] = totals.grazing[0] + counts.grazing[0]
     totals.lost_gradients[0] = totals.lost_gradients[0] + 1 - complete[0]
+
+
+class _Arrays(NamedTuple):
+    """The arrays of a state, which an attribute of the state may replace later."""
+
+    particle_q: wp.array | None
+    particle_qd: wp.array | None
+    body_q: wp.array | None
+    body_qd: wp.array | None
+
+
+def _arrays(state):
+    return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
 
 
 @contextlib.contextmanager
@@ -146,6 +189,7 @@ class SolverCCD(SolverBase):
         friction: float | None = None,
         restitution: float | None = None,
         coupling: int | None = None,
+        bodies: bool | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -200,15 +244,17 @@ class SolverCCD(SolverBase):
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
-        self._motion = ModelMotion(mesh, *self._friction(friction))
+        self._moves_bodies = self._find_moves_bodies(bodies, coupling)
+        self._motion = ModelMotion(mesh, *self._friction(friction), moves_bodies=self._moves_bodies)
         self._response = Response(
             mesh,
             separation=float(separation),
             restitution=float(restitution),
             differentiable=model.requires_grad,
+            moves_bodies=self._moves_bodies,
         )
         self._motion.set_start(model.particle_q, model.body_q)
-        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
+        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
         self._response.prepare(self._motion)
         self._recount_crossings()
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
@@ -218,6 +264,25 @@ class SolverCCD(SolverBase):
         self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._limited is not None)
+
+    def _find_moves_bodies(self, bodies, coupling):
+        """Returns whether the response can move bodies, as the argument ``bodies`` says."""
+        model, mesh, solver = self.model, self.mesh, self.solver
+        if bodies is None and coupling is not None:
+            return False
+        if bodies and coupling is not None:
+            raise ValueError("coupled steps move no bodies: omit coupling, or bodies")
+        if bodies and model.requires_grad:
+            raise NotImplementedError("steps that move bodies carry no gradients: omit bodies, or requires_grad")
+        if not self.respond or bodies is False or not model.body_count:
+            return False
+        if bodies is None:
+            integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
+            if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
+                return False
+        shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
+        return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
 
     def _friction(self, friction):
         """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
@@ -283,18 +348,17 @@ class SolverCCD(SolverBase):
             elif self.respond:
                 self._respond(state_in, state_out, dt, tape)
             else:
-                arrays = state_out.particle_q, state_out.particle_qd, state_out.body_q
-                run_on_host(lambda: self._inspect(*arrays, dt), self.mesh.device)
+                run_on_host(lambda: self._inspect(_arrays(state_out), dt), self.mesh.device)
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
         with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
             self.solver.step(*arguments, **options)
 
-    def _inspect(self, particle_q, particle_qd, body_q, dt):
-        """Detects the collisions of the motion from the start of the step to these positions, and counts the step."""
+    def _inspect(self, end, dt):
+        """Detects the collisions of the motion from the start of the step to a state, and counts the step."""
         with self._timed():
-            self._motion.set_end(particle_q, particle_qd, body_q, dt)
+            self._set_end(end, dt)
             resolution = self._response.inspect(self._motion)
             inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
             self._launch(_finish_inspection, self.mesh.vertex_count, inputs, outputs)
@@ -306,16 +370,16 @@ class SolverCCD(SolverBase):
     def _respond(self, state_in, state_out, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
         device = self.mesh.device
-        particle_q, particle_qd, body_q = state_out.particle_q, state_out.particle_qd, state_out.body_q
-        if tape is None or particle_q is None or not particle_q.requires_grad:
-            run_on_host(lambda: self._resolve(particle_q, particle_qd, body_q, dt), device)
+        end = _arrays(state_out)
+        if tape is None or end.particle_q is None or not end.particle_q.requires_grad:
+            run_on_host(lambda: self._resolve(end, dt), device)
             return
         recorded = None
-        arrays = [state_in.particle_q, particle_q, particle_qd]
+        arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
 
         def forward():
             nonlocal recorded
-            resolution = self._resolve(particle_q, particle_qd, body_q, dt, self._recorder)
+            resolution = self._resolve(end, dt, self._recorder)
             recorded = None
             if device.is_capturing or resolution.vertices.outcome.numpy().any():
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
@@ -329,28 +393,34 @@ class SolverCCD(SolverBase):
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), arrays)
 
-    def _resolve(self, particle_q, particle_qd, body_q, dt, record=None):
-        """Resolves the motion from the start of the step to these positions, and changes them."""
+    def _set_end(self, end, dt):
+        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
+
+    def _resolve(self, end, dt, record=None):
+        """Resolves the motion from the start of the step to a state, and changes it."""
         with self._timed():
-            self._motion.set_end(particle_q, particle_qd, body_q, dt)
+            self._set_end(end, dt)
             resolution = self._response.resolve(self._motion, dt, record)
-            self._finish(resolution, particle_q, particle_qd)
+            self._finish(resolution, end)
         return resolution
 
     def _couple(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
-            self._motion.set_end(state.particle_q, state.particle_qd, state.body_q, dt)
+            self._set_end(_arrays(state), dt)
             assert self._coupling is not None
             resolution = self._coupling.resolve(state, control, contacts, dt, self._is_coupled)
-            self._finish(resolution, state.particle_q, state.particle_qd)
+            self._finish(resolution, _arrays(state))
 
-    def _finish(self, resolution, particle_q, particle_qd):
+    def _finish(self, resolution, end):
         """Writes a resolved motion to the arrays of a state, and counts the step."""
         vertices = resolution.vertices
         inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [particle_q, particle_qd, resolution.status]
+        outputs = [end.particle_q, end.particle_qd, resolution.status]
         self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
+        if self._moves_bodies:
+            outputs = [end.body_q, end.body_qd, getattr(self.solver, "body_q_prev", None), resolution.status]
+            self._launch(_write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
         self._count_step(resolution)
 
     def _count_step(self, resolution):
