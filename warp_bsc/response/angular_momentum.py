@@ -1,4 +1,4 @@
-"""Angular momentum: a rigid turn of all vertices and bodies that collided removes what the position multipliers added to it.
+"""Angular momentum: a rigid turn of all that collided removes what the position multipliers added to it.
 
 Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
 """

@@ -5,6 +5,7 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
+from .bodies import follows_a_hit, sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
@@ -43,6 +44,8 @@ __all__ = [
 ]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
+_MOST_SAGITTA = wp.constant(wp.float64(4.0))
+"""Most that the turn of a body adds to the separation of a contact, in separations."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -140,11 +143,15 @@ def _collect_contact(
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
+        if iteration == 0 and contacts.edges == 1:
+            if follows_a_hit(motion, vertices, corners, contacts.coordinates[i], contacts.toi[i]):
+                return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     weights = contact_weights(contacts.edges, contacts.coordinates[i])
     target = widened(separation, progress)
     if slow == 1:
         target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+    target += sagitta(motion, vertices, corners, _MOST_SAGITTA * separation)
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     add_constraint(
         motion,

@@ -206,9 +206,7 @@ class ModelMotion:
         if self._moves_bodies:
             model = self._mesh.model
             inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
-            wp.launch(
-                _write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device
-            )
+            wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device)
         inputs = [self._placement(particle_q, body_q), particle_qd, dt]
         outputs = [self.vertices, self.planes.end]
         wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self._mesh.device)

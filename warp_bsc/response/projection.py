@@ -45,6 +45,8 @@ _SLIDING = wp.constant(wp.float64(0.999))
 """Share of the friction limit from which a contact slides."""
 _CREEP = wp.constant(wp.float64(0.1))
 """Longest path of a contact that friction holds, as a share of the tolerance; it adds up over steps."""
+_OF_BODIES = wp.constant(wp.float64(0.1))
+"""Tolerance of a constraint on a body as a share of that of others: a body moves as one, so that its motion shows."""
 _SHARE_OF_DISTANCE = wp.constant(wp.float64(0.5))
 """Largest tolerance of a position constraint as a share of its separation: elements that it holds stay apart."""
 _UNITS = wp.constant(wp.float64(2.0**40))
@@ -172,6 +174,17 @@ def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: i
 
 
 @wp.func
+def _tolerance_of(motion: Motion, constraints: Constraints, i: int, tolerance: wp.float64) -> wp.float64:
+    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
+    if motion.bodies.of_vertex:
+        for side in range(2):
+            body = motion.bodies.of_vertex[constraints.vertices[i][3 * side]]
+            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+                return _OF_BODIES * tolerance
+    return tolerance
+
+
+@wp.func
 def _max_sweeps(progress: Progress, world: int, slow: int) -> int:
     """Returns the most sweeps in a world, which are ``slow`` where it has no fast contacts."""
     return wp.where(progress.fast[world] == 1, MAX_SWEEPS, slow)
@@ -241,6 +254,7 @@ def activate_position_constraints(
     distance = gap(vertices, constraints, i)
     if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
         tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * constraints.separation[i])
+    tolerance = _tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
     if not active and is_reversible(constraints, progress, i):
         multiplier = constraints.position_multiplier[i]
@@ -393,7 +407,7 @@ def activate_velocity_constraints(
             return
         if gap(vertices, constraints, i) > constraints.separation[i]:
             return
-    tolerance /= dt
+    tolerance = _tolerance_of(motion, constraints, i, tolerance) / dt
     normal = constraints.normal[i]
     excess = _excess_speed(motion, vertices, constraints, i, restitution)
     active = excess < -tolerance

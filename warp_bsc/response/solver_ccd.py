@@ -158,12 +158,18 @@ class SolverCCD(SolverBase):
     """Lets another solver step, then makes the motion that it wanted free of collisions.
 
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
-    particles. All other attributes are those of the inner solver.
+    particles. Particles push dynamic bodies back, see ``bodies``. All other attributes are those of the inner solver.
 
     Elements that cross or touch at the start of a step, and vertices that begin in the solid of an infinite plane, are
     left to the inner solver. So are contacts of which no vertex can be moved. Everything else is certified. A particle
     whose wanted position or velocity is not finite stays where it was. A position at the start that is not finite
     leaves the step uncertified, without its elements.
+
+    The certificate is of straight motion: of all vertices between the stored state at the start and the stored state at
+    the end, those of shapes between the poses of their bodies. The vertices of a body that turns go in arcs, whose
+    distance from their chords (the sagitta) the response adds to the separation of contacts with that body, up to 4
+    times the separation; the arcs themselves are not certified. A body whose wanted pose or velocity is not finite is
+    left to the inner solver, and the step is not certified.
 
     With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
     tape then records what the inner solver records.
@@ -204,18 +210,25 @@ class SolverCCD(SolverBase):
                 ``soft_contact_restitution``.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none.
+            bodies: Whether contacts with particles push dynamic bodies: their poses and velocities change by mass and
+                inertia, with friction and restitution, so that momentum is kept. Default: true for solvers that keep
+                bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) without ``coupling`` and
+                ``requires_grad``. True for another solver needs one that reads ``body_q`` and ``body_qd`` of the state.
+                Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies that
+                are all kinematic at construction stay so.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
                 ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
-                velocity; the four numbers then have no meaning, and must not be given.
+                velocity; separation, friction, restitution, coupling and bodies
+                then have no meaning, and must not be given.
 
         Raises:
-            ValueError: If a number or the friction of a shape that collides with particles is out of range, or a number
-                is given without a response.
+            ValueError: If a number or the friction of a shape that collides with particles is out of range, an
+                argument is given without a response, or bodies are to be moved in coupled steps.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver is to be differentiated.
+                solver, or one that moves bodies, is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -226,6 +239,7 @@ class SolverCCD(SolverBase):
         self.respond = respond
         if not respond:
             numbers = {"separation": separation, "friction": friction, "restitution": restitution, "coupling": coupling}
+            numbers |= {"bodies": bodies}
             for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
@@ -268,7 +282,7 @@ class SolverCCD(SolverBase):
     def _find_moves_bodies(self, bodies, coupling):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
         model, mesh, solver = self.model, self.mesh, self.solver
-        if bodies is None and coupling is not None:
+        if bodies is None and (coupling is not None or model.requires_grad):
             return False
         if bodies and coupling is not None:
             raise ValueError("coupled steps move no bodies: omit coupling, or bodies")
