@@ -14,6 +14,7 @@ from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
 from .coupling import Coupling
+from .coupling_hooks import CouplingHooks
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -154,7 +155,7 @@ def _paused_tape():
         tape.__enter__()
 
 
-class SolverCCD(SolverBase):
+class SolverCCD(SolverBase, CouplingHooks):
     """Lets another solver step, then makes the motion that it wanted free of collisions.
 
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
@@ -352,7 +353,8 @@ class SolverCCD(SolverBase):
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
-            self._motion.set_start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
+            start = state_in if self._coupled is None else self._coupled.start_of(state_in)
+            self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
                 self._coupling.save(state_in)
         self._step_inner(state_in, state_out, control, contacts, dt, **options)
@@ -363,6 +365,8 @@ class SolverCCD(SolverBase):
                 self._respond(state_in, state_out, dt, tape)
             else:
                 run_on_host(lambda: self._inspect(_arrays(state_out), dt), self.mesh.device)
+            if self._coupled is not None:
+                self._coupled.finish(state_out, self._motion.vertices, self._response.vertices, self._moves_bodies)
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
