@@ -75,9 +75,10 @@ def check_vertices(rollout):
     assert certified.tobytes() == rollout.vertices(rollout.states[0]).tobytes()
 
 
-def test_a_ball_and_a_free_cloth_keep_their_momenta(device):
+@pytest.mark.parametrize("coupling", [None, 2])
+def test_a_ball_and_a_free_cloth_keep_their_momenta(coupling, device):
     model = ball_and_sheet(device, fixed=False)
-    rollout = Rollout(model, bsc.SolverCCD(free(model), friction=0.5))
+    rollout = Rollout(model, bsc.SolverCCD(free(model), friction=0.5, coupling=coupling))
     linear, angular = momenta(model, rollout.states[0])
     hits = 0
     for _ in range(8):
@@ -245,6 +246,21 @@ def test_bodies_that_cannot_be_moved_keep_every_bit(why, device):
         assert solver.report.rounds > 0 and start.particle_q.numpy()[:, 2].min() < -0.03
 
 
+def test_coupling_stops_a_ball_earlier(device):
+    """The sheet pulls against the ball within a step, so that it gives way less."""
+    lowest = []
+    for coupling in (None, 4):
+        model = ball_and_sheet(device, fixed=True, n=6)
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=coupling))
+        heights = []
+        for _ in range(24):
+            rollout.step()
+            heights.append(rollout.states[0].body_q.numpy()[0, 2])
+        assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
+        lowest.append(min(heights))
+    assert lowest[1] > 0.5 * lowest[0] and lowest[0] < -0.05
+
+
 def test_worlds_with_bodies_are_like_one_alone(device):
     one, three = (ball_and_sheet(device, fixed=True, worlds=worlds, n=6) for worlds in (1, 3))
     alone, together = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model))) for model in (one, three))
@@ -311,8 +327,6 @@ def test_without_bodies_no_kernel_of_bodies_is_launched(device, monkeypatch):
 
 def test_arguments_that_do_not_go_together(device):
     model = ball_and_sheet(device, fixed=True, n=2)
-    with pytest.raises(ValueError, match="coupled"):
-        bsc.SolverCCD(SOLVERS["vbd"](model), bodies=True, coupling=2)
     with pytest.raises(ValueError, match="bodies"):
         bsc.SolverCCD(SOLVERS["vbd"](model), bodies=True, respond=False)
     builder = newton.ModelBuilder()

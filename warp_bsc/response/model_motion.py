@@ -10,7 +10,7 @@ from .constraints import to_double, to_single
 from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
 
-__all__ = ["ModelMotion"]
+__all__ = ["ModelMotion", "moves_with_body", "wanted_velocity"]
 
 
 @wp.struct
@@ -44,6 +44,24 @@ def _place_plane(placement: _Placement, i: int, planes: wp.array[wp.vec4d]):
         planes[i] = transformed_plane(
             placement.plane_point[i], placement.plane_normal[i], placement.plane_body[i], placement.body_q
         )
+
+
+@wp.func
+def moves_with_body(motion: Motion, vertex: int) -> bool:
+    """Returns whether a vertex is of a body that the response can move."""
+    if not motion.bodies.of_vertex:
+        return False
+    body = motion.bodies.of_vertex[vertex]
+    return body >= 0 and motion.bodies.inverse_mass[body] > 0.0
+
+
+@wp.func
+def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
+    """Returns the wanted velocity of a vertex of a body, whose wanted position is ``x1`` [m/s]."""
+    body = motion.bodies.of_vertex[vertex]
+    twist = motion.bodies.velocity[body]
+    arm = to_double(x1) - centre_of(motion.bodies, body, motion.bodies.end[body])
+    return to_single(to_double(wp.spatial_top(twist)) + wp.cross(to_double(wp.spatial_bottom(twist)), arm))
 
 
 @wp.kernel(enable_backward=False)
@@ -113,13 +131,8 @@ def _write_end(
     velocity = (x1 - x0) / dt
     if i < particle_qd.shape[0]:
         velocity = particle_qd[i]
-    elif motion.bodies.of_vertex:
-        body = motion.bodies.of_vertex[i]
-        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-            twist = motion.bodies.velocity[body]
-            arm = to_double(x1) - centre_of(motion.bodies, body, motion.bodies.end[body])
-            turning = wp.cross(to_double(wp.spatial_bottom(twist)), arm)
-            velocity = to_single(to_double(wp.spatial_top(twist)) + turning)
+    elif moves_with_body(motion, i):
+        velocity = wanted_velocity(motion, i, x1)
     finite = wp.isfinite(x1) and wp.isfinite(velocity)
     motion.x1[i] = wp.where(finite, x1, x0)
     motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
@@ -204,12 +217,16 @@ class ModelMotion:
         """
         self._mesh.check_lengths(particle_q, body_q, self.vertices.x1)
         if self._moves_bodies:
-            model = self._mesh.model
-            inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
-            wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device)
+            self.set_body_ends(body_q, body_qd)
         inputs = [self._placement(particle_q, body_q), particle_qd, dt]
         outputs = [self.vertices, self.planes.end]
         wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self._mesh.device)
+
+    def set_body_ends(self, body_q: wp.array[wp.transform], body_qd: wp.array[wp.spatial_vector]) -> None:
+        """Copies the wanted poses and velocities of bodies, but not the positions of their vertices."""
+        model = self._mesh.model
+        inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
+        wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device)
 
     def _placement(self, particle_q, body_q):
         mesh, placement = self._mesh, _Placement()

@@ -271,6 +271,11 @@ class Response:
         self._project(self._sweep_positions, tolerance=tolerance * self._tolerance)
         self._change_velocities(dt)
 
+    def begin_bodies(self, motion: ModelMotion) -> None:
+        """Initializes the bodies of ``vertices`` by what a motion wants of them."""
+        self._motion = motion
+        self._launch_over_bodies(begin_bodies)
+
     def inspect(self, motion: ModelMotion) -> Resolution:
         """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
 
@@ -295,8 +300,8 @@ class Response:
         outputs = [self.vertices, self.constraints, self._dividing_planes, self.progress]
         size = max(len(self.vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
+        self.begin_bodies(motion)
         if self._bodies:
-            self._launch_over_bodies(begin_bodies)
             self.vertices.bodies.first_hit.fill_(int(NEVER))
         wp.capture_if(self.status.recount, self._count_crossings)
 

@@ -213,7 +213,7 @@ class SolverCCD(SolverBase, CouplingHooks):
                 against the contacts, see :mod:`.coupling`; None for none.
             bodies: Whether contacts with particles push dynamic bodies: their poses and velocities change by mass and
                 inertia, with friction and restitution, so that momentum is kept. Default: true for solvers that keep
-                bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) without ``coupling`` and
+                bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) without
                 ``requires_grad``. True for another solver needs one that reads ``body_q`` and ``body_qd`` of the state.
                 Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies that
                 are all kinematic at construction stay so.
@@ -226,8 +226,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 then have no meaning, and must not be given.
 
         Raises:
-            ValueError: If a number or the friction of a shape that collides with particles is out of range, an
-                argument is given without a response, or bodies are to be moved in coupled steps.
+            ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
+                argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
                 solver, or one that moves bodies, is to be differentiated.
         """
@@ -259,7 +259,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
-        self._moves_bodies = self._find_moves_bodies(bodies, coupling)
+        self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(mesh, *self._friction(friction), moves_bodies=self._moves_bodies)
         self._response = Response(
             mesh,
@@ -275,18 +275,17 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
-            self._coupling = Coupling(self._step_inner, solver, mesh, self._motion, self._response, coupling)
+            arguments = self._step_inner, solver, mesh, self._motion, self._response, coupling
+            self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
         self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._limited is not None)
 
-    def _find_moves_bodies(self, bodies, coupling):
+    def _find_moves_bodies(self, bodies):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
         model, mesh, solver = self.model, self.mesh, self.solver
-        if bodies is None and (coupling is not None or model.requires_grad):
+        if bodies is None and model.requires_grad:
             return False
-        if bodies and coupling is not None:
-            raise ValueError("coupled steps move no bodies: omit coupling, or bodies")
         if bodies and model.requires_grad:
             raise NotImplementedError("steps that move bodies carry no gradients: omit bodies, or requires_grad")
         if not self.respond or bodies is False or not model.body_count:
