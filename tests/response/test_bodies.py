@@ -335,3 +335,97 @@ def test_arguments_that_do_not_go_together(device):
     differentiable = builder.finalize(device=device, requires_grad=True)
     with pytest.raises(NotImplementedError, match="gradients"):
         bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), bodies=True)
+
+
+def boxes(device, *, velocities, positions, static=False):
+    """Boxes in a row without gravity, each smaller than the last, a static one before them if asked; cloth far away."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 5.0))
+    half = 0.1
+    if static:
+        at = wp.transform(wp.vec3(-0.3, 0.01, 0.02), wp.quat_identity())
+        builder.add_shape_box(-1, xform=at, hx=half, hy=half, hz=half)
+    for position in positions:
+        add_body(builder, "box", position, inertia=(7e-3, 7e-3, 7e-3), hx=half, hy=half, hz=half)
+        half -= 0.03  # edges of two boxes are not in one line
+    return finalize(builder, [[*velocity, 0.0, 0.0, 0.0] for velocity in velocities], device)
+
+
+def count_body_collisions(rollout):
+    """Collisions of the last step between vertices of two bodies, or of a body and a static shape."""
+    mesh = rollout.mesh
+    body = np.full(mesh.vertex_count, -2)
+    body[rollout.model.particle_count :] = mesh.shape_vertices.body
+    c = rollout.detector.detect(rollout.start, rollout.vertices(rollout.states[0]))
+    vertex_face = np.stack([c.vertex_face[:, 0], mesh.faces[c.vertex_face[:, 1]][:, 0]], axis=1)
+    edge_edge = mesh.edges[c.edge_edge][:, :, 0]
+    pairs = body[np.concatenate([vertex_face.reshape(-1, 2), edge_edge.reshape(-1, 2)])]
+    return int((pairs[:, 0] != pairs[:, 1]).sum())
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_bodies_that_pass_each_other_are_reported(static, device):
+    first = [] if static else [(-0.3, 0.01, 0.02)]
+    model = boxes(
+        device, positions=[*first, (0.0, 0.0, 0.0)], velocities=[*[(0, 0, 0)] * len(first), (-3.0, 0, 0)], static=static
+    )
+    rollout = Rollout(model, bsc.SolverCCD(free(model)))
+    for _ in range(14):
+        rollout.step()
+        count = count_body_collisions(rollout)
+        assert (count > 0) == (rollout.solver.report.body_contacts > 0)
+        assert rollout.solver.report.certified and rollout.solver.report.hits == 0
+        if count:  # from now on they cross at the start of a step
+            break
+    assert count > 0
+    np.testing.assert_allclose(rollout.states[0].body_qd.numpy()[-1, :3], [-3.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_filtered_pairs_are_not_reported(device):
+    model = boxes(device, positions=[(-0.3, 0.01, 0.02), (0.0, 0.0, 0.0)], velocities=[(0, 0, 0), (-3.0, 0, 0)])
+    groups = model.shape_collision_group.numpy()
+    for group, other in ((0, 1), (1, 2), (-1, -1)):
+        model.shape_collision_group.assign(np.array([group, other], dtype=np.int32))
+        rollout = Rollout(model, bsc.SolverCCD(free(model), bodies=True))
+        for _ in range(10):
+            rollout.step()
+            assert rollout.solver.report.body_contacts == rollout.solver.report.hits == 0
+    model.shape_collision_group.assign(groups)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 1.0])
+def test_bodies_push_each_other_if_asked(restitution, device):
+    """Two boxes of one mass: the faster one stops and the other flies on, or both fly on together."""
+    model = boxes(device, positions=[(-0.18, 0.0, 0.0), (0.0, 0.0, 0.0)], velocities=[(0, 0, 0), (-3.0, 0, 0)])
+    solver = bsc.SolverCCD(free(model), bodies=True, restitution=restitution, friction=0.0)
+    rollout = Rollout(model, solver)
+    linear, angular = momenta(model, rollout.states[0])
+    hits = 0
+    for _ in range(6):
+        rollout.step()
+        hits += solver.report.hits
+        assert solver.report.certified and solver.report.body_contacts == 0
+        assert count_body_collisions(rollout) == 0
+        check_vertices(rollout)
+    assert hits > 0
+    new_linear, new_angular = momenta(model, rollout.states[0])
+    assert np.linalg.norm(new_linear - linear) < 1e-5 * np.linalg.norm(linear)
+    assert np.linalg.norm(new_angular - angular) < 1e-5 * np.linalg.norm(linear)
+    twists = rollout.states[0].body_qd.numpy()
+    np.testing.assert_allclose(twists[1, 0] - twists[0, 0], 3.0 * restitution, atol=0.02)
+
+
+def test_a_box_falls_on_a_static_one_and_stays(device):
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 5.0))
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.3, hy=0.3, hz=0.1)
+    add_body(builder, "box", (0.013, 0.007, 0.055), inertia=(2e-3, 2e-3, 2e-3), hx=0.05, hy=0.05, hz=0.05)
+    model = finalize(builder, [6 * [0.0]], device)
+    solver = bsc.SolverCCD(free(model), bodies=True)
+    rollout = Rollout(model, solver)
+    for _ in range(60):
+        rollout.step()
+        assert solver.report.certified and count_body_collisions(rollout) == 0
+    pose, twist = rollout.states[0].body_q.numpy()[0], rollout.states[0].body_qd.numpy()[0]
+    assert 0.05 < pose[2] < 0.0505 and np.abs(twist).max() < 0.05
+    assert len(solver.report.uncertified_bodies) == 0

@@ -126,7 +126,9 @@ def body_inverse_masses(
             linear = lever.weight * lever.weight * wp.float64(motion.bodies.inverse_mass[lever.body])
             turned = wp.cross(inverse_inertia * wp.cross(lever.arm, normal), lever.arm)
             turned_along = wp.dot(turned, normal)
-            product = wp.length(turned - turned_along * normal)
+            product = _ZERO
+            if constraints.friction[i] > 0.0:
+                product = wp.length(turned - turned_along * normal)
             trace = wp.trace(inverse_inertia) * wp.length_sq(lever.arm)
             trace -= wp.dot(lever.arm, inverse_inertia * lever.arm)
             along += parts * (linear + turned_along + product)

@@ -39,7 +39,12 @@ class Bodies:
     Velocities are those of centres of mass, as in ``newton.State.body_qd``.
     """
 
+    responds: int  # 1 if the response keeps bodies apart from each other and from static shapes
     of_vertex: wp.array[int]  # body of a vertex of a shape, -1 of particles and of static shapes
+    shape: wp.array[int]  # of a vertex of a shape
+    shape_flags: wp.array[int]  # as in newton.Model, of shapes
+    shape_collision_group: wp.array[int]
+    filtered: wp.array[wp.int64]  # pairs of shapes that do not collide, the smaller times their number plus the other
     particle_count: int  # the vertices of shapes follow the particles
     position: wp.array[wp.vec3]  # of a vertex of a shape, in the frame of its body [m]
     com: wp.array[wp.vec3]  # centre of mass in the frame of the body [m]
@@ -143,6 +148,8 @@ class SolveStatus:
     excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
+    body_hits: wp.array[int]  # contacts between bodies found so far by the detection in progress
+    body_contacts: wp.array[int]  # contacts between bodies that the last detection found, left to the inner solver
     crossings: wp.array[int]  # edges that cross faces at the start
     projecting: wp.array[int]  # 1 if the last detection added constraints
     recount: wp.array[int]  # 1 if crossings may have changed since they were counted

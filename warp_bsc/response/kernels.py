@@ -30,7 +30,7 @@ from .constraints import (
     widened,
 )
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
-from .exclusion import crossed_at_start, is_movable
+from .exclusion import bodies_meet, crossed_at_start, is_movable
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = [
@@ -71,6 +71,8 @@ def begin_step(
         status.certified[0] = 0
         status.hits[0] = 0
         status.crossed_hits[0] = 0
+        status.body_hits[0] = 0
+        status.body_contacts[0] = 0
         status.first_hits[0] = 0
         status.counted[0] = 0
         status.remaining[0] = 0
@@ -119,6 +121,11 @@ def _collect_contact(
         return
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
+        if bodies_meet(motion, corners):
+            if not crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
+                wp.atomic_add(progress.status.body_hits, 0, 1)
+                for j in range(4):
+                    vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
     may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
     if may_cross and crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
@@ -233,6 +240,7 @@ def decide(
         status.undetected[0] = 1
         status.hits[0] = 0
         status.crossed_hits[0] = 0
+        status.body_hits[0] = 0
         status.iteration[0] = wp.max(status.iteration[0], progress.max_iterations)
         return
     overflowed = overflowed and not can_search
@@ -241,6 +249,8 @@ def decide(
     status.remaining[0] = hits
     status.excluded[0] = status.crossed_hits[0]
     status.crossed_hits[0] = 0
+    status.body_contacts[0] = status.body_hits[0]
+    status.body_hits[0] = 0
     if status.counted[0] == 0:
         status.first_hits[0] = status.first_hits[0] + hits
         status.counted[0] = 1

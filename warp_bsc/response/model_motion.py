@@ -154,6 +154,7 @@ class ModelMotion:
         plane_friction: wp.array[float],
         *,
         moves_bodies: bool = False,
+        responds_to_bodies: bool = False,
     ):
         """Allocates buffers.
 
@@ -162,6 +163,7 @@ class ModelMotion:
             friction: Coefficients of its vertices; that of a contact is the geometric mean.
             plane_friction: Coefficients of its planes.
             moves_bodies: Whether the response can move bodies.
+            responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
         """
         self._mesh = mesh
         self.vertices = vertices = Motion()
@@ -177,11 +179,17 @@ class ModelMotion:
         self._moves_bodies = moves_bodies
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
+            vertices.bodies.responds = int(responds_to_bodies)
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
         mesh, bodies = self._mesh, Bodies()
         model, device = mesh.model, mesh.device
+        pairs = np.sort(np.array(list(model.shape_collision_filter_pairs), dtype=np.int64).reshape(-1, 2), axis=1)
+        filtered = np.unique(model.shape_count * pairs[:, 0] + pairs[:, 1])
+        bodies.filtered = wp.array(filtered, dtype=wp.int64, device=device)
+        bodies.shape = mesh.device_shape_vertices.shape
+        bodies.shape_flags, bodies.shape_collision_group = model.shape_flags, model.shape_collision_group
         bodies.particle_count = model.particle_count
         of_vertex = np.concatenate([np.full(model.particle_count, -1, dtype=np.int32), mesh.shape_vertices.body])
         bodies.of_vertex = wp.array(of_vertex, dtype=int, device=device)
@@ -222,7 +230,7 @@ class ModelMotion:
         outputs = [self.vertices, self.planes.end]
         wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self._mesh.device)
 
-    def set_body_ends(self, body_q: wp.array[wp.transform], body_qd: wp.array[wp.spatial_vector]) -> None:
+    def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
         """Copies the wanted poses and velocities of bodies, but not the positions of their vertices."""
         model = self._mesh.model
         inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]

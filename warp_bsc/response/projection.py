@@ -35,7 +35,8 @@ MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
 """Most sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one
 active set, after which the device checks whether a constraint is still active."""
 SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 16, 12
-"""Most sweeps in worlds without fast contacts: dividing planes resolve what they leave."""
+"""Most sweeps over constraints that move no body in worlds without fast contacts: dividing planes resolve what they
+leave."""
 
 _RELAXATION = wp.constant(wp.float64(1.5))
 """Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
@@ -174,20 +175,27 @@ def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: i
 
 
 @wp.func
-def _tolerance_of(motion: Motion, constraints: Constraints, i: int, tolerance: wp.float64) -> wp.float64:
-    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
+def _moves_body(motion: Motion, constraints: Constraints, i: int) -> bool:
+    """Returns whether a constraint moves a body."""
     if motion.bodies.of_vertex:
         for side in range(2):
             body = motion.bodies.of_vertex[constraints.vertices[i][3 * side]]
             if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                return _OF_BODIES * tolerance
-    return tolerance
+                return True
+    return False
 
 
 @wp.func
-def _max_sweeps(progress: Progress, world: int, slow: int) -> int:
-    """Returns the most sweeps in a world, which are ``slow`` where it has no fast contacts."""
-    return wp.where(progress.fast[world] == 1, MAX_SWEEPS, slow)
+def _tolerance_of(motion: Motion, constraints: Constraints, i: int, tolerance: wp.float64) -> wp.float64:
+    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
+    return wp.where(_moves_body(motion, constraints, i), _OF_BODIES, _ONE) * tolerance
+
+
+@wp.func
+def _max_sweeps(motion: Motion, constraints: Constraints, progress: Progress, i: int, slow: int) -> int:
+    """Returns the most sweeps of a constraint: ``slow`` if it moves no body, and its world has no fast contacts."""
+    world = motion.world[constraints.vertices[i][0]]
+    return wp.where(progress.fast[world] == 1 or _moves_body(motion, constraints, i), MAX_SWEEPS, slow)
 
 
 @wp.func
@@ -248,7 +256,7 @@ def activate_position_constraints(
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
-    past = progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_position_sweeps)
+    past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
         return
     distance = gap(vertices, constraints, i)
@@ -314,8 +322,7 @@ def project_positions(
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(constraints, progress, i)
-    world = motion.world[constraints.vertices[i][0]]
-    max_sweeps = _max_sweeps(progress, world, progress.slow_position_sweeps)
+    max_sweeps = _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     momentum = _momentum(constraints, progress, i, max_sweeps)
     if pushes_only:
         violated = gap(vertices, constraints, i) < _ZERO
@@ -398,8 +405,7 @@ def activate_velocity_constraints(
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    world = motion.world[constraints.vertices[i][0]]
-    if progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_velocity_sweeps):
+    if progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == _ZERO:
@@ -433,8 +439,7 @@ def project_velocities(
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    world = motion.world[constraints.vertices[i][0]]
-    max_sweeps = _max_sweeps(progress, world, progress.slow_velocity_sweeps)
+    max_sweeps = _max_sweeps(motion, constraints, progress, i, progress.slow_velocity_sweeps)
     momentum = _momentum(constraints, progress, i, max_sweeps)
     old = constraints.velocity_multiplier[i]
     if is_recording(record):

@@ -211,12 +211,15 @@ class SolverCCD(SolverBase, CouplingHooks):
                 ``soft_contact_restitution``.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none.
-            bodies: Whether contacts with particles push dynamic bodies: their poses and velocities change by mass and
-                inertia, with friction and restitution, so that momentum is kept. Default: true for solvers that keep
-                bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) without
-                ``requires_grad``. True for another solver needs one that reads ``body_q`` and ``body_qd`` of the state.
-                Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies that
-                are all kinematic at construction stay so.
+            bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
+                friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
+                keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) and the model has
+                no ``requires_grad``; contacts between bodies are left to the inner solver, and those that its motion
+                passes are counted, see ``report.body_contacts``. True: bodies are kept apart from each other and from
+                static shapes as well, as their flags, groups and filters of collision say, and certified; this needs an
+                inner solver that reads ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic
+                bodies, bodies without mass, static shapes and infinite planes are never pushed, and bodies are not kept
+                out of infinite planes. Bodies that are all kinematic at construction stay so.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
@@ -260,7 +263,9 @@ class SolverCCD(SolverBase, CouplingHooks):
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
         self._moves_bodies = self._find_moves_bodies(bodies)
-        self._motion = ModelMotion(mesh, *self._friction(friction), moves_bodies=self._moves_bodies)
+        self._motion = ModelMotion(
+            mesh, *self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
+        )
         self._response = Response(
             mesh,
             separation=float(separation),
@@ -295,6 +300,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
                 return False
         shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        assert model.body_flags is not None and model.body_inv_mass is not None
         kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
         return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
 
