@@ -118,7 +118,7 @@ def test_a_ball_dropped_on_a_pinned_sheet(device):
 
 
 def test_a_box_at_rest_on_a_sheet(device):
-    """It comes to rest on the pinned sheet that it stretches: after 2 s, it moves by less than 1 mm/s."""
+    """It comes to rest on the pinned sheet that it stretches, and stays: it moves by less than 1 mm/s."""
     builder = newton.ModelBuilder()
     sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
     cloth = {"dim_x": 6, "dim_y": 6, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.002, **STIFF, "tri_kd": 3.0}
@@ -128,9 +128,9 @@ def test_a_box_at_rest_on_a_sheet(device):
     model = finalize(builder, [6 * [0.0]], device)
     rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), friction=0.5))
     rollout.count_collisions = lambda before, after: 0  # once at the end is enough here
-    for step in range(500):
+    for step in range(300):
         rollout.step()
-        if step >= 480:
+        if step >= 280:
             speed = np.linalg.norm(rollout.states[0].body_qd.numpy()[0, :3])
             assert speed < 1e-3, f"{1e3 * speed} mm/s"
     report = rollout.solver.report
@@ -155,8 +155,8 @@ def test_an_impulse_off_the_centre_of_mass(restitution, device):
     assert rollout.solver.report.hits > 0 and rollout.collisions == 0 and rollout.solver.report.certified
     impulse = (1.0 + restitution) * speed / (1.0 / mass + arm**2 / inertia[1])
     twist = rollout.states[0].body_qd.numpy()[0]
-    np.testing.assert_allclose(twist[2], -speed + impulse / mass, atol=1e-3 * speed)
-    np.testing.assert_allclose(twist[4], -arm * impulse / inertia[1], rtol=2e-3)
+    np.testing.assert_allclose(twist[2], -speed + impulse / mass, atol=5e-3 * speed)
+    np.testing.assert_allclose(twist[4], -arm * impulse / inertia[1], rtol=5e-3)
     assert rollout.positions.tobytes() == start.tobytes()
 
 
@@ -173,7 +173,7 @@ def test_friction_slows_a_box_on_a_held_sheet(friction, device):
     for _ in range(round(time / DT)):
         rollout.step()
     assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    np.testing.assert_allclose(rollout.states[0].body_qd.numpy()[0, 0], 1.0 - friction * 9.81 * time, atol=0.03)
+    np.testing.assert_allclose(rollout.states[0].body_qd.numpy()[0, 0], 1.0 - friction * 9.81 * time, atol=2e-3)
 
 
 @pytest.mark.parametrize(("speed", "spin"), [(60.0, (0.0, 0.0, 0.0)), (3.0, (100.0, 50.0, 300.0))])

@@ -8,9 +8,6 @@ pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of
 
 import warp as wp
 
-from ..detection.settings import Count
-from ..kernels.pipeline.queues import is_filled
-from ..kernels.signs import FREE
 from .buffers import (
     DIVIDED,
     FROZEN,
@@ -25,7 +22,7 @@ from .buffers import (
     Vertices,
     has_final_velocity,
 )
-from .constraints import NO_CONSTRAINT, TIME_UNITS, Contacts, contact_vertices, to_double, to_single
+from .constraints import NO_CONSTRAINT, TIME_UNITS, to_double, to_single
 from .dividing_planes import DividingPlanes, has_all_planes, share_of_path
 
 __all__ = [
@@ -37,8 +34,6 @@ __all__ = [
     "change_body_velocities",
     "cut_bodies",
     "find_body_shares",
-    "find_first_hits",
-    "follows_a_hit",
     "freeze_undetected_bodies",
     "inertia_at",
     "move_bodies",
@@ -57,7 +52,6 @@ _WHOLE = wp.constant(wp.int64(2**30))
 """The share of a path that is not cut, in units of TIME_UNITS."""
 _FREEZES = wp.constant(wp.int64(-1))
 """In place of a share: the body is frozen."""
-_CONTACTS = wp.constant(int(Count.CONTACTS))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -261,50 +255,6 @@ def sagitta(motion: Motion, vertices: Vertices, corners: wp.vec4i, most: wp.floa
                 arm = to_double(motion.x1[corners[j]]) - vertices.bodies.centre[body]
                 off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
     return wp.min(off, most)
-
-
-@wp.func
-def _units_of_time(time: wp.float64) -> wp.int64:
-    return wp.int64(wp.floor(TIME_UNITS * time))
-
-
-@wp.func
-def _is_of_body_and_particles(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether one of two elements is of a body that can be moved, and the other is of particles."""
-    for side in range(2):
-        body = motion.bodies.of_vertex[corners[3 * side]]
-        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-            return corners[3 - 3 * side] < motion.bodies.particle_count
-    return False
-
-
-@wp.kernel(**_KERNEL)
-def find_first_hits(motion: Motion, vertices: Vertices, vertex_face: Contacts):
-    """Finds when each vertex first meets a face, between bodies and particles."""
-    i = wp.tid()
-    if not is_filled(i, vertex_face.pairs, vertex_face.counts, _CONTACTS) or int(vertex_face.status[i]) == FREE:
-        return
-    corners = contact_vertices(vertex_face, i)
-    if _is_of_body_and_particles(motion, corners):
-        wp.atomic_min(vertices.bodies.first_hit, corners[0], _units_of_time(vertex_face.toi[i]))
-
-
-@wp.func
-def follows_a_hit(
-    motion: Motion, vertices: Vertices, corners: wp.vec4i, coordinates: wp.vec3d, toi: wp.float64
-) -> bool:
-    """Returns whether two edges, of a body and of particles, meet only because an end of one has passed a face before.
-
-    The edge of a box, below whose end a sheet is, then runs into the edges of that sheet from the side. To stop the end
-    at the face resolves both; if not, the next detection finds the two edges again.
-    """
-    if not motion.bodies.of_vertex or not _is_of_body_and_particles(motion, corners):
-        return False
-    for edge in range(2):
-        end = corners[2 * edge + wp.where(coordinates[edge] < wp.float64(0.5), 0, 1)]
-        if vertices.bodies.first_hit[end] < _units_of_time(toi):
-            return True
-    return False
 
 
 @wp.kernel(**_KERNEL)

@@ -73,7 +73,6 @@ class MovedBodies:
     share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see bodies.find_body_shares
     loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
-    first_hit: wp.array[wp.int64]  # of each vertex, when it first meets a face of the other side, in units of time
 
 
 @wp.struct
@@ -201,11 +200,11 @@ def allocate_vertices(count, device) -> Vertices:
     return vertices
 
 
-def allocate_bodies(count, vertices, device) -> MovedBodies:
-    """Returns bodies that nothing has moved, and ``vertices`` vertices that meet nothing."""
+def allocate_bodies(count, device) -> MovedBodies:
+    """Returns bodies that nothing has moved."""
     bodies = MovedBodies()
     for name, var in MovedBodies.vars.items():
-        shape = (count, 6) if var.type.ndim == 2 else vertices if name == "first_hit" else count
+        shape = (count, 6) if var.type.ndim == 2 else count
         setattr(bodies, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
     return bodies
 

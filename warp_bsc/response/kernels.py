@@ -5,7 +5,7 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
-from .bodies import follows_a_hit, sagitta
+from .bodies import sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
@@ -31,6 +31,7 @@ from .constraints import (
 )
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
 from .exclusion import bodies_meet, crossed_at_start, is_movable
+from .hidden_edges import are_hidden
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = [
@@ -151,8 +152,8 @@ def _collect_contact(
     else:
         progress.status.projecting[0] = 1
         if iteration == 0 and contacts.edges == 1:
-            if follows_a_hit(motion, vertices, corners, contacts.coordinates[i], contacts.toi[i]):
-                return
+            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
+                return  # the next detection finds it, if it is still there
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     weights = contact_weights(contacts.edges, contacts.coordinates[i])
     target = widened(separation, progress)

@@ -17,7 +17,6 @@ from .bodies import (
     change_body_velocities,
     cut_bodies,
     find_body_shares,
-    find_first_hits,
     freeze_undetected_bodies,
     move_bodies,
     move_to_end,
@@ -25,7 +24,6 @@ from .bodies import (
     set_vertex_velocities,
 )
 from .buffers import (
-    NEVER,
     Constraints,
     Progress,
     SolveStatus,
@@ -159,7 +157,7 @@ class Response:
         self._movable = mesh.model.particle_count
         self._bodies = mesh.model.body_count if moves_bodies else 0
         if moves_bodies:
-            self.vertices.bodies = allocate_bodies(self._bodies, mesh.vertex_count, device)
+            self.vertices.bodies = allocate_bodies(self._bodies, device)
         self._shape_vertices = mesh.vertex_count - self._movable
         self._connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = mesh.device_faces, mesh.device_edges
@@ -301,8 +299,6 @@ class Response:
         size = max(len(self.vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
         self.begin_bodies(motion)
-        if self._bodies:
-            self.vertices.bodies.first_hit.fill_(int(NEVER))
         wp.capture_if(self.status.recount, self._count_crossings)
 
     def _count_crossings(self):
@@ -459,8 +455,6 @@ class Response:
             wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
         contacts = list(self._contacts())
         queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
-        if self._bodies and not refit:
-            self._launch_over(find_first_hits, queues[:1], [motion, vertices, contacts[0]])
         inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
         self._launch_over(collect_contacts, queues, [*inputs, *self._fill_of_queues()])
         if self._recorder is not None:
