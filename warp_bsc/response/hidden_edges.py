@@ -9,7 +9,7 @@ from .exclusion import Connectivity
 __all__ = ["are_hidden"]
 
 _MOST_BEND, _LEAST_BEND = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e-3))
-"""Sines of the angles by which a sheet may bend towards a body, and a body towards a sheet: it does not but by rounding."""
+"""Sines of the angles by which a sheet may bend towards a body, and a body towards a sheet, which rounding allows."""
 
 
 @wp.func
