@@ -1,4 +1,4 @@
-"""Projection: Jacobi sweeps over constraints that move vertices, and then change velocities, until all are met."""
+"""Projection: Jacobi sweeps over constraints that move vertices and bodies, and then change velocities."""
 
 import warp as wp
 

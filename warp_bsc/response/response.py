@@ -111,6 +111,9 @@ class Response:
     is not enough, frozen. This ends, because vertices that stood apart and stand still do not collide. A detection
     whose queues are too small in a CUDA graph is completed without queues, see :mod:`.queueless`.
 
+    Bodies that can be moved are projected with the particles, each by its pose, see :mod:`.bodies`. One whose vertices
+    are to be divided or frozen goes back along its path as one, and collides with what is left in the next iteration.
+
     If the response is differentiable, paths are truncated before their first contact instead of divided, and a
     detection whose queues are too small freezes all vertices, uncertified.
 
