@@ -36,17 +36,18 @@ class ExampleBase:
         self.sim_time = 0.0
         self.frame = 0
 
-    def start(self, model, solver, camera, clocks=()):
+    def start(self, model, solver, camera, clocks=(), **options):
         """Puts the collision stage behind a solver, unless ``--no-ccd`` is given, and shows the model.
 
         Args:
             model: The model.
-            solver: The inner solver, which needs no contacts.
+            solver: The inner solver, which needs no contacts; or a stage, which stays as it is.
             camera: Position [m], pitch and yaw [degrees].
             clocks: Arrays on the device, besides the states, that a step reads and advances.
+            options: Options of the stage.
         """
         self.model = model
-        self.solver = bsc.SolverCCD(solver) if self.ccd else solver
+        self.solver = bsc.SolverCCD(solver, **options) if self.ccd and not isinstance(solver, bsc.SolverCCD) else solver
         self.state_0, self.state_1 = model.state(), model.state()
         self.control = model.control()
         self.run_frame = bsc.CapturedSteps(self.simulate, self.solver, [self.state_0, *clocks])

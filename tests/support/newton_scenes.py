@@ -118,7 +118,7 @@ def add_plates(builder, gap):
         x, y, _ = builder.particle_q[particle]
         builder.particle_q[particle] = wp.vec3(x, y, 0.01 * float(np.sin(20.0 * x) * np.cos(17.0 * y)))
     for height in plate_heights(gap):
-        body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity()))
+        body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity()), is_kinematic=True)
         builder.add_shape_box(body, hx=0.2, hy=0.2, hz=_HALF_PLATE)
 
 

@@ -1,4 +1,4 @@
-"""Angular momentum: a rigid turn of all vertices that collided removes what the position multipliers added to it.
+"""Angular momentum: a rigid turn of all that collided removes what the position multipliers added to it.
 
 Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
 """
@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from .bodies import centre_of, inertia_at
 from .buffers import DIVIDED, Constraints, Motion, Vertices, has_final_velocity
 from .constraints import relative, to_double, to_single
 from .projection import with_delta
@@ -21,9 +22,11 @@ __all__ = [
     "change_by_turn",
     "is_held",
     "moments",
+    "sum_body_moments",
     "sum_moments",
     "sum_torques",
     "torque_of",
+    "turn_bodies",
     "turn_vertices",
     "turns",
 ]
@@ -61,20 +64,33 @@ def _add(sums: wp.array2d[wp.int64], world: int, added: Any):
 
 @wp.func
 def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
-    """Returns whether a vertex collided, and is free to turn."""
+    """Returns whether a vertex collided, and is free to turn by itself."""
     outcome = vertices.outcome[vertex]
     return motion.inverse_mass[vertex] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
 
 
 @wp.func
-def torque_of(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
-    """Returns the change of angular momentum by a contact between free bodies [kg m^2/s].
+def _body_turns(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Returns whether a body collided, and is free to turn."""
+    outcome = vertices.bodies.outcome[body]
+    return motion.bodies.inverse_mass[body] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
 
-    Position changes across the motion change it, and so do impulses at points that slid apart since the contact.
+
+@wp.func
+def torque_of(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+    """Returns the change of angular momentum by a contact between free vertices and bodies [kg m^2/s].
+
+    Position changes across the motion change it, and so do impulses at points that slid apart since the contact. For
+    the position changes of bodies, see :func:`sum_body_moments`.
     """
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
-    of_positions = wp.cross(constraints.position_multiplier[i], relative(weights, corners, motion.velocity))
+    moving = wp.vec4d(weights)
+    if motion.bodies.of_vertex:
+        for j in range(4):
+            if motion.bodies.of_vertex[corners[j]] >= 0:
+                moving[j] = _ZERO
+    of_positions = wp.cross(constraints.position_multiplier[i], relative(moving, corners, motion.velocity))
     return of_positions + wp.cross(relative(weights, corners, vertices.x1), constraints.velocity_multiplier[i])
 
 
@@ -91,7 +107,12 @@ def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int
     corners = constraints.vertices[i]
     held = corners[0] == corners[1]  # on a plane
     for j in range(4):
-        held = held or (constraints.weights[i][j] != _ZERO and not turns(motion, vertices, corners[j]))
+        free = turns(motion, vertices, corners[j])
+        if motion.bodies.of_vertex:
+            body = motion.bodies.of_vertex[corners[j]]
+            if body >= 0:
+                free = _body_turns(motion, vertices, body)
+        held = held or (constraints.weights[i][j] != _ZERO and not free)
     return held
 
 
@@ -168,12 +189,44 @@ def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int
     _add(sums, world, added)
 
 
+@wp.kernel(**_KERNEL)
+def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the bodies that collided, and the torques by changes of their poses."""
+    body = wp.tid()
+    world = wp.max(motion.bodies.world[body], 0)
+    if not _body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+        return
+    mass = wp.float64(motion.bodies.mass[body])
+    x = vertices.bodies.centre[body]
+    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
+    half = wp.float64(0.5) * wp.trace(inertia)  # the second moments are half - inertia, without products
+    wanted = motion.bodies.velocity[body]
+    linear = to_double(wp.spatial_top(wanted))
+    angular = to_double(wp.spatial_bottom(wanted))
+    change = to_double(wp.spatial_top(vertices.bodies.velocity[body])) - linear
+    turn = to_double(wp.spatial_bottom(vertices.bodies.velocity[body])) - angular
+    moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
+    torque = mass * wp.cross(moved, linear)
+    torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
+    added = _Sums()
+    for axis in range(3):
+        added[axis] = _units(torque[axis])
+        added[MASS + 1 + axis] = _units(mass * x[axis])
+        added[MASS + 4 + axis] = _units(mass * x[axis] * x[axis] + half - inertia[axis, axis])
+    added[MASS] = _units(mass)
+    added[MASS + 7] = _units(mass * x[1] * x[2] - inertia[1, 2])
+    added[MASS + 8] = _units(mass * x[2] * x[0] - inertia[2, 0])
+    added[MASS + 9] = _units(mass * x[0] * x[1] - inertia[0, 1])
+    added[MASS + 10] = _units(mass * wp.length_sq(change) + wp.dot(turn, inertia * turn))
+    _add(sums, world, added)
+
+
 @wp.func
-def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
-    """Returns the change of velocity at ``x`` by a rigid turn of a world that removes a torque [m/s]."""
+def _turn_of(torque: wp.vec3d, total: Moments):
+    """Returns the turn of a world that removes a torque [rad/s], and the point that it is about."""
     square = total[10]
     if wp.dot(torque, torque) == _ZERO or square <= _ZERO:
-        return wp.vec3d()
+        return wp.vec3d(), wp.vec3d()
     mass = total[0]
     centre = wp.vec3d(total[1], total[2], total[3]) / mass
     squares = wp.vec3d(total[4], total[5], total[6]) - mass * wp.cw_mul(centre, centre)
@@ -194,10 +247,29 @@ def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
         squares[0] + squares[1],
     )
     if wp.determinant(inertia) <= _ZERO:
-        return wp.vec3d()
+        return wp.vec3d(), wp.vec3d()
     turn = -wp.inverse(inertia) * torque
     most = _LIMIT * wp.sqrt(square / wp.max(wp.dot(turn, inertia * turn), wp.float64(1e-300)))
-    return wp.cross(wp.min(most, _ONE) * turn, x - centre)
+    return wp.min(most, _ONE) * turn, centre
+
+
+@wp.func
+def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
+    """Returns the change of velocity at ``x`` by a rigid turn of a world that removes a torque [m/s]."""
+    turn, centre = _turn_of(torque, total)
+    return wp.cross(turn, x - centre)
+
+
+@wp.func
+def _totals(sums: wp.array2d[wp.int64], world: int):
+    """Returns the torque on a world and its moments."""
+    torque = wp.vec3d()
+    for axis in range(3):
+        torque[axis] = wp.float64(sums[world, axis]) / _UNITS
+    total = Moments()
+    for i in range(MOMENTS):
+        total[i] = wp.float64(sums[world, MASS + i]) / _UNITS
+    return torque, total
 
 
 @wp.kernel(**_KERNEL)
@@ -207,11 +279,22 @@ def turn_vertices(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]
     world = motion.world[vertex]
     if not turns(motion, vertices, vertex) or sums[world, HELD] != wp.int64(0):
         return
-    torque = wp.vec3d()
-    for axis in range(3):
-        torque[axis] = wp.float64(sums[world, axis]) / _UNITS
-    total = Moments()
-    for i in range(MOMENTS):
-        total[i] = wp.float64(sums[world, MASS + i]) / _UNITS
+    torque, total = _totals(sums, world)
     change = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
     vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)
+
+
+@wp.kernel(**_KERNEL)
+def turn_bodies(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Turns the bodies that collided as :func:`turn_vertices` does the vertices of their world."""
+    body = wp.tid()
+    world = wp.max(motion.bodies.world[body], 0)
+    if not _body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+        return
+    torque, total = _totals(sums, world)
+    turn, centre = _turn_of(torque, total)
+    change = wp.cross(turn, vertices.bodies.centre[body] - centre)
+    velocity = vertices.bodies.velocity[body]
+    linear = to_double(wp.spatial_top(velocity)) + change
+    angular = to_double(wp.spatial_bottom(velocity)) + turn
+    vertices.bodies.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))

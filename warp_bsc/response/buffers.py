@@ -10,12 +10,15 @@ __all__ = [
     "PROJECTED",
     "TRUNCATED",
     "UNCONSTRAINED",
+    "Bodies",
     "Constraints",
     "Motion",
+    "MovedBodies",
     "Progress",
     "SolveStatus",
     "SweepStatus",
     "Vertices",
+    "allocate_bodies",
     "allocate_constraints",
     "allocate_vertices",
     "has_final_velocity",
@@ -30,6 +33,49 @@ NEVER = wp.constant(wp.int64(2**62))
 
 
 @wp.struct
+class Bodies:
+    """The rigid bodies, and the motion that the inner solver wants of them; empty if the response moves none.
+
+    Velocities are those of centres of mass, as in ``newton.State.body_qd``.
+    """
+
+    responds: int  # 1 if the response keeps bodies apart from each other and from static shapes
+    of_vertex: wp.array[int]  # body of a vertex of a shape, -1 of particles and of static shapes
+    shape: wp.array[int]  # of a vertex of a shape
+    shape_flags: wp.array[int]  # as in newton.Model, of shapes
+    shape_collision_group: wp.array[int]
+    filtered: wp.array[wp.int64]  # pairs of shapes that do not collide, the smaller times their number plus the other
+    particle_count: int  # the vertices of shapes follow the particles
+    position: wp.array[wp.vec3]  # of a vertex of a shape, in the frame of its body [m]
+    com: wp.array[wp.vec3]  # centre of mass in the frame of the body [m]
+    world: wp.array[int]
+    mass: wp.array[float]  # [kg]
+    inertia: wp.array[wp.mat33]  # about the centre of mass, in the frame of the body [kg m^2]
+    inverse_inertia: wp.array[wp.mat33]
+    inverse_mass: wp.array[float]  # [1/kg], 0 where the response cannot move the body in this step
+    start: wp.array[wp.transform]  # pose at the start of the step
+    end: wp.array[wp.transform]  # wanted pose at its end
+    velocity: wp.array[wp.spatial_vector]  # wanted velocity at its end, linear and angular [m/s, rad/s]
+
+
+@wp.struct
+class MovedBodies:
+    """The bodies as the response moves them; empty if it moves none."""
+
+    pose: wp.array[wp.transform]  # at the end of the step
+    velocity: wp.array[wp.spatial_vector]  # at its end
+    centre: wp.array[wp.vec3d]  # of mass, where impulses act: as wanted, and in the end as moved [m]
+    inverse_inertia: wp.array[wp.mat33d]  # there, in the frame of the world
+    active: wp.array[int]  # active constraints of the body
+    moved: wp.array[int]  # 1 if its vertices are to follow
+    delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
+    delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
+    share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see bodies.find_body_shares
+    loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
+
+
+@wp.struct
 class Motion:
     """The motion that the inner solver wants, and properties of its vertices. The response only reads it."""
 
@@ -37,9 +83,10 @@ class Motion:
     x1: wp.array[wp.vec3]  # wanted positions at its end [m]
     velocity: wp.array[wp.vec3]  # wanted velocities at its end [m/s]
     is_lost: wp.array[int]  # 1 where what was wanted is not finite: the vertex stands
-    inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved
+    inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved by itself
     friction: wp.array[float]  # coefficient
     world: wp.array[int]
+    bodies: Bodies
 
 
 @wp.struct
@@ -55,6 +102,7 @@ class Vertices:
     first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST
+    bodies: MovedBodies
 
 
 @wp.struct
@@ -102,6 +150,8 @@ class SolveStatus:
     excluded: wp.array[int]  # contacts that the last detection found, of elements that crossed at the start
     newly_frozen: wp.array[int]  # vertices that this iteration froze
     undetected: wp.array[int]  # 1 if the last detection was incomplete
+    body_hits: wp.array[int]  # contacts between bodies found so far by the detection in progress
+    body_contacts: wp.array[int]  # contacts between bodies that the last detection found, left to the inner solver
     crossings: wp.array[int]  # edges that cross faces at the start
     projecting: wp.array[int]  # 1 if the last detection added constraints
     recount: wp.array[int]  # 1 if crossings may have changed since they were counted
@@ -152,6 +202,15 @@ def allocate_vertices(count, device) -> Vertices:
     vertices.first_active = wp.full(count, -1, dtype=int, device=device)
     vertices.first_contact = wp.full(count, int(NEVER), dtype=wp.int64, device=device)
     return vertices
+
+
+def allocate_bodies(count, device) -> MovedBodies:
+    """Returns bodies that nothing has moved."""
+    bodies = MovedBodies()
+    for name, var in MovedBodies.vars.items():
+        shape = (count, 6) if var.type.ndim == 2 else count
+        setattr(bodies, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
+    return bodies
 
 
 def allocate_constraints(capacity, device) -> Constraints:

@@ -32,6 +32,7 @@ __all__ = [
     "feasible_in_contact",
     "gap",
     "has_overflowed",
+    "inverse_mass_of",
     "is_dividing",
     "is_excluded",
     "is_projecting",
@@ -147,6 +148,16 @@ def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -
 
 
 @wp.func
+def inverse_mass_of(motion: Motion, vertex: int) -> float:
+    """Returns the inverse mass of a vertex, or of the body that it moves with [1/kg]; 0 where nothing can move it."""
+    if motion.bodies.of_vertex:
+        body = motion.bodies.of_vertex[vertex]
+        if body >= 0:
+            return motion.bodies.inverse_mass[body]
+    return motion.inverse_mass[vertex]
+
+
+@wp.func
 def count_contact(progress: Progress, world: int):
     """Counts a contact that a detection found."""
     wp.atomic_add(progress.status.hits, 0, 1)
@@ -233,7 +244,7 @@ def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.
     for j in range(4):
         vertex = corners[j]
         x = motion.x0[vertex]
-        if motion.inverse_mass[vertex] == 0.0:
+        if inverse_mass_of(motion, vertex) == 0.0:
             moves = moves or wp.length_sq(motion.x1[vertex] - x) > 0.0
             x = motion.x1[vertex]
         end += weights[j] * to_double(x)

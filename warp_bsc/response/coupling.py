@@ -20,7 +20,7 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import PLANE_CONTACT, approach_of
 from .model_mesh import ModelMesh
-from .model_motion import ModelMotion
+from .model_motion import ModelMotion, moves_with_body, wanted_velocity
 from .response import Resolution, Response
 
 __all__ = ["Coupling"]
@@ -85,7 +85,10 @@ def _start_substep(
     substep_end: wp.array[wp.vec4d],
     vertices: Vertices,
 ):
-    """Writes the motion of a substep: particles go where the inner solver wants them, shapes a share of their way."""
+    """Writes the motion of a substep.
+
+    Particles, and bodies that the response can move, go where the inner solver wants them, shapes a share of their way.
+    """
     i = wp.tid()
     before = float(substeps - remaining[0]) / float(substeps)
     after = float(substeps - remaining[0] + 1) / float(substeps)
@@ -106,6 +109,11 @@ def _start_substep(
             x1 = x0
             velocity = wp.vec3()
             lost = 1
+    elif moves_with_body(substep, i):
+        x0 = substep.x0[i]
+        place = i - motion.bodies.particle_count
+        x1 = wp.transform_point(substep.bodies.end[motion.bodies.of_vertex[i]], motion.bodies.position[place])
+        velocity = wanted_velocity(substep, i, x1)
     else:
         path = motion.x1[i] - motion.x0[i]
         x0 = motion.x0[i] + before * path
@@ -167,17 +175,40 @@ def _end_substep(
     particle_qd: wp.array[wp.vec3],
 ):
     """Makes the end of a substep the start of the next."""
-    particle = wp.tid()
-    if particle == 0:
+    vertex = wp.tid()
+    if vertex == 0:
         remaining[0] = remaining[0] - 1
-    substep.x0[particle] = vertices.x1[particle]
-    particle_q[particle] = vertices.x1[particle]
-    particle_qd[particle] = vertices.velocity[particle]
+    if vertex < particle_q.shape[0]:
+        substep.x0[vertex] = vertices.x1[vertex]
+        particle_q[vertex] = vertices.x1[vertex]
+        particle_qd[vertex] = vertices.velocity[vertex]
+    elif moves_with_body(substep, vertex):
+        substep.x0[vertex] = vertices.x1[vertex]
+
+
+@wp.kernel(**_KERNEL)
+def _end_body_substep(
+    # in
+    substep: Motion,
+    vertices: Vertices,
+    # out
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_q_prev: wp.array[wp.transform],
+):
+    """Makes the poses and velocities at the end of a substep those at the start of the next."""
+    body = wp.tid()
+    if substep.bodies.inverse_mass[body] > 0.0:
+        body_q[body] = vertices.bodies.pose[body]
+        body_qd[body] = vertices.bodies.velocity[body]
+        if body_q_prev:
+            body_q_prev[body] = vertices.bodies.pose[body]
 
 
 @wp.kernel(**_KERNEL)
 def _move_bodies(
     # in
+    motion: Motion,
     body_q_start: wp.array[wp.transform],
     body_q_end: wp.array[wp.transform],
     substeps: int,
@@ -186,8 +217,11 @@ def _move_bodies(
     body_q_in: wp.array[wp.transform],
     body_q_out: wp.array[wp.transform],
 ):
-    """Writes the poses of bodies at both ends of a substep, between those of the whole step."""
+    """Writes poses at both ends of a substep, between those of the whole step, of bodies that cannot be moved."""
     body = wp.tid()
+    if motion.bodies.of_vertex:
+        if motion.bodies.inverse_mass[body] > 0.0:
+            return
     for end in range(2):
         share = float(substeps - remaining[0] + end) / float(substeps)
         start_pose = body_q_start[body]
@@ -228,6 +262,39 @@ def _end_substeps(
 
 
 @wp.kernel(**_KERNEL)
+def _end_body_substeps(
+    # in
+    is_coupled: wp.array[int],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    # in and out
+    motion: Motion,
+    # out
+    body_q_out: wp.array[wp.transform],
+    body_qd_out: wp.array[wp.spatial_vector],
+):
+    """Makes the poses after the substeps the wanted ones, in worlds that have constraints."""
+    body = wp.tid()
+    if motion.bodies.inverse_mass[body] == 0.0 or is_coupled[wp.max(motion.bodies.world[body], 0)] == 0:
+        return
+    motion.bodies.end[body] = body_q[body]
+    motion.bodies.velocity[body] = body_qd[body]
+    body_q_out[body] = body_q[body]
+    body_qd_out[body] = body_qd[body]
+
+
+@wp.kernel(**_KERNEL)
+def _place_bodies(motion: Motion):
+    """Writes the wanted positions and velocities of the vertices of bodies."""
+    place = wp.tid()
+    vertex = motion.bodies.particle_count + place
+    if moves_with_body(motion, vertex):
+        x1 = wp.transform_point(motion.bodies.end[motion.bodies.of_vertex[vertex]], motion.bodies.position[place])
+        motion.x1[vertex] = x1
+        motion.velocity[vertex] = wanted_velocity(motion, vertex, x1)
+
+
+@wp.kernel(**_KERNEL)
 def _restore_hits(detected: wp.array[int], progress: Progress):
     """Makes the contacts of the step the inner solver wanted those that the status counts."""
     progress.status.first_hits[0] = detected[1]
@@ -236,10 +303,10 @@ def _restore_hits(detected: wp.array[int], progress: Progress):
 class Coupling:
     """Takes steps that collide again in substeps, in which the inner solver and a projection alternate.
 
-    Worlds without contacts keep what the inner solver made of the whole step, bit by bit. The bodies of all worlds do:
-    in the substeps, they move evenly between their poses at both ends. Arrays of the inner solver are restored after
-    the substeps, so that histories and clocks advance once a step. Options of a step, such as observables, are those of
-    the whole step.
+    Worlds without contacts keep what the inner solver made of the whole step, bit by bit. So do, in all worlds, bodies
+    that the response cannot move: in the substeps, they move evenly between their poses at both ends. Arrays of the
+    inner solver are restored after the substeps, so that histories and clocks advance once a step. Options of a step,
+    such as observables, are those of the whole step.
 
     An explicit inner solver is coupled as well, though it needs it less: it is stable at small steps only.
 
@@ -258,6 +325,8 @@ class Coupling:
         motion: ModelMotion,
         response: Response,
         substeps: int,
+        *,
+        moves_bodies: bool = False,
     ):
         """Allocates buffers.
 
@@ -268,11 +337,13 @@ class Coupling:
             motion: The motion of the whole step.
             response: The response.
             substeps: Number of substeps, at least 2.
+            moves_bodies: Whether the response can move bodies.
         """
         self.substeps = substeps
         self._step, self._solver = step, solver
         self._mesh, self._motion, self._response = mesh, motion, response
-        self._substep = ModelMotion(mesh, motion.vertices.friction, motion.planes.friction)
+        self._moves_bodies = moves_bodies
+        self._substep = ModelMotion(mesh, motion.vertices.friction, motion.planes.friction, moves_bodies=moves_bodies)
         model, device = mesh.model, mesh.device
         self._start, self._in, self._out = model.state(), model.state(), model.state()
         self._histories: dict[str, wp.array] = {}  # copies of arrays of the inner solver
@@ -282,6 +353,11 @@ class Coupling:
         self._active = wp.zeros(1, dtype=int, device=device)
         self._allocates = type(solver) not in _ALLOCATION_FREE or solver.collision_pipeline is not None
         self._histories_of_solver()
+
+    @property
+    def _body_q_prev(self):
+        """The poses from which VBD takes velocities; None for other solvers."""
+        return getattr(self._solver, "body_q_prev", None)
 
     def save(self, state: newton.State) -> None:
         """Copies the state at the start of the step, before the inner solver changes it."""
@@ -345,6 +421,8 @@ class Coupling:
             wp.copy(saved, array)
         self._in.assign(self._start)
         wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
+        if self._moves_bodies and self._body_q_prev is not None:
+            wp.copy(self._body_q_prev, self._start.body_q)
         arguments = {"body_q": state.body_q, "control": control, "contacts": contacts, "dt": dt}
         if mesh.device.is_capturing and self._allocates:
             for _ in range(self.substeps):
@@ -357,6 +435,11 @@ class Coupling:
         inputs = [self._is_coupled, self._in.particle_q, self._in.particle_qd]
         outputs = [self._motion.vertices, state.particle_q, state.particle_qd, response.vertices]
         self._launch(_end_substeps, mesh.vertex_count, inputs, outputs)
+        if self._moves_bodies:
+            motion = self._motion.vertices
+            inputs = [self._is_coupled, self._in.body_q, self._in.body_qd, motion]
+            self._launch(_end_body_substeps, mesh.model.body_count, inputs, [state.body_q, state.body_qd])
+            self._launch(_place_bodies, len(mesh.shape_vertices.body), [motion], [])
 
     def _take_substep(self, body_q, control, contacts, dt):
         """Steps the inner solver, and projects its motion onto the constraints."""
@@ -364,10 +447,15 @@ class Coupling:
         start, end = self._in, self._out
         particle_q, particle_qd = start.particle_q, start.particle_qd
         if mesh.model.body_count:
-            inputs = [self._start.body_q, body_q, self.substeps, self._remaining]
+            inputs = [motion.vertices, self._start.body_q, body_q, self.substeps, self._remaining]
             self._launch(_move_bodies, mesh.model.body_count, inputs, [start.body_q, end.body_q])
         substep_dt = dt / self.substeps
+        if self._moves_bodies:
+            wp.copy(substep.vertices.bodies.start, start.body_q)  # now: some solvers overwrite it
         self._step(start, end, control, contacts, substep_dt)
+        if self._moves_bodies:
+            substep.set_body_ends(end.body_q, end.body_qd)
+            response.begin_bodies(substep)
         inputs = [motion.vertices, motion.planes.start, motion.planes.end, self.substeps, dt, self._remaining]
         inputs += [self._detected, end.particle_q, end.particle_qd]
         outputs = [substep.vertices, response.constraints, response.progress]
@@ -380,7 +468,10 @@ class Coupling:
         response.project(substep, substep_dt, 1.0 / self.substeps)  # creep adds up over substeps
         start.assign(self._start)
         outputs = [substep.vertices, particle_q, particle_qd]
-        self._launch(_end_substep, mesh.model.particle_count, [response.vertices, self._remaining], outputs)
+        self._launch(_end_substep, mesh.vertex_count, [response.vertices, self._remaining], outputs)
+        if self._moves_bodies:
+            outputs = [start.body_q, start.body_qd, self._body_q_prev]
+            self._launch(_end_body_substep, mesh.model.body_count, [substep.vertices, response.vertices], outputs)
 
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""

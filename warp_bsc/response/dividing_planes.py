@@ -15,7 +15,7 @@ import warp as wp
 
 from ..kernels.pipeline.queues import take_place
 from .buffers import Motion, Vertices
-from .constraints import LEAST_DISTANCE, to_double, to_single
+from .constraints import LEAST_DISTANCE, inverse_mass_of, to_double, to_single
 from .proximities import closest_direction
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "allocate_dividing_planes",
     "has_all_planes",
     "position_on_sides",
+    "share_of_path",
 ]
 
 _NONE = wp.constant(-1)
@@ -160,7 +161,7 @@ def _side(
         side.start = wp.min(side.start, x0)
         side.reach = wp.min(side.reach, _HALF * (x0 + x1 - wp.length(path)))
         side.end = wp.min(side.end, x1)
-        inverse_mass = wp.float64(motion.inverse_mass[vertex])
+        inverse_mass = wp.float64(inverse_mass_of(motion, vertex))
         side.inverse_mass += inverse_mass
         if inverse_mass == _ZERO:
             side.fixed = wp.min(side.fixed, x1)
@@ -196,7 +197,7 @@ def add_dividing_plane(
         return False
     movable = wp.vec4i()
     for j in range(4):
-        movable[j] = wp.where(motion.inverse_mass[corners[j]] > 0.0, corners[j], -1)
+        movable[j] = wp.where(inverse_mass_of(motion, corners[j]) > 0.0, corners[j], -1)
     if distance <= _ZERO:
         for j in range(4):
             if movable[j] >= 0:
@@ -322,7 +323,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
+def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3d) -> wp.float64:
     """Returns the share of a path, in [0, 1], up to which it is above the planes of its vertex."""
     share = _ONE
     node = planes.first[vertex]
@@ -350,7 +351,7 @@ def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.v
         return end, False
     start = to_double(x0)
     x = to_double(end)
-    end = to_single(start + _share_of_path(planes, vertex, start, x) * (x - start))
+    end = to_single(start + share_of_path(planes, vertex, start, x) * (x - start))
     if _is_above(planes, vertex, to_double(end)):
         return end, True
     return x0, True

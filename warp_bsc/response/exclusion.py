@@ -1,17 +1,19 @@
 """Pairs that the response leaves alone: pairs that crossed at the start of the step, and pairs that it cannot move."""
 
 import warp as wp
+from newton import ShapeFlags
 
 from ..detection.settings import Count
 from ..kernels.crossing import edge_crosses_face
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE, HIT
-from .buffers import Motion
+from .buffers import Bodies, Motion
 from .model_mesh import Incidence
 
-__all__ = ["Connectivity", "count_crossings", "crossed_at_start", "is_movable"]
+__all__ = ["Connectivity", "bodies_meet", "count_crossings", "crossed_at_start", "is_movable"]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
+_COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
 
 
 @wp.struct
@@ -30,7 +32,56 @@ def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True
+    if not motion.bodies.of_vertex:
+        return False
+    for side in range(2):
+        body = motion.bodies.of_vertex[corners[3 * side]]
+        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+            if corners[3 - 3 * side] < motion.bodies.particle_count:  # a particle that is held
+                return True
+            return motion.bodies.responds == 1 and bodies_meet(motion, corners)
     return False
+
+
+@wp.func
+def _collides(bodies: Bodies, shape: int, other: int) -> bool:
+    """Returns whether two shapes are to collide: by their flags, their groups, and the pairs that are filtered out.
+
+    Shapes of one positive group collide with each other, and with all negative groups but no other positive one; those
+    of a negative group with all but their own; those of group 0 with none.
+    """
+    if bodies.shape_flags[shape] & bodies.shape_flags[other] & _COLLIDE_SHAPES == 0:
+        return False
+    group = bodies.shape_collision_group[shape]
+    other_group = bodies.shape_collision_group[other]
+    if group == 0 or other_group == 0 or wp.where(group == other_group, group < 0, group > 0 and other_group > 0):
+        return False
+    shapes = wp.int64(bodies.shape_flags.shape[0])
+    key = wp.int64(wp.min(shape, other)) * shapes + wp.int64(wp.max(shape, other))
+    place = wp.lower_bound(bodies.filtered, key)
+    return place == bodies.filtered.shape[0] or bodies.filtered[place] != key
+
+
+@wp.func
+def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
+    """Returns whether two elements of shapes are of two that are to collide, one on a body that can be moved."""
+    if not motion.bodies.of_vertex:
+        return False
+    particles = motion.bodies.particle_count
+    if corners[0] < particles or corners[3] < particles:
+        return False
+    body = motion.bodies.of_vertex[corners[0]]
+    other = motion.bodies.of_vertex[corners[3]]
+    if body == other:
+        return False
+    movable = bool(False)
+    if body >= 0:
+        movable = motion.bodies.inverse_mass[body] > 0.0
+    if other >= 0:
+        movable = movable or motion.bodies.inverse_mass[other] > 0.0
+    return movable and _collides(
+        motion.bodies, motion.bodies.shape[corners[0] - particles], motion.bodies.shape[corners[3] - particles]
+    )
 
 
 @wp.func

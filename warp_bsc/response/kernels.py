@@ -5,6 +5,7 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
+from .bodies import sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
@@ -33,8 +34,9 @@ from .constraints import (
     widened,
 )
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
-from .exclusion import crossed_at_start, is_movable
-from .projection import has_pushed
+from .exclusion import bodies_meet, crossed_at_start, is_movable
+from .hidden_edges import are_hidden
+from .projection import has_pushed, moves_body
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = [
@@ -49,6 +51,8 @@ __all__ = [
 ]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
+_MOST_SAGITTA = wp.constant(wp.float64(4.0))
+"""Most that the turn of a body adds to the separation of a contact, in separations."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -74,6 +78,8 @@ def begin_step(
         status.certified[0] = 0
         status.hits[0] = 0
         status.crossed_hits[0] = 0
+        status.body_hits[0] = 0
+        status.body_contacts[0] = 0
         status.first_hits[0] = 0
         status.counted[0] = 0
         status.remaining[0] = 0
@@ -122,6 +128,11 @@ def _collect_contact(
         return
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
+        if bodies_meet(motion, corners):
+            if not crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
+                wp.atomic_add(progress.status.body_hits, 0, 1)
+                for j in range(4):
+                    vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
     may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
     if may_cross and crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
@@ -147,10 +158,14 @@ def _collect_contact(
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
+        if iteration == 0 and contacts.edges == 1:
+            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
+                return  # the next detection finds it, if it is still there
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = widened(separation, progress)
     if slow == 1:
         target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+    target += sagitta(motion, vertices, corners, _MOST_SAGITTA * separation)
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     add_constraint(
         motion,
@@ -216,7 +231,7 @@ def divide_near_pairs(
     if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
         return
     corners = constraints.vertices[i]
-    if not begins_dividing(progress, motion.world[corners[0]]):
+    if not begins_dividing(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
     meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
@@ -261,6 +276,7 @@ def decide(
         status.undetected[0] = 1
         status.hits[0] = 0
         status.crossed_hits[0] = 0
+        status.body_hits[0] = 0
         status.iteration[0] = wp.max(status.iteration[0], progress.max_iterations)
         return
     overflowed = overflowed and not can_search
@@ -269,6 +285,8 @@ def decide(
     status.remaining[0] = hits
     status.excluded[0] = status.crossed_hits[0]
     status.crossed_hits[0] = 0
+    status.body_contacts[0] = status.body_hits[0]
+    status.body_hits[0] = 0
     if status.counted[0] == 0:
         status.first_hits[0] = status.first_hits[0] + hits
         status.counted[0] = 1

@@ -1,12 +1,16 @@
 """The motion of a model in a step: its vertices and planes at the start, and as wanted at the end."""
 
+import numpy as np
 import warp as wp
+from newton import BodyFlags
 
-from .buffers import Motion
+from .bodies import centre_of
+from .buffers import Bodies, Motion
+from .constraints import to_double, to_single
 from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
 
-__all__ = ["ModelMotion"]
+__all__ = ["ModelMotion", "moves_with_body", "wanted_velocity"]
 
 
 @wp.struct
@@ -42,6 +46,24 @@ def _place_plane(placement: _Placement, i: int, planes: wp.array[wp.vec4d]):
         )
 
 
+@wp.func
+def moves_with_body(motion: Motion, vertex: int) -> bool:
+    """Returns whether a vertex is of a body that the response can move."""
+    if not motion.bodies.of_vertex:
+        return False
+    body = motion.bodies.of_vertex[vertex]
+    return body >= 0 and motion.bodies.inverse_mass[body] > 0.0
+
+
+@wp.func
+def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
+    """Returns the wanted velocity of a vertex of a body, whose wanted position is ``x1`` [m/s]."""
+    body = motion.bodies.of_vertex[vertex]
+    twist = motion.bodies.velocity[body]
+    arm = to_double(x1) - centre_of(motion.bodies, body, motion.bodies.end[body])
+    return to_single(to_double(wp.spatial_top(twist)) + wp.cross(to_double(wp.spatial_bottom(twist)), arm))
+
+
 @wp.kernel(enable_backward=False)
 def _write_start(
     # in
@@ -58,6 +80,33 @@ def _write_start(
 
 
 @wp.kernel(enable_backward=False)
+def _write_bodies(
+    # in
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_inv_mass: wp.array[float],
+    body_flags: wp.array[int],
+    worlds: int,
+    # in and out
+    motion: Motion,
+):
+    """Writes poses, velocities and inverse masses of bodies at the end of the step.
+
+    A body whose pose or velocity is not finite is left to the inner solver, and so is one that is in all of several
+    worlds.
+    """
+    body = wp.tid()
+    pose = body_q[body]
+    velocity = body_qd[body]
+    movable = wp.isfinite(wp.transform_get_translation(pose)) and wp.isfinite(wp.transform_get_rotation(pose))
+    movable = movable and wp.isfinite(wp.length(velocity)) and body_flags[body] & BodyFlags.KINEMATIC == 0
+    movable = movable and (worlds <= 1 or motion.bodies.world[body] >= 0)
+    motion.bodies.end[body] = pose
+    motion.bodies.velocity[body] = velocity
+    motion.bodies.inverse_mass[body] = wp.where(movable, body_inv_mass[body], 0.0)
+
+
+@wp.kernel(enable_backward=False)
 def _write_end(
     # in
     placement: _Placement,
@@ -70,8 +119,8 @@ def _write_end(
 ):
     """Writes positions, velocities and planes at the end of a step.
 
-    Velocities are those of particles as they are, and those of shapes from their positions. A vertex without a finite
-    position at the end stands where it was.
+    Velocities are those of particles and movable bodies as they are, and those of other shapes from their positions. A
+    vertex without a finite position at the end stands where it was.
     """
     i = wp.tid()
     _place_plane(placement, i, planes)
@@ -82,6 +131,8 @@ def _write_end(
     velocity = (x1 - x0) / dt
     if i < particle_qd.shape[0]:
         velocity = particle_qd[i]
+    elif moves_with_body(motion, i):
+        velocity = wanted_velocity(motion, i, x1)
     finite = wp.isfinite(x1) and wp.isfinite(velocity)
     motion.x1[i] = wp.where(finite, x1, x0)
     motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
@@ -96,13 +147,23 @@ class ModelMotion:
         planes: The infinite planes, :class:`.planes.MovingPlanes`.
     """
 
-    def __init__(self, mesh: ModelMesh, friction: wp.array[float], plane_friction: wp.array[float]):
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        friction: wp.array[float],
+        plane_friction: wp.array[float],
+        *,
+        moves_bodies: bool = False,
+        responds_to_bodies: bool = False,
+    ):
         """Allocates buffers.
 
         Args:
             mesh: The mesh.
             friction: Coefficients of its vertices; that of a contact is the geometric mean.
             plane_friction: Coefficients of its planes.
+            moves_bodies: Whether the response can move bodies.
+            responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
         """
         self._mesh = mesh
         self.vertices = vertices = Motion()
@@ -115,6 +176,31 @@ class ModelMotion:
         for name in ("start", "end"):
             setattr(planes, name, wp.zeros(len(plane_friction), dtype=wp.vec4d, device=mesh.device))
         self._size = max(mesh.vertex_count, len(plane_friction))
+        self._moves_bodies = moves_bodies
+        if moves_bodies:
+            vertices.bodies = self._allocate_bodies()
+            vertices.bodies.responds = int(responds_to_bodies)
+
+    def _allocate_bodies(self):
+        """Returns the bodies of the model, with buffers for their motion."""
+        mesh, bodies = self._mesh, Bodies()
+        model, device = mesh.model, mesh.device
+        pairs = np.sort(np.array(list(model.shape_collision_filter_pairs), dtype=np.int64).reshape(-1, 2), axis=1)
+        filtered = np.unique(model.shape_count * pairs[:, 0] + pairs[:, 1])
+        bodies.filtered = wp.array(filtered, dtype=wp.int64, device=device)
+        bodies.shape = mesh.device_shape_vertices.shape
+        bodies.shape_flags, bodies.shape_collision_group = model.shape_flags, model.shape_collision_group
+        bodies.particle_count = model.particle_count
+        of_vertex = np.concatenate([np.full(model.particle_count, -1, dtype=np.int32), mesh.shape_vertices.body])
+        bodies.of_vertex = wp.array(of_vertex, dtype=int, device=device)
+        bodies.position = mesh.device_shape_vertices.position
+        bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
+        bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
+        bodies.inverse_mass = wp.zeros(model.body_count, dtype=float, device=device)
+        for name in ("start", "end"):
+            setattr(bodies, name, wp.zeros(model.body_count, dtype=wp.transform, device=device))
+        bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
+        return bodies
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""
@@ -122,6 +208,8 @@ class ModelMotion:
         self._mesh.check_lengths(particle_q, body_q, x0)
         inputs = [self._placement(particle_q, body_q)]
         wp.launch(_write_start, self._size, inputs=inputs, outputs=[x0, planes], device=self._mesh.device)
+        if self._moves_bodies:
+            wp.copy(self.vertices.bodies.start, body_q)
 
     def set_end(
         self,
@@ -129,12 +217,24 @@ class ModelMotion:
         particle_qd: wp.array[wp.vec3] | None,
         body_q: wp.array[wp.transform] | None,
         dt: float,
+        body_qd: wp.array[wp.spatial_vector] | None = None,
     ) -> None:
-        """Copies the wanted positions and velocities at the end of a step of length ``dt`` [s], after its start."""
+        """Copies the wanted positions and velocities at the end of a step of length ``dt`` [s], after its start.
+
+        Velocities of bodies are needed only where the response can move bodies.
+        """
         self._mesh.check_lengths(particle_q, body_q, self.vertices.x1)
+        if self._moves_bodies:
+            self.set_body_ends(body_q, body_qd)
         inputs = [self._placement(particle_q, body_q), particle_qd, dt]
         outputs = [self.vertices, self.planes.end]
         wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self._mesh.device)
+
+    def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
+        """Copies the wanted poses and velocities of bodies, but not the positions of their vertices."""
+        model = self._mesh.model
+        inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
+        wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device)
 
     def _placement(self, particle_q, body_q):
         mesh, placement = self._mesh, _Placement()

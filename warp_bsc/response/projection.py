@@ -1,8 +1,9 @@
-"""Projection: Jacobi sweeps over constraints that move vertices, and then change velocities, until all are met."""
+"""Projection: Jacobi sweeps over constraints that move vertices and bodies, and then change velocities."""
 
 import warp as wp
 
 from ..kernels.pipeline.queues import take_slot
+from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_final_velocity
 from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
@@ -20,6 +21,7 @@ __all__ = [
     "initial_velocity_multiplier",
     "initialize_velocity_multipliers",
     "is_reversible",
+    "moves_body",
     "position_multiplier_after",
     "project_positions",
     "project_velocities",
@@ -35,7 +37,8 @@ MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
 """Most sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one
 active set, after which the device checks whether a constraint is still active."""
 SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 16, 12
-"""Most sweeps in worlds without fast contacts: dividing planes resolve what they leave."""
+"""Most sweeps over constraints that move no body in worlds without fast contacts: dividing planes resolve what they
+leave."""
 
 _RELAXATION = wp.constant(wp.float64(1.5))
 """Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
@@ -45,6 +48,8 @@ _SLIDING = wp.constant(wp.float64(0.999))
 """Share of the friction limit from which a contact slides."""
 _CREEP = wp.constant(wp.float64(0.1))
 """Longest path of a contact that friction holds, as a share of the tolerance; it adds up over steps."""
+_OF_BODIES = wp.constant(wp.float64(0.1))
+"""Tolerance of a constraint on a body as a share of that of others: a body moves as one, so that its motion shows."""
 _SHARE_OF_DISTANCE = wp.constant(wp.float64(0.5))
 """Largest tolerance of a position constraint as a share of its separation: elements that it holds stay apart."""
 _UNITS = wp.constant(wp.float64(2.0**40))
@@ -69,17 +74,28 @@ def _excess_speed(
 
 
 @wp.func
-def _effective_inverse_mass(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, relaxation: wp.float64
-) -> wp.float64:
-    """Returns the inverse mass of a constraint [1/kg], whose vertices are split among their active constraints."""
+def _effective_inverse_masses(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    x: wp.array[wp.vec3],
+    relaxation: wp.float64,
+):
+    """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
+
+    Its vertices and bodies are split among their active constraints.
+    """
     inverse_mass = _ZERO
     for j in range(4):
         vertex = constraints.vertices[i][j]
         parts = wp.max(wp.float64(vertices.active[vertex]) / relaxation, _ONE)
         share = wp.float64(motion.inverse_mass[vertex]) * parts
         inverse_mass += constraints.weights[i][j] * constraints.weights[i][j] * share
-    return inverse_mass
+    if not motion.bodies.of_vertex:
+        return inverse_mass, inverse_mass
+    along, across = body_inverse_masses(motion, vertices, constraints, i, x, relaxation)
+    return inverse_mass + along, inverse_mass + across
 
 
 @wp.func
@@ -88,16 +104,17 @@ def _multiplier_after(
     normal: wp.vec3d,
     excess: wp.float64,
     motion: wp.vec3d,
-    inverse_mass: wp.float64,
+    inverse_mass_along: wp.float64,
+    inverse_mass_across: wp.float64,
     friction: wp.float64,
 ) -> wp.vec3d:
     """Returns a multiplier after a step towards no excess along the normal and no motion across it.
 
     Along the normal it only pushes; across, it is limited by friction (Coulomb).
     """
-    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass, _ZERO)
+    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass_along, _ZERO)
     across = multiplier - wp.dot(multiplier, normal) * normal
-    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass
+    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass_across
     length = wp.length(across)
     if length > friction * along:
         across = across * (friction * along / length)
@@ -185,8 +202,8 @@ def count_active(vertices: Vertices, constraints: Constraints, i: int):
 
 
 @wp.func
-def _activate(vertices: Vertices, constraints: Constraints, i: int):
-    """Adds a constraint to the active set, and to the lists of the vertices that it moves."""
+def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
+    """Adds a constraint to the active set, to the lists of the vertices that it moves, and to its bodies."""
     place = int(take_slot(constraints.active_count, 0))
     constraints.active_set[place] = i
     count_active(vertices, constraints, i)
@@ -194,12 +211,32 @@ def _activate(vertices: Vertices, constraints: Constraints, i: int):
         if constraints.weights[i][j] != _ZERO:
             node = 4 * place + j
             constraints.next_active[node] = wp.atomic_exch(vertices.first_active, constraints.vertices[i][j], node)
+    if motion.bodies.of_vertex:
+        activate_bodies(motion, vertices, constraints, i)
 
 
 @wp.func
-def _max_sweeps(progress: Progress, world: int, slow: int) -> int:
-    """Returns the most sweeps in a world, which are ``slow`` where it has no fast contacts."""
-    return wp.where(progress.fast[world] == 1, MAX_SWEEPS, slow)
+def moves_body(motion: Motion, constraints: Constraints, i: int) -> bool:
+    """Returns whether a constraint moves a body."""
+    if motion.bodies.of_vertex:
+        for side in range(2):
+            body = motion.bodies.of_vertex[constraints.vertices[i][3 * side]]
+            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+                return True
+    return False
+
+
+@wp.func
+def _tolerance_of(motion: Motion, constraints: Constraints, i: int, tolerance: wp.float64) -> wp.float64:
+    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
+    return wp.where(moves_body(motion, constraints, i), _OF_BODIES, _ONE) * tolerance
+
+
+@wp.func
+def _max_sweeps(motion: Motion, constraints: Constraints, progress: Progress, i: int, slow: int) -> int:
+    """Returns the most sweeps of a constraint: ``slow`` if it moves no body, and its world has no fast contacts."""
+    world = motion.world[constraints.vertices[i][0]]
+    return wp.where(progress.fast[world] == 1 or moves_body(motion, constraints, i), MAX_SWEEPS, slow)
 
 
 @wp.func
@@ -260,12 +297,13 @@ def activate_position_constraints(
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
-    past = progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_position_sweeps)
+    past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
         return
     distance = gap(vertices, constraints, i)
     if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
         tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * constraints.separation[i])
+    tolerance = _tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
     if not active and is_reversible(constraints, progress, i):
         multiplier = constraints.position_multiplier[i]
@@ -274,7 +312,7 @@ def activate_position_constraints(
             path = _path(motion, vertices, constraints, i)
             active = distance > tolerance or not _is_held(multiplier, constraints.normal[i], path, friction, tolerance)
     if active:
-        _activate(vertices, constraints, i)
+        _activate(motion, vertices, constraints, i)
 
 
 @wp.func
@@ -284,15 +322,15 @@ def position_multiplier_after(
     """Returns the position multiplier of a constraint after a sweep, without momentum."""
     old = constraints.position_multiplier[i]
     relaxation = wp.where(pushes_only, _RELAXATION, _ONE)
-    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, relaxation)
-    if inverse_mass <= _ZERO:
+    along, across = _effective_inverse_masses(motion, vertices, constraints, i, motion.x1, relaxation)
+    if along <= _ZERO:
         return old
     excess = gap(vertices, constraints, i)
     if pushes_only and excess >= _ZERO:
         return old
     path = _path(motion, vertices, constraints, i)
     friction = wp.float64(constraints.friction[i])
-    return _multiplier_after(old, constraints.normal[i], excess, path, inverse_mass, friction)
+    return _multiplier_after(old, constraints.normal[i], excess, path, along, across, friction)
 
 
 @wp.func
@@ -301,13 +339,13 @@ def velocity_multiplier_after(
 ) -> wp.vec3d:
     """Returns the velocity multiplier of a constraint after a sweep, without momentum."""
     old = constraints.velocity_multiplier[i]
-    inverse_mass = _effective_inverse_mass(motion, vertices, constraints, i, _ONE)
-    if inverse_mass <= _ZERO:
+    along, across = _effective_inverse_masses(motion, vertices, constraints, i, vertices.x1, _ONE)
+    if along <= _ZERO:
         return old
     excess = _excess_speed(motion, vertices, constraints, i, restitution)
     velocity = relative(constraints.weights[i], constraints.vertices[i], vertices.velocity)
     friction = wp.float64(constraints.friction[i])
-    return _multiplier_after(old, constraints.normal[i], excess, velocity, inverse_mass, friction)
+    return _multiplier_after(old, constraints.normal[i], excess, velocity, along, across, friction)
 
 
 @wp.kernel(**_KERNEL)
@@ -325,8 +363,7 @@ def project_positions(
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(constraints, progress, i)
-    world = motion.world[constraints.vertices[i][0]]
-    max_sweeps = _max_sweeps(progress, world, progress.slow_position_sweeps)
+    max_sweeps = _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     momentum = _momentum(constraints, progress, i, max_sweeps)
     if pushes_only:
         violated = gap(vertices, constraints, i) < _ZERO
@@ -339,6 +376,8 @@ def project_positions(
     constraints.previous_multiplier[i] = multiplier
     constraints.position_multiplier[i] = new
     constraints.change[place] = new - old
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, new - old, motion.x1, vertices.bodies.delta_x)
 
 
 @wp.kernel(**_KERNEL)
@@ -387,6 +426,10 @@ def initialize_velocity_multipliers(motion: Motion, vertices: Vertices, constrai
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         add_delta(motion, constraints, i, constraints.velocity_multiplier[i], vertices.particle_delta_v)
+        if motion.bodies.of_vertex:
+            activate_bodies(motion, vertices, constraints, i)
+            impulse = constraints.velocity_multiplier[i]
+            add_body_delta(motion, vertices, constraints, i, impulse, vertices.x1, vertices.bodies.delta_v)
     constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
     constraints.last_sweep[i] = -2
 
@@ -405,8 +448,7 @@ def activate_velocity_constraints(
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    world = motion.world[constraints.vertices[i][0]]
-    if progress.sweep.number[0] >= _max_sweeps(progress, world, progress.slow_velocity_sweeps):
+    if progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == _ZERO:
@@ -414,7 +456,7 @@ def activate_velocity_constraints(
             return
         if gap(vertices, constraints, i) > constraints.separation[i]:
             return
-    tolerance /= dt
+    tolerance = _tolerance_of(motion, constraints, i, tolerance) / dt
     normal = constraints.normal[i]
     excess = _excess_speed(motion, vertices, constraints, i, restitution)
     active = excess < -tolerance
@@ -423,7 +465,7 @@ def activate_velocity_constraints(
         friction = wp.float64(constraints.friction[i])
         active = excess > tolerance or not _is_held(multiplier, normal, velocity, friction, tolerance)
     if active:
-        _activate(vertices, constraints, i)
+        _activate(motion, vertices, constraints, i)
 
 
 @wp.kernel(**_KERNEL)
@@ -440,8 +482,7 @@ def project_velocities(
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    world = motion.world[constraints.vertices[i][0]]
-    max_sweeps = _max_sweeps(progress, world, progress.slow_velocity_sweeps)
+    max_sweeps = _max_sweeps(motion, constraints, progress, i, progress.slow_velocity_sweeps)
     momentum = _momentum(constraints, progress, i, max_sweeps)
     old = constraints.velocity_multiplier[i]
     if is_recording(record):
@@ -451,6 +492,8 @@ def project_velocities(
     constraints.previous_multiplier[i] = multiplier
     constraints.velocity_multiplier[i] = new
     constraints.change[place] = new - old
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, new - old, vertices.x1, vertices.bodies.delta_v)
 
 
 @wp.kernel(**_KERNEL)

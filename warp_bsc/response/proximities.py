@@ -21,6 +21,7 @@ from .constraints import (
     to_double,
 )
 from .exclusion import Connectivity, crossed_at_start, is_movable
+from .hidden_edges import are_hidden
 
 __all__ = ["Proximities", "closest_direction", "closest_vector", "collect_proximities", "drop_proximities"]
 
@@ -162,6 +163,8 @@ def _collect_proximity(
     if is_slow(motion, corners, near.edges) == 0:
         return
     if progress.status.crossings[0] > 0 and crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+        return
+    if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = feasible(separation, distance, separation, path)

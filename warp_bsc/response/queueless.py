@@ -21,7 +21,7 @@ from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
 from .constraints import NO_CONSTRAINT, count_contact, update_first_contact
 from .dividing_planes import DividingPlanes, add_dividing_plane
-from .exclusion import Connectivity, crossed_at_start, is_movable
+from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable
 
 __all__ = ["find_contacts_without_queues"]
 
@@ -50,7 +50,8 @@ def _next(corner: int) -> int:
 def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     motion = arguments.motion
-    if not is_movable(motion, corners):
+    movable = is_movable(motion, corners)
+    if not movable and not bodies_meet(motion, corners):
         return
     x0 = motion.x0
     x1 = arguments.vertices.x1
@@ -77,7 +78,12 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
         return
     edges = wp.where(kind == EDGE_EDGE, 1, 0)
     if crossed_at_start(motion, arguments.mesh, edges, pair, result.toi):
-        wp.atomic_add(arguments.progress.status.crossed_hits, 0, 1)
+        wp.atomic_add(arguments.progress.status.crossed_hits, 0, wp.where(movable, 1, 0))
+        return
+    if not movable:
+        wp.atomic_add(arguments.progress.status.body_hits, 0, 1)
+        for j in range(4):
+            arguments.vertices.changed[corners[j]] = 1
         return
     count_contact(arguments.progress, motion.world[corners[0]])
     add_dividing_plane(motion, arguments.vertices, corners, edges, arguments.separation, arguments.dividing, True)

@@ -80,6 +80,16 @@ class SolverReport:
         return _read(self._response.status.excluded)
 
     @property
+    def body_contacts(self) -> int:
+        """Contacts between bodies in the motion of the last step as it is stored, which were left to the inner solver.
+
+        These are pairs of meshes that are to collide, of two bodies, or of a body and a static shape, without elements
+        that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
+        the response moves no bodies, and counts nothing that it keeps apart (``bodies=True``).
+        """
+        return _read(self._response.status.body_contacts)
+
+    @property
     def crossings(self) -> int:
         """Edges that cross faces at the start of the last step, pair by pair, as far as a vertex of theirs can move.
 
@@ -121,6 +131,21 @@ class SolverReport:
         return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
 
     @property
+    def uncertified_bodies(self) -> np.ndarray:
+        """Bodies that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
+
+        They are bodies of contacts that remain, if the response moves bodies, and those without a finite pose or
+        velocity. Gathered on the host, on each access.
+        """
+        model = self._mesh.model
+        if self.certified or not model.body_count:
+            return np.empty(0, dtype=np.int32)
+        first = model.particle_count
+        listed = (self._response.vertices.changed.numpy() != 0) | (self._motion.vertices.is_lost.numpy() != 0)
+        bodies = np.unique(self._mesh.shape_vertices.body[listed[first:]])
+        return bodies[bodies >= 0].astype(np.int32)
+
+    @property
     def undetected(self) -> bool:
         """Whether the last step froze all vertices because its detection was incomplete.
 
@@ -136,12 +161,12 @@ class SolverReport:
 
     @property
     def truncated(self) -> int:
-        """Vertices whose paths were truncated in the last step, so that they stay on their side of a contact."""
+        """Vertices and bodies whose paths were truncated in the last step, so that they stay on their side."""
         return self._count_vertices(TRUNCATED)
 
     @property
     def frozen(self) -> int:
-        """Vertices that were frozen where they were at the start of the last step."""
+        """Vertices and bodies that were frozen where they were at the start of the last step."""
         return self._count_vertices(FROZEN)
 
     @property
@@ -250,7 +275,9 @@ class SolverReport:
         return mesh
 
     def _count_vertices(self, bit):
-        return int(np.count_nonzero(self._response.vertices.outcome.numpy() & int(bit)))
+        vertices = self._response.vertices
+        counts = [vertices.outcome] + ([vertices.bodies.outcome] if vertices.bodies.outcome else [])
+        return sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in counts)
 
 
 def _read(values):

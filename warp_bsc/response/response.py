@@ -11,13 +11,25 @@ from ..detection.launch import retry_until_fits
 from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import Count, PairKind, capacity_for
 from .adjoint_kernels import count_grazing
-from .angular_momentum import SUMS, sum_moments, sum_torques, turn_vertices
+from .angular_momentum import SUMS, sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
+from .bodies import (
+    begin_bodies,
+    change_body_velocities,
+    cut_bodies,
+    find_body_shares,
+    freeze_undetected_bodies,
+    move_bodies,
+    move_to_end,
+    place_vertices,
+    set_vertex_velocities,
+)
 from .buffers import (
     Constraints,
     Progress,
     SolveStatus,
     SweepStatus,
     Vertices,
+    allocate_bodies,
     allocate_constraints,
     allocate_vertices,
 )
@@ -101,6 +113,9 @@ class Response:
     still do not collide. A detection whose queues are too small in a CUDA graph is completed without queues, see
     :mod:`.queueless`.
 
+    Bodies that can be moved are projected with the particles, each by its pose, see :mod:`.bodies`. One whose vertices
+    are to be divided or frozen goes back along its path as one, and collides with what is left in the next iteration.
+
     If the response is differentiable, paths are truncated before their first contact instead of divided, and a
     detection whose queues are too small freezes all vertices, uncertified.
 
@@ -116,7 +131,15 @@ class Response:
         device: The device.
     """
 
-    def __init__(self, mesh: ModelMesh, *, separation: float, restitution: float, differentiable: bool):
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        *,
+        separation: float,
+        restitution: float,
+        differentiable: bool,
+        moves_bodies: bool = False,
+    ):
         """Allocates buffers.
 
         Args:
@@ -125,6 +148,7 @@ class Response:
             restitution: Share of the approaching velocity that comes back, in [0, 1].
             differentiable: Whether all sweeps are made and paths are truncated, not divided, as the adjoint has it:
                 whether a constraint is active would otherwise depend on tiny changes, and results would jump.
+            moves_bodies: Whether motions have bodies that can be moved.
         """
         self.device = device = mesh.device
         self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
@@ -136,6 +160,10 @@ class Response:
         self._summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
+        self._bodies = mesh.model.body_count if moves_bodies else 0
+        if moves_bodies:
+            self.vertices.bodies = allocate_bodies(self._bodies, device)
+        self._shape_vertices = mesh.vertex_count - self._movable
         self._connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = mesh.device_faces, mesh.device_edges
         connectivity.vertex_edges, connectivity.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
@@ -246,6 +274,11 @@ class Response:
         self._project(self._sweep_positions, tolerance=tolerance * self._tolerance)
         self._change_velocities(dt)
 
+    def begin_bodies(self, motion: ModelMotion) -> None:
+        """Initializes the bodies of ``vertices`` by what a motion wants of them."""
+        self._motion = motion
+        self._launch_over_bodies(begin_bodies)
+
     def inspect(self, motion: ModelMotion) -> Resolution:
         """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
 
@@ -270,6 +303,7 @@ class Response:
         outputs = [self.vertices, self.constraints, self._dividing_planes, self.progress]
         size = max(len(self.vertices.x1), self.worlds)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
+        self.begin_bodies(motion)
         wp.capture_if(self.status.recount, self._count_crossings)
 
     def _count_crossings(self):
@@ -293,6 +327,8 @@ class Response:
         self._record_offsets(after=1)
         wp.capture_if(self.constraints.count, self._change_velocities, dt=dt)
         self._launch_over_particles(freeze_undetected, [self._motion.vertices, self.vertices, self.progress])
+        self._launch_over_bodies(freeze_undetected_bodies, self.progress)
+        self._launch_over_shape_vertices(place_vertices)
 
     def _collect_penetrations(self, ahead):
         motion = self._motion
@@ -338,6 +374,8 @@ class Response:
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
         self._launch_over_particles(update_positions, [*inputs, last])
+        self._launch_over_bodies(move_bodies, last)
+        self._launch_over_shape_vertices(place_vertices)
 
     def _sweep_velocities(self, dt, first=True, last=True):
         """Sweeps over the constraints on velocities once, like :meth:`_sweep_positions`."""
@@ -353,6 +391,8 @@ class Response:
     def _update_velocities(self, last=True):
         inputs = [self._motion.vertices, self.vertices, self.constraints, self.progress, self._record, last]
         self._launch_over_particles(update_velocities, inputs)
+        self._launch_over_bodies(change_body_velocities, last)
+        self._launch_over_shape_vertices(set_vertex_velocities)
 
     def _project(self, sweep, **options):
         """Sweeps until no constraint is active, or MAX_SWEEPS times; not at all if vertices are to be divided."""
@@ -377,6 +417,7 @@ class Response:
     def _change_velocities(self, dt):
         """Solves the velocity constraints of all contacts that moved a vertex."""
         inputs = [self._motion.vertices, self.vertices]
+        self._launch_over_bodies(move_to_end)
         self.launch_over_constraints(initialize_velocity_multipliers, [*inputs, self.constraints, dt])
         self._update_velocities()
         self._project(self._sweep_velocities, dt=dt)
@@ -384,7 +425,9 @@ class Response:
         threads = self._summing_threads
         for kernel, arguments in ((sum_torques, [self.constraints]), (sum_moments, [self._movable])):
             wp.launch(kernel, threads, inputs=[*inputs, *arguments, threads, self._turn], device=self.device)
+        self._launch_over_bodies(sum_body_moments, self._turn)
         self._launch_over_particles(turn_vertices, [*inputs, self._turn])
+        self._launch_over_bodies(turn_bodies, self._turn)
 
     def _iterate(self, dt):
         """Projects or truncates once, and detects the new motion."""
@@ -399,6 +442,9 @@ class Response:
         inputs = [motion, vertices, self.progress, self._record, dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
+        self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing)
+        self._launch_over_bodies(cut_bodies, self.progress, dt)
+        self._launch_over_shape_vertices(place_vertices)
         self._detect(refit=True)
 
     def _detect(self, refit):
@@ -524,3 +570,14 @@ class Response:
 
     def _launch_over_particles(self, kernel, inputs):
         wp.launch(kernel, self._movable, inputs=inputs, device=self.device)
+
+    def _launch_over_bodies(self, kernel, *options):
+        if self._bodies:
+            inputs = [self._motion.vertices, self.vertices, *options]
+            wp.launch(kernel, self._bodies, inputs=inputs, device=self.device)
+
+    def _launch_over_shape_vertices(self, kernel, *options):
+        """Launches a kernel over the vertices of shapes, if bodies can be moved."""
+        if self._bodies:
+            inputs = [self._motion.vertices, self.vertices, *options]
+            wp.launch(kernel, self._shape_vertices, inputs=inputs, device=self.device)

@@ -2,16 +2,19 @@
 
 import contextlib
 import time
+from typing import NamedTuple
 
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase
+from newton import BodyFlags
+from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
-from .buffers import FROZEN, LOST, TRUNCATED, SolveStatus
+from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
 from .coupling import Coupling
+from .coupling_hooks import CouplingHooks
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -51,6 +54,34 @@ def _write_back(
         status.frozen[0] = 1
     if outcome[particle] & LOST != 0:
         wp.atomic_add(status.lost, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def _write_back_bodies(
+    # in
+    bodies: MovedBodies,
+    # out
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_q_prev: wp.array[wp.transform],
+    status: SolveStatus,
+):
+    """Writes the bodies that the response changed; the others keep every bit of what they are.
+
+    VBD takes the velocity of its next step from ``body_q_prev``, where it has that array.
+    """
+    body = wp.tid()
+    outcome = bodies.outcome[body]
+    if outcome == 0:
+        return
+    body_q[body] = bodies.pose[body]
+    body_qd[body] = bodies.velocity[body]
+    if body_q_prev:
+        body_q_prev[body] = bodies.pose[body]
+    if outcome & TRUNCATED != 0:
+        status.truncated[0] = 1
+    if outcome & FROZEN != 0:
+        status.frozen[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -97,6 +128,19 @@ def _count_record(counts: RecordCounts, complete: wp.array[int], totals: StepTot
     totals.lost_gradients[0] = totals.lost_gradients[0] + 1 - complete[0]
 
 
+class _Arrays(NamedTuple):
+    """The arrays of a state, which an attribute of the state may replace later."""
+
+    particle_q: wp.array | None
+    particle_qd: wp.array | None
+    body_q: wp.array | None
+    body_qd: wp.array | None
+
+
+def _arrays(state):
+    return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
+
+
 @contextlib.contextmanager
 def _paused_tape():
     """Pauses the active tape, if any, so that it records no launches, and yields it."""
@@ -111,16 +155,22 @@ def _paused_tape():
         tape.__enter__()
 
 
-class SolverCCD(SolverBase):
+class SolverCCD(SolverBase, CouplingHooks):
     """Lets another solver step, then makes the motion that it wanted free of collisions.
 
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
-    particles. All other attributes are those of the inner solver.
+    particles. Particles push dynamic bodies back, see ``bodies``. All other attributes are those of the inner solver.
 
     Elements that cross or touch at the start of a step, and vertices that begin in the solid of an infinite plane, are
     left to the inner solver. So are contacts of which no vertex can be moved. Everything else is certified. A particle
     whose wanted position or velocity is not finite stays where it was. A position at the start that is not finite
     leaves the step uncertified, without its elements.
+
+    The certificate is of straight motion: of all vertices between the stored state at the start and the stored state at
+    the end, those of shapes between the poses of their bodies. The vertices of a body that turns go in arcs, whose
+    distance from their chords (the sagitta) the response adds to the separation of contacts with that body, up to 4
+    times the separation; the arcs themselves are not certified. A body whose wanted pose or velocity is not finite is
+    left to the inner solver, and the step is not certified.
 
     With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
     tape then records what the inner solver records.
@@ -146,6 +196,7 @@ class SolverCCD(SolverBase):
         friction: float | None = None,
         restitution: float | None = None,
         coupling: int | None = None,
+        bodies: bool | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -160,18 +211,28 @@ class SolverCCD(SolverBase):
                 ``soft_contact_restitution``.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none.
+            bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
+                friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
+                keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) and the model has
+                no ``requires_grad``; contacts between bodies are left to the inner solver, and those that its motion
+                passes are counted, see ``report.body_contacts``. True: bodies are kept apart from each other and from
+                static shapes as well, as their flags, groups and filters of collision say, and certified; this needs an
+                inner solver that reads ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic
+                bodies, bodies without mass, static shapes and infinite planes are never pushed, and bodies are not kept
+                out of infinite planes. Bodies that are all kinematic at construction stay so.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
                 ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
-                velocity; the four numbers then have no meaning, and must not be given.
+                velocity; separation, friction, restitution, coupling and bodies
+                then have no meaning, and must not be given.
 
         Raises:
-            ValueError: If a number or the friction of a shape that collides with particles is out of range, or a number
-                is given without a response.
+            ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
+                argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver is to be differentiated.
+                solver, or one that moves bodies, is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -182,6 +243,7 @@ class SolverCCD(SolverBase):
         self.respond = respond
         if not respond:
             numbers = {"separation": separation, "friction": friction, "restitution": restitution, "coupling": coupling}
+            numbers |= {"bodies": bodies}
             for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
@@ -200,24 +262,47 @@ class SolverCCD(SolverBase):
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
-        self._motion = ModelMotion(mesh, *self._friction(friction))
+        self._moves_bodies = self._find_moves_bodies(bodies)
+        self._motion = ModelMotion(
+            mesh, *self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
+        )
         self._response = Response(
             mesh,
             separation=float(separation),
             restitution=float(restitution),
             differentiable=model.requires_grad,
+            moves_bodies=self._moves_bodies,
         )
         self._motion.set_start(model.particle_q, model.body_q)
-        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0)
+        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
         self._response.prepare(self._motion)
         self._recount_crossings()
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
-            self._coupling = Coupling(self._step_inner, solver, mesh, self._motion, self._response, coupling)
+            arguments = self._step_inner, solver, mesh, self._motion, self._response, coupling
+            self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
         self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._limited is not None)
+
+    def _find_moves_bodies(self, bodies):
+        """Returns whether the response can move bodies, as the argument ``bodies`` says."""
+        model, mesh, solver = self.model, self.mesh, self.solver
+        if bodies is None and model.requires_grad:
+            return False
+        if bodies and model.requires_grad:
+            raise NotImplementedError("steps that move bodies carry no gradients: omit bodies, or requires_grad")
+        if not self.respond or bodies is False or not model.body_count:
+            return False
+        if bodies is None:
+            integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
+            if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
+                return False
+        shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        assert model.body_flags is not None and model.body_inv_mass is not None
+        kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
+        return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
 
     def _friction(self, friction):
         """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
@@ -273,7 +358,8 @@ class SolverCCD(SolverBase):
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
-            self._motion.set_start(state_in.particle_q, state_in.body_q)  # now: some solvers overwrite it
+            start = state_in if self._coupled is None else self._coupled.start_of(state_in)
+            self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
                 self._coupling.save(state_in)
         self._step_inner(state_in, state_out, control, contacts, dt, **options)
@@ -283,18 +369,19 @@ class SolverCCD(SolverBase):
             elif self.respond:
                 self._respond(state_in, state_out, dt, tape)
             else:
-                arrays = state_out.particle_q, state_out.particle_qd, state_out.body_q
-                run_on_host(lambda: self._inspect(*arrays, dt), self.mesh.device)
+                run_on_host(lambda: self._inspect(_arrays(state_out), dt), self.mesh.device)
+            if self._coupled is not None:
+                self._coupled.finish(state_out, self._motion.vertices, self._response.vertices, self._moves_bodies)
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
         with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
             self.solver.step(*arguments, **options)
 
-    def _inspect(self, particle_q, particle_qd, body_q, dt):
-        """Detects the collisions of the motion from the start of the step to these positions, and counts the step."""
+    def _inspect(self, end, dt):
+        """Detects the collisions of the motion from the start of the step to a state, and counts the step."""
         with self._timed():
-            self._motion.set_end(particle_q, particle_qd, body_q, dt)
+            self._set_end(end, dt)
             resolution = self._response.inspect(self._motion)
             inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
             self._launch(_finish_inspection, self.mesh.vertex_count, inputs, outputs)
@@ -306,16 +393,16 @@ class SolverCCD(SolverBase):
     def _respond(self, state_in, state_out, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
         device = self.mesh.device
-        particle_q, particle_qd, body_q = state_out.particle_q, state_out.particle_qd, state_out.body_q
-        if tape is None or particle_q is None or not particle_q.requires_grad:
-            run_on_host(lambda: self._resolve(particle_q, particle_qd, body_q, dt), device)
+        end = _arrays(state_out)
+        if tape is None or end.particle_q is None or not end.particle_q.requires_grad:
+            run_on_host(lambda: self._resolve(end, dt), device)
             return
         recorded = None
-        arrays = [state_in.particle_q, particle_q, particle_qd]
+        arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
 
         def forward():
             nonlocal recorded
-            resolution = self._resolve(particle_q, particle_qd, body_q, dt, self._recorder)
+            resolution = self._resolve(end, dt, self._recorder)
             recorded = None
             if device.is_capturing or resolution.vertices.outcome.numpy().any():
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
@@ -329,28 +416,34 @@ class SolverCCD(SolverBase):
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), arrays)
 
-    def _resolve(self, particle_q, particle_qd, body_q, dt, record=None):
-        """Resolves the motion from the start of the step to these positions, and changes them."""
+    def _set_end(self, end, dt):
+        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
+
+    def _resolve(self, end, dt, record=None):
+        """Resolves the motion from the start of the step to a state, and changes it."""
         with self._timed():
-            self._motion.set_end(particle_q, particle_qd, body_q, dt)
+            self._set_end(end, dt)
             resolution = self._response.resolve(self._motion, dt, record)
-            self._finish(resolution, particle_q, particle_qd)
+            self._finish(resolution, end)
         return resolution
 
     def _couple(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
-            self._motion.set_end(state.particle_q, state.particle_qd, state.body_q, dt)
+            self._set_end(_arrays(state), dt)
             assert self._coupling is not None
             resolution = self._coupling.resolve(state, control, contacts, dt, self._is_coupled)
-            self._finish(resolution, state.particle_q, state.particle_qd)
+            self._finish(resolution, _arrays(state))
 
-    def _finish(self, resolution, particle_q, particle_qd):
+    def _finish(self, resolution, end):
         """Writes a resolved motion to the arrays of a state, and counts the step."""
         vertices = resolution.vertices
         inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [particle_q, particle_qd, resolution.status]
+        outputs = [end.particle_q, end.particle_qd, resolution.status]
         self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
+        if self._moves_bodies:
+            outputs = [end.body_q, end.body_qd, getattr(self.solver, "body_q_prev", None), resolution.status]
+            self._launch(_write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
         self._count_step(resolution)
 
     def _count_step(self, resolution):

@@ -1,0 +1,139 @@
+"""The stage as an entry of Newton's coupled solvers: bodies of another solver, and cloth of the inner one."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledADMM, SolverCoupledProxy
+from newton_scenes import DT, SOLVERS, add_patch
+
+import warp_bsc as bsc
+
+
+def ball_over_sheet(device, mass=0.2):
+    """A ball that flies at a pinned sheet."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    radius = 0.05
+    inertia = wp.mat33(*(0.4 * mass * radius**2 * np.eye(3)).ravel().tolist())
+    pose = wp.transform(wp.vec3(0.013, 0.007, 0.055), wp.quat_identity())
+    body = builder.add_body(xform=pose, mass=mass, inertia=inertia, lock_inertia=True)
+    builder.add_shape_sphere(body, radius=radius, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5, density=0.0))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    builder.color()
+    model = builder.finalize(device=device)
+    model.body_qd.assign(np.float32([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]))
+    return model
+
+
+def entries(model, rigid, cloth):
+    """The bodies of a model for one solver, the particles for another."""
+    joints, particles = list(range(model.joint_count)), list(range(model.particle_count))
+    bodies = list(range(model.body_count))
+    return [
+        SolverCoupled.Entry(name="rigid", solver=rigid, bodies=bodies, joints=joints),
+        SolverCoupled.Entry(name="cloth", solver=cloth, particles=particles),
+    ]
+
+
+def fall(model, solver, steps):
+    """Poses of the first body after each step, and the last state."""
+    start, end = model.state(), model.state()
+    poses = []
+    for _ in range(steps):
+        start.clear_forces()
+        solver.step(start, end, model.control(), None, DT)
+        start, end = end, start
+        poses.append(start.body_q.numpy()[0].copy())
+    return np.array(poses), start
+
+
+@pytest.mark.parametrize(
+    ("inner", "mass", "mode", "iterations"),
+    [("vbd", 0.2, "lagged", 1), ("vbd", 0.2, "staggered", 1), ("xpbd", 0.02, "lagged", 2)],
+)
+def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, iterations, device):
+    """The impulses of the response on the proxy reach the solver that owns the body, with ``lagged`` a step later."""
+    model, steps = ball_over_sheet(device, mass), 40
+    alone = bsc.SolverCCD(SOLVERS[inner](model))
+    expected, _ = fall(model, alone, steps)
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS[inner](view)))
+        return stages[-1]
+
+    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0], mode=mode)]
+    config = SolverCoupledProxy.Config(proxies=proxies, iterations=iterations)
+    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
+    poses, state = fall(model, SolverCoupledProxy(model, entries(model, rigid, make), config), steps)
+    report = stages[0].report
+    assert (report.steps, report.uncertified_steps, report.crossings) == (iterations * steps, 0, 0)
+    lags = mode == "lagged" and iterations == 1
+    np.testing.assert_allclose(poses[:, :3], expected[:, :3], atol=5e-3 if lags else 2e-3)
+    assert poses[-1, 2] > 0.055 - steps * DT + 0.02
+    assert (state.particle_q.numpy()[:, 2] < -0.01).any()
+
+
+def test_a_body_hangs_on_cloth_over_a_sphere(device):
+    """ADMM attaches a body of one solver to cloth of another, whose stage keeps it on a static sphere."""
+    builder = newton.ModelBuilder()
+    at = wp.vec3(0.0, 0.0, -0.11)
+    builder.add_shape_sphere(-1, xform=wp.transform(at, wp.quat_identity()), radius=0.1)
+    add_patch(builder, 6, 0.05, (0.003, 0.007, 0.0))
+    pose = wp.transform(wp.vec3(0.15, 0.15, -0.02), wp.quat_identity())
+    inertia = wp.mat33(*(1e-5 * np.eye(3)).ravel().tolist())
+    body = builder.add_body(xform=pose, mass=0.01, inertia=inertia, lock_inertia=True)
+    corner = builder.particle_count - 1
+    builder.add_attachment_particle_body(corner, body, body_point=(0.0, 0.0, 0.02), stiffness=1e3, damping=1e-1)
+    builder.color()
+    model = builder.finalize(device=device)
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    config = SolverCoupledADMM.Config(iterations=2, rho=20.0, baumgarte=0.2)
+    rigid = newton.solvers.SolverSemiImplicit
+    _, state = fall(model, SolverCoupledADMM(model, entries(model, rigid, make), config), 80)
+    report = stages[0].report
+    assert report.steps == 160 and report.uncertified_steps == 0 and report.crossings == 0
+    q, pose = state.particle_q.numpy(), state.body_q.numpy()[0]
+    assert np.linalg.norm(q - np.array(at), axis=1).min() > 0.098  # the sphere's surface is an inscribed mesh
+    free_fall = -0.02 - 0.5 * 9.81 * (80 * DT) ** 2
+    assert np.linalg.norm(q[corner] - pose[:3]) < 0.06 and pose[2] > 0.7 * free_fall
+
+
+def test_hooks_are_those_of_the_inner_solver(device):
+    calls = []
+    hooks = [name for name in dir(CouplingInterface) if name.startswith("coupling_")]
+
+    def record(name):
+        return lambda self, *arguments, **options: calls.append((name, arguments, options))
+
+    inner = type("Inner", (newton.solvers.SolverXPBD,), {name: record(name) for name in hooks})
+    stage = bsc.SolverCCD(inner(ball_over_sheet(device)))
+    options = {"state": 1, "dt": 0.0}
+    for name in hooks:
+        arguments = {"coupling_notify_input_state_update": (1, 0)}.get(name, (1, 2))
+        arguments = (1,) if name == "coupling_notify_iteration_restarts" else arguments
+        known = {} if name == "coupling_notify_iteration_restarts" else options
+        known = {"dt": 0.0} if name == "coupling_notify_input_state_update" else known
+        known = {**known, "dt": 1.0} if "harvest" in name else known
+        forces = wp.zeros(1, dtype=wp.spatial_vector if "wrenches" in name else wp.vec3, device=device)
+        proxy = wp.full(100, -1, dtype=int, device=device)
+        arguments = (proxy, forces) if "harvest" in name else arguments
+        getattr(stage, name)(*arguments, **known)
+        assert calls[-1][:2] == (name, arguments)
+    assert len(calls) == len(hooks)
+
+
+def test_an_inner_solver_without_hooks_has_those_of_the_interface(device):
+    model = ball_over_sheet(device)
+    stage = bsc.SolverCCD(type("Plain", (newton.solvers.SolverBase,), {})(model))
+    assert not isinstance(stage.solver, CouplingInterface)
+    masses = wp.zeros(1, dtype=float, device=device)
+    kinds = wp.array([int(CouplingInterface.EndpointKind.BODY)], dtype=int, device=device)
+    points = wp.zeros(1, dtype=wp.vec3, device=device)
+    stage.coupling_eval_effective_mass(kinds, wp.zeros(1, dtype=int, device=device), points, masses)
+    np.testing.assert_allclose(masses.numpy(), 0.2, rtol=1e-6)

@@ -1,0 +1,239 @@
+"""The hooks of Newton's coupled solvers for a stage behind another solver: that solver's, and what the stage adds."""
+
+import warp as wp
+from newton import BodyFlags, ParticleFlags, StateFlags
+from newton.solvers import SolverBase
+from newton.solvers.experimental.coupled import CouplingInterface
+
+from .bodies import inertia_at
+from .buffers import Motion, Vertices
+from .constraints import to_double, to_single
+
+__all__ = ["CouplingHooks"]
+
+_PROXY = wp.constant(int(BodyFlags.PROXY))
+_PARTICLE_PROXY = wp.constant(int(ParticleFlags.PROXY))
+
+_KERNEL = {"enable_backward": False}
+
+
+@wp.kernel(**_KERNEL)
+def _start_bodies(
+    # in
+    ends: wp.array[wp.transform],
+    flags: wp.array[int],
+    body_q: wp.array[wp.transform],
+    # out
+    starts: wp.array[wp.transform],
+):
+    """Writes where bodies start: proxies where the last step ended, others where they are."""
+    body = wp.tid()
+    starts[body] = body_q[body]
+    if flags[body] & _PROXY != 0:
+        starts[body] = ends[body]
+
+
+@wp.kernel(**_KERNEL)
+def _start_particles(
+    # in
+    ends: wp.array[wp.vec3],
+    flags: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    # out
+    starts: wp.array[wp.vec3],
+):
+    """Writes where particles start: proxies where the last step ended, others where they are."""
+    particle = wp.tid()
+    starts[particle] = particle_q[particle]
+    if flags[particle] & _PARTICLE_PROXY != 0:
+        starts[particle] = ends[particle]
+
+
+@wp.kernel(**_KERNEL)
+def _add_body_impulses(motion: Motion, vertices: Vertices, impulses: wp.array[wp.spatial_vector]):
+    """Adds the changes of momentum by the response, angular momentum about centres of mass [N s, N m s]."""
+    body = wp.tid()
+    if vertices.bodies.outcome[body] == 0:
+        return
+    change = vertices.bodies.velocity[body] - motion.bodies.velocity[body]
+    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
+    angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
+    impulses[body] += wp.spatial_vector(motion.bodies.mass[body] * wp.spatial_top(change), angular)
+
+
+@wp.kernel(**_KERNEL)
+def _add_particle_impulses(
+    motion: Motion, vertices: Vertices, particle_mass: wp.array[float], impulses: wp.array[wp.vec3]
+):
+    """Adds the changes of momentum by the response [N s]."""
+    particle = wp.tid()
+    if vertices.outcome[particle] != 0:
+        impulses[particle] += particle_mass[particle] * (vertices.velocity[particle] - motion.velocity[particle])
+
+
+@wp.kernel(**_KERNEL)
+def _add_body_forces(
+    # in
+    impulses: wp.array[wp.spatial_vector],
+    proxy: wp.array[int],
+    dt: float,
+    # out
+    forces: wp.array[wp.spatial_vector],
+):
+    body = wp.tid()
+    if proxy[body] >= 0:
+        wp.atomic_add(forces, proxy[body], impulses[body] / dt)
+
+
+@wp.kernel(**_KERNEL)
+def _add_particle_forces(
+    # in
+    impulses: wp.array[wp.vec3],
+    proxy: wp.array[int],
+    dt: float,
+    # out
+    forces: wp.array[wp.vec3],
+):
+    particle = wp.tid()
+    if proxy[particle] >= 0:
+        wp.atomic_add(forces, proxy[particle], impulses[particle] / dt)
+
+
+def _is_default(solver, hook):
+    """Returns whether a solver has a hook of the interface itself."""
+    return getattr(type(solver), hook, None) in (None, getattr(CouplingInterface, hook))
+
+
+class CouplingHooks(CouplingInterface):
+    """Makes a stage with an inner ``solver`` an entry of ``newton.solvers.experimental.coupled``.
+
+    Hooks are those of the inner solver, or those that the interface derives from the model if it has none, with two
+    additions. A proxy, which the coupler sets to the pose of its source before a step, moves from where it was at the
+    end of the last step: so nothing is passed where the two differ. And what the response changes of the momentum of a
+    proxy is fed back to its source, also by inner solvers that harvest only the forces of their own contacts.
+
+    Attributes:
+        solver: The inner solver.
+    """
+
+    solver: SolverBase
+
+    _coupled: "_Coupled | None" = None  # None outside coupled simulations
+
+    def _hook(self, name):
+        return getattr(self.solver if isinstance(self.solver, CouplingInterface) else super(), name)
+
+    def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
+        """Delegates to the inner solver, and prepares for a coupled simulation."""
+        self._hook("coupling_notify_iteration_restarts")(enabled)
+        self._coupled = _Coupled(self.model)
+
+    def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
+        """Delegates to the inner solver; in a step, makes proxies move from where they were at the end of the last."""
+        options = {"iteration_restart": iteration_restart, "dt": dt}
+        self._hook("coupling_notify_input_state_update")(state, flags, **options)
+        if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
+            self._coupled.update_input(state, **options)
+
+    def coupling_rewind_proxy_body(self, *arguments, **options) -> None:
+        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
+        self._hook("coupling_rewind_proxy_body")(*arguments, **options)
+        if self._coupled is not None:
+            self._coupled.body_impulses.zero_()
+
+    def coupling_rewind_proxy_particle(self, *arguments, **options) -> None:
+        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
+        self._hook("coupling_rewind_proxy_particle")(*arguments, **options)
+        if self._coupled is not None:
+            self._coupled.particle_impulses.zero_()
+
+    def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
+        """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
+        hook = "coupling_harvest_proxy_wrenches"
+        self._hook(hook)(body_local_to_proxy_global, out_body_f, **options)
+        if self._coupled is not None and not _is_default(self.solver, hook):
+            impulses = self._coupled.body_impulses
+            _add_forces(_add_body_forces, impulses, body_local_to_proxy_global, out_body_f, options["dt"])
+
+    def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
+        """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
+        hook = "coupling_harvest_proxy_particle_forces"
+        self._hook(hook)(particle_local_to_proxy_global, out_particle_f, **options)
+        if self._coupled is not None and not _is_default(self.solver, hook):
+            impulses = self._coupled.particle_impulses
+            _add_forces(_add_particle_forces, impulses, particle_local_to_proxy_global, out_particle_f, options["dt"])
+
+
+def _delegate(name):
+    """Returns a hook that is that of the inner solver."""
+
+    def hook(self, *arguments, **options):
+        return self._hook(name)(*arguments, **options)
+
+    hook.__name__ = name
+    hook.__doc__ = "Delegates to the inner solver."
+    return hook
+
+
+for _name in dir(CouplingInterface):
+    if _name.startswith("coupling_") and _name not in vars(CouplingHooks):
+        setattr(CouplingHooks, _name, _delegate(_name))
+
+
+def _add_forces(kernel, impulses, proxy, forces, dt):
+    if len(impulses):
+        wp.launch(kernel, len(impulses), inputs=[impulses, proxy, dt], outputs=[forces], device=impulses.device)
+
+
+class _Coupled:
+    """What a stage keeps for a coupler: where proxies were, and the impulses on them."""
+
+    def __init__(self, model):
+        self._model, device = model, model.device
+        self._last, self._first, self._start = model.state(), model.state(), model.state()
+        self._continues = False
+        self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
+        self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
+
+    def update_input(self, state, *, iteration_restart, dt):
+        """Notes that a coupler has set positions: for a step of length ``dt``, or at a reset where that is 0."""
+        if dt <= 0.0:
+            _copy_positions(self._last, state)
+        elif not iteration_restart and not self._continues:
+            _copy_positions(self._first, self._last)
+        self._continues = dt > 0.0
+
+    def start_of(self, state):
+        """Returns the state that a step starts from, as far as positions go, given that which it is called with."""
+        if not self._continues:
+            return state
+        self._continues = False
+        model, first, start = self._model, self._first, self._start
+        for kernel, count, arrays in (
+            (_start_bodies, model.body_count, (first.body_q, model.body_flags, state.body_q, start.body_q)),
+            (
+                _start_particles,
+                model.particle_count,
+                (first.particle_q, model.particle_flags, state.particle_q, start.particle_q),
+            ),
+        ):
+            if count:
+                wp.launch(kernel, count, inputs=arrays, device=model.device)
+        return start
+
+    def finish(self, state, motion, vertices, moves_bodies):
+        """Notes where a step has ended, and what the response did."""
+        _copy_positions(self._last, state)
+        model = self._model
+        if model.particle_count:
+            inputs = [motion, vertices, model.particle_mass, self.particle_impulses]
+            wp.launch(_add_particle_impulses, model.particle_count, inputs=inputs, device=model.device)
+        if moves_bodies:
+            inputs = [motion, vertices, self.body_impulses]
+            wp.launch(_add_body_impulses, model.body_count, inputs=inputs, device=model.device)
+
+
+def _copy_positions(to, state):
+    for name in ("particle_q", "body_q"):
+        if getattr(to, name) is not None:
+            wp.copy(getattr(to, name), getattr(state, name))
