@@ -1,7 +1,9 @@
 """Device functions for continuous collision detection, to call from any Warp kernel.
 
 ``ccd_vertex_face`` and ``ccd_edge_edge`` return FREE, HIT or UNSURE; ``impact_vertex_face`` and ``impact_edge_edge``
-return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. FREE and HIT are
+return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. With a last
+argument, a minimum distance in double precision, ``ccd_vertex_face``, ``ccd_edge_edge``, ``ccd_vertex_edge`` and
+``ccd_vertex_vertex`` return whether the features come within that distance, without gradients. FREE and HIT are
 certain whatever the options of the calling module, ``fast_math`` among them, and on processors that flush subnormal
 numbers to zero, as long as these round to nearest. Each of the other modules holds one idea of the method.
 
@@ -11,7 +13,14 @@ References:
     Sections, equations and algorithms that docstrings cite are those of this paper.
 """
 
-from .ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
+from .ccd import (
+    ccd_edge_edge,
+    ccd_vertex_edge,
+    ccd_vertex_face,
+    ccd_vertex_vertex,
+    impact_edge_edge,
+    impact_vertex_face,
+)
 from .signs import FREE, HIT, UNSURE
 from .time_of_impact import Impact
 
@@ -21,7 +30,9 @@ __all__ = [
     "UNSURE",
     "Impact",
     "ccd_edge_edge",
+    "ccd_vertex_edge",
     "ccd_vertex_face",
+    "ccd_vertex_vertex",
     "impact_edge_edge",
     "impact_vertex_face",
 ]

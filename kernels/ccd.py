@@ -8,13 +8,15 @@ import warp as wp
 from .classification import classify
 from .culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from .gradients import with_gradients
-from .motion import all_finite, doubles, relative_motion
-from .polynomials import EDGE_EDGE, VERTEX_FACE, Motion, coplanarity
-from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
+from .min_distance import min_distance_impact
+from .motion import all_finite, doubles, motion_and_distance, relative_motion
+from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
+from .signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from .time_of_impact import Impact, impact
 
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
 _NAN = wp.constant(wp.float64(math.nan))
+_ZERO = wp.constant(wp.float64(0.0))
 
 
 @wp.func
@@ -171,3 +173,95 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
     return _answer(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, False, _TOLERANCE).status
+
+
+@wp.func
+def impact_at_distance(
+    kind: int,
+    # points at the start
+    a0: Any,
+    b0: Any,
+    c0: Any,
+    d0: Any,
+    # points at the end
+    a1: Any,
+    b1: Any,
+    c1: Any,
+    d1: Any,
+    # minimum distance
+    min_distance: wp.float64,
+    roundoff: wp.float64,
+    # time of impact
+    timed: bool,
+    tolerance: wp.float64,
+) -> Impact:
+    """Returns the status of a query with a minimum distance and, if ``timed``, the first time at which it is reached.
+
+    Points are those of a vertex-face or edge-edge query; p a b a for a vertex and an edge, p q q q for two vertices. If
+    a point or the distance is not finite, or the distance negative, the status is UNSURE.
+    """
+    result = Impact()
+    if not (all_finite(a0, b0, c0, d0, a1, b1, c1, d1) and wp.isfinite(min_distance) and min_distance >= _ZERO):
+        result.status = UNSURE
+        result.coordinates = wp.vec3d(_NAN)
+        result.normal = wp.vec3d(_NAN)
+        return result
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    motion, distance = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, min_distance, roundoff)
+    result = min_distance_impact(kind, motion, distance, timed, tolerance)
+    if motion.size == _ZERO:  # the features are one point, at any distance of at least 0
+        result.status = HIT
+        result.within_tolerance = 1
+        result.toi = _ZERO
+    return result
+
+
+@wp.func
+def ccd_vertex_face(  # noqa: F811, an overload
+    p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any, min_distance: wp.float64
+) -> int:
+    """Returns whether a moving vertex p comes within a distance of a moving triangle a b c: FREE, HIT or UNSURE.
+
+    Points are ``vec3`` or ``vec3d``, at the start (0) and at the end (1) of the step, and move linearly between.
+    Time, triangle and distance are closed: a vertex at exactly ``min_distance`` counts. FREE and HIT are certain; treat
+    UNSURE as contact. If a point or the distance is not finite, or the distance negative, the status is UNSURE. For a
+    distance of 0 the function without it certifies more.
+    """
+    return impact_at_distance(
+        VERTEX_FACE, p0, a0, b0, c0, p1, a1, b1, c1, min_distance, ROUNDOFF, False, _TOLERANCE
+    ).status
+
+
+@wp.func
+def ccd_edge_edge(  # noqa: F811, an overload
+    a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, min_distance: wp.float64
+) -> int:
+    """Returns whether a moving edge a b comes within a distance of a moving edge c d: FREE, HIT or UNSURE.
+
+    Points and distance as of :func:`ccd_vertex_face`.
+    """
+    return impact_at_distance(
+        EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, min_distance, ROUNDOFF, False, _TOLERANCE
+    ).status
+
+
+@wp.func
+def ccd_vertex_edge(p0: Any, a0: Any, b0: Any, p1: Any, a1: Any, b1: Any, min_distance: wp.float64) -> int:
+    """Returns whether a moving vertex p comes within a distance of a moving edge a b: FREE, HIT or UNSURE.
+
+    Points and distance as of :func:`ccd_vertex_face`.
+    """
+    return impact_at_distance(
+        VERTEX_EDGE, p0, a0, b0, a0, p1, a1, b1, a1, min_distance, ROUNDOFF, False, _TOLERANCE
+    ).status
+
+
+@wp.func
+def ccd_vertex_vertex(p0: Any, q0: Any, p1: Any, q1: Any, min_distance: wp.float64) -> int:
+    """Returns whether a moving vertex p comes within a distance of a moving vertex q: FREE, HIT or UNSURE.
+
+    Points and distance as of :func:`ccd_vertex_face`.
+    """
+    return impact_at_distance(
+        VERTEX_VERTEX, p0, q0, q0, q0, p1, q1, q1, q1, min_distance, ROUNDOFF, False, _TOLERANCE
+    ).status

@@ -43,8 +43,8 @@ def edge_edge_boxes_apart(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, 
 
 
 @wp.func
-def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
-    """Returns whether a direction certainly separates the features of a motion at both ends, on the same side.
+def gaps_along(motion: Motion, direction: wp.vec3d):
+    """Returns by how much a direction separates the features of a motion at both ends, on either side, and a bound.
 
     The differences of the points of the two features are w, w - u, w - v (vertex-face) and w, w - u, w + v,
     w - u + v (edge-edge).
@@ -52,6 +52,9 @@ def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
     Bound: any direction is valid, so that it has no error. The products of a dot product have at most 4 roundings of
     the vector (a motion restricted in time has been interpolated), 1 of the product, 2 of the sum, and 2 of the
     difference: 9r times the sum of the sizes of all products.
+
+    Returns:
+        The least difference along the direction, the greatest one, and the bound on the error of both.
     """
     u0 = wp.dot(direction, motion.u0)
     u1 = wp.dot(direction, motion.u1)
@@ -68,7 +71,13 @@ def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
         low = wp.min(w0 - wp.max(u0, low) + wp.min(v0, high), w1 - wp.max(u1, low) + wp.min(v1, high))
         high = wp.max(w0 - wp.min(u0, high) + wp.max(v0, high), w1 - wp.min(u1, high) + wp.max(v1, high))
     size = wp.dot(wp.abs(direction), motion.u_size + motion.v_size + motion.w_size)
-    bound = motion.roundoff * (DIRECTION_ERROR * size + UNDERFLOW)
+    return low, high, motion.roundoff * (DIRECTION_ERROR * size + UNDERFLOW)
+
+
+@wp.func
+def direction_separates(motion: Motion, direction: wp.vec3d) -> bool:
+    """Returns whether a direction certainly separates the features of a motion at both ends, on the same side."""
+    low, high, bound = gaps_along(motion, direction)
     return low > bound or high < -bound
 
 

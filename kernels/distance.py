@@ -42,19 +42,15 @@ def _nearer(nearest: wp.vec3d, kind: int, s: wp.float64, r: wp.float64, u: wp.ve
 
 
 @wp.func
-def closest_points(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
-    """Finds the closest points of two features.
+def nearest_pair(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
+    """Returns the coordinates of the closest points of two features, and the square of their distance.
 
-    Returns:
-        Coordinates of the two points as of :func:`.closest.closest_coordinates`; their distance; and the bound on its
-        error. All differences of points must be finite.
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE.
+        a: Vector u, scaled so that squares neither overflow nor underflow where it matters.
+        b: Vector v, in the same scale.
+        c: Vector w, in the same scale.
     """
-    size = wp.max(wp.max(wp.max(wp.abs(u)), wp.max(wp.abs(v))), wp.max(wp.abs(w)))
-    scale = wp.where(size > _ZERO, size, _ONE)
-    # divided by their size, so that squares neither overflow nor underflow where it matters
-    a = u / scale
-    b = v / scale
-    c = w / scale
     n = wp.cross(a, b)
     nn = wp.dot(n, n)
     nearest = wp.vec3d(_ZERO, _ZERO, wp.float64(wp.inf))
@@ -73,4 +69,18 @@ def closest_points(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
         nearest = _nearer(nearest, kind, _along(c + b, a), _ONE, a, b, c)
         s = ratio(wp.dot(wp.cross(c, b), n), nn)
         nearest = _nearer(nearest, kind, s, _along(s * a - c, b), a, b, c)
+    return nearest
+
+
+@wp.func
+def closest_points(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
+    """Finds the closest points of two features.
+
+    Returns:
+        Coordinates of the two points as of :func:`.closest.closest_coordinates`; their distance; and the bound on its
+        error. All differences of points must be finite.
+    """
+    size = wp.max(wp.max(wp.max(wp.abs(u)), wp.max(wp.abs(v))), wp.max(wp.abs(w)))
+    scale = wp.where(size > _ZERO, size, _ONE)
+    nearest = nearest_pair(kind, u / scale, v / scale, w / scale)
     return wp.vec2d(nearest[0], nearest[1]), wp.sqrt(nearest[2]) * size, DISTANCE_ERROR * size

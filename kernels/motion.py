@@ -16,6 +16,7 @@ _LARGEST = wp.constant(wp.float64(2.0**1023))
 _SMALLEST_WITH_GRADIENT = wp.constant(wp.float64(1.0e-280))
 _LIFT = wp.constant(wp.float64(2.0**600))
 _LIFTED_BIT = wp.constant(wp.float64(2.0**-474))  # the lowest bit of a number, times _LIFT
+_TINY_DISTANCE = wp.constant(wp.float64(2.0**-400))
 _LARGEST_GRADIENT = wp.constant(wp.float64(2.0**100))
 
 
@@ -235,3 +236,52 @@ def relative_motion(
         in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
         motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
     return motion
+
+
+@wp.func
+def motion_and_distance(
+    kind: int,
+    # points at the start
+    a0: Any,
+    b0: Any,
+    c0: Any,
+    d0: Any,
+    # points at the end
+    a1: Any,
+    b1: Any,
+    c1: Any,
+    d1: Any,
+    # minimum distance
+    distance: wp.float64,
+    # rounding
+    roundoff: wp.float64,
+):
+    """Returns the relative motion of a query as of :func:`relative_motion`, and a distance in the same scale.
+
+    A distance out of the range of that scale becomes infinite, where it is more than all distances of the query, or
+    loses what is below 2^-1022 of the largest coordinate.
+    """
+    from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
+    size = motion.size
+    rescaled = distance
+    if _out_of_range(a0, size):
+        motion = _motion_of_kind(
+            kind,
+            _rescaled(from_a, size),
+            _rescaled(from_b, size),
+            _rescaled(from_c, size),
+            _rescaled(from_d, size),
+            _rescaled(to_a, size),
+            _rescaled(to_b, size),
+            _rescaled(to_c, size),
+            _rescaled(to_d, size),
+            roundoff,
+        )
+        rescaled = _rescaled_coordinate(distance, size)
+        if size < _ONE and distance >= _TINY_DISTANCE:
+            rescaled = wp.float64(wp.inf)
+    if motion.size > _ZERO and wp.isfinite(rescaled):
+        rescaled = rescaled * inverse_power_of_two(motion.size)
+    return motion, rescaled

@@ -30,6 +30,10 @@ from .signs import UNDERFLOW
 
 VERTEX_FACE = wp.constant(0)
 EDGE_EDGE = wp.constant(1)
+VERTEX_EDGE = wp.constant(2)
+"""Kind of a query with a minimum distance: its motion is that of a vertex and the collapsed triangle a b a."""
+VERTEX_VERTEX = wp.constant(3)
+"""Kind of a query with a minimum distance: its motion is that of a vertex and the collapsed triangle q q q."""
 
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _HALF = wp.constant(wp.float64(0.5))

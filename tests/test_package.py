@@ -51,7 +51,7 @@ PACKAGES = {
 
 LIBRARIES = {
     "newton": {"response", "warp_bsc/bench/newton_examples.py"},  # a benchmark of Newton's examples runs them
-    "pxr": {"usd"},
+    "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
     "rich": {"cli"},
     "argparse": {"cli"},
     "matplotlib": {"bench"},

@@ -31,9 +31,16 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.detector import CollisionDetector
     from .detection.differentiable import CollisionArrays
     from .detection.mesh import CollisionMesh
-    from .detection.query import QueryResult, query_edge_edge, query_vertex_face
+    from .detection.query import (
+        QueryResult,
+        query_edge_edge,
+        query_vertex_edge,
+        query_vertex_face,
+        query_vertex_vertex,
+    )
     from .detection.query_points import query_points
-    from .replay.intervals import IntervalResult, IntervalSummary, replay
+    from .replay.intervals import replay
+    from .replay.results import IntervalResult, IntervalSummary
     from .replay.scene_contacts import SceneContacts
     from .replay.scene_intersections import SceneIntersections
     from .replay.scene_proximities import SceneProximities
@@ -53,8 +60,8 @@ _MODULES = {
     "Collisions": "detection.collisions",
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.scene",
-    "IntervalResult": "replay.intervals",
-    "IntervalSummary": "replay.intervals",
+    "IntervalResult": "replay.results",
+    "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
     "Scene": "usd.scene",
     "SceneContacts": "replay.scene_contacts",
@@ -65,7 +72,9 @@ _MODULES = {
     "SolverReport": "response.report",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
+    "query_vertex_edge": "detection.query",
     "query_vertex_face": "detection.query",
+    "query_vertex_vertex": "detection.query",
     "replay": "replay.intervals",
 }
 
@@ -92,7 +101,9 @@ __all__ = [
     "checker",
     "query_edge_edge",
     "query_points",
+    "query_vertex_edge",
     "query_vertex_face",
+    "query_vertex_vertex",
     "replay",
 ]
 

@@ -4,7 +4,9 @@ What counts as a collision
 --------------------------
 Each point moves as x(t) = (1-t) x0 + t x1, its coordinates being exactly the floating-point numbers given. A
 vertex-face pair collides when some t in the closed [0, 1] puts the point in the closed triangle; an edge-edge pair when
-the closed segments meet at some t in the closed [0, 1]. Triangles and segments may degenerate.
+the closed segments meet at some t in the closed [0, 1]. Triangles and segments may degenerate. With a minimum distance
+d, exactly the number given, a pair collides when some t in the closed [0, 1] puts its closed features within the closed
+distance d of each other.
 
 One question
 ------------
@@ -39,11 +41,32 @@ The times of contact form a closed set, so there is a first one, t*. It is 0, or
 A root of f is held between two times that are not roots, and the sign of q there comes from the theorem of Sturm and
 Tarski: from the first time to the second, the sequence of signed remainders that starts with f and f' q loses as many
 changes of sign as f has distinct roots between them with q > 0, less those with q < 0. With q = 1 it counts the roots.
+
+A minimum distance
+------------------
+The differences of the points of two features fill a moving polygon: one point for two vertices, a segment for a vertex
+and an edge, a triangle for a vertex and a face, a parallelogram for two edges. The query asks whether its distance from
+the origin is at most d at some time. With corners q and r of a side, e = r - q and the polygon's normal n, the polygon
+is within d at one time exactly when
+
+- a corner is: q.q <= d^2;
+- or a side is, with the foot of the perpendicular between its ends: e != 0, q.e <= 0 <= r.e, and
+  |q x r|^2 <= d^2 e.e;
+- or the plane is, with the foot inside: n != 0, n.(q x r) >= 0 for all sides, and (q.n)^2 <= d^2 n.n.
+
+Each is a polynomial of degree at most 6. At the first time t* > 0 of the closed set of such times the distance is d,
+and the closest point is a corner, or inside a side with e != 0, or inside the polygon with n != 0, because a polygon
+without a normal is the union of its sides, and a side without length is a corner. In each case the line's last
+condition is an equation at t*. Its polynomial is not identically zero: the foot moves continuously, so that it would be
+inside, at the distance d, just before t* as well. Thus t* is 0 or a root of the last polynomial of a line, and the
+other conditions of that line hold there.
 """
 
 import bisect
 import functools
 import itertools
+import math
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 
 import numpy as np
@@ -51,52 +74,110 @@ from numpy.typing import ArrayLike
 
 from ._arrays import checked_coordinates
 
-__all__ = ["edge_edge", "edge_edge_toi", "edge_face_crossings", "edges_pass_faces", "vertex_face", "vertex_face_toi"]
+__all__ = [
+    "edge_edge",
+    "edge_edge_toi",
+    "edge_face_crossings",
+    "edges_pass_faces",
+    "vertex_edge",
+    "vertex_edge_toi",
+    "vertex_face",
+    "vertex_face_toi",
+    "vertex_vertex",
+    "vertex_vertex_toi",
+]
 
 # The triangles of a query, each corner a difference of two of its four points (first minus second).
 _VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
 _EDGE_EDGE = np.array([[(0, 2), (1, 2), (1, 3)], [(0, 2), (1, 3), (0, 3)]])
 
+# The polygon of a query, its corners in order around it, each a difference of two of its points.
+_POLYGONS = {
+    "vertex_vertex": np.array([(0, 1)]),
+    "vertex_edge": np.array([(0, 1), (0, 2)]),
+    "vertex_face": np.array([(0, 1), (0, 2), (0, 3)]),
+    "edge_edge": np.array([(0, 2), (1, 2), (1, 3), (0, 3)]),
+}
+
 _BLOCK = 8192  # queries that go through the filter together: arrays of this length stay in the processor's cache
 _PIECES = 8  # into which the filter cuts the step
 _MARGIN = 1e-10  # more than the error of any value in the filter, see _may_touch
+_HALVINGS = 7  # of the step in the filter of minimum distances
+_DISTANCE_MARGIN = 1e-12  # more than the error of any value in it, see _near_by_filter
 
 
-def vertex_face(points: ArrayLike) -> np.ndarray:
+def vertex_face(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     """Returns which vertex-face queries collide.
 
     Args:
         points: Positions, float32 or float64 array of shape (n, 8, 3), rows p0 a0 b0 c0 p1 a1 b1 c1.
+        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
+            one for all queries, or one each, shape (n,).
 
     Returns:
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If the shape or the type is wrong, or a coordinate is not finite.
+        ValueError: If a shape or a type is wrong, a coordinate is not finite, or a distance is no finite number of at
+            least 0.
     """
-    return _collides(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
+    return _answer(_collides, "vertex_face", points, min_distance)
 
 
-def edge_edge(points: ArrayLike) -> np.ndarray:
+def edge_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     """Returns which edge-edge queries collide.
 
     Args:
         points: Positions, float32 or float64 array of shape (n, 8, 3), rows a0 b0 c0 d0 a1 b1 c1 d1; edges ab and cd.
+        min_distance: As in :func:`vertex_face`.
 
     Returns:
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If the shape or the type is wrong, or a coordinate is not finite.
+        ValueError: As in :func:`vertex_face`.
     """
-    return _collides(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
+    return _answer(_collides, "edge_edge", points, min_distance)
 
 
-def vertex_face_toi(points: ArrayLike) -> np.ndarray:
+def vertex_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
+    """Returns which vertex-edge queries collide.
+
+    Args:
+        points: Positions, float32 or float64 array of shape (n, 6, 3), rows p0 a0 b0 p1 a1 b1; vertex p and edge ab.
+        min_distance: As in :func:`vertex_face`.
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: As in :func:`vertex_face`.
+    """
+    return _answer(_collides, "vertex_edge", points, min_distance)
+
+
+def vertex_vertex(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
+    """Returns which vertex-vertex queries collide.
+
+    Args:
+        points: Positions, float32 or float64 array of shape (n, 4, 3), rows p0 q0 p1 q1; vertices p and q.
+        min_distance: As in :func:`vertex_face`.
+
+    Returns:
+        Bool array of shape (n,).
+
+    Raises:
+        ValueError: As in :func:`vertex_face`.
+    """
+    return _answer(_collides, "vertex_vertex", points, min_distance)
+
+
+def vertex_face_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     """Returns bounds of the earliest contact time of vertex-face queries.
 
     Args:
         points: As in :func:`vertex_face`.
+        min_distance: As in :func:`vertex_face`.
 
     Returns:
         Float64 array of shape (n, 2): the largest double that is not after the earliest contact, and the smallest one
@@ -105,22 +186,55 @@ def vertex_face_toi(points: ArrayLike) -> np.ndarray:
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _earliest(checked_coordinates(points, (8, 3), "points"), _VERTEX_FACE)
+    return _answer(_earliest, "vertex_face", points, min_distance)
 
 
-def edge_edge_toi(points: ArrayLike) -> np.ndarray:
+def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     """Returns bounds of the earliest contact time of edge-edge queries.
 
     Args:
         points: As in :func:`edge_edge`.
+        min_distance: As in :func:`vertex_face`.
 
     Returns:
         Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
 
     Raises:
-        ValueError: As in :func:`edge_edge`.
+        ValueError: As in :func:`vertex_face`.
     """
-    return _earliest(checked_coordinates(points, (8, 3), "points"), _EDGE_EDGE)
+    return _answer(_earliest, "edge_edge", points, min_distance)
+
+
+def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
+    """Returns bounds of the earliest contact time of vertex-edge queries.
+
+    Args:
+        points: As in :func:`vertex_edge`.
+        min_distance: As in :func:`vertex_face`.
+
+    Returns:
+        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
+
+    Raises:
+        ValueError: As in :func:`vertex_face`.
+    """
+    return _answer(_earliest, "vertex_edge", points, min_distance)
+
+
+def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
+    """Returns bounds of the earliest contact time of vertex-vertex queries.
+
+    Args:
+        points: As in :func:`vertex_vertex`.
+        min_distance: As in :func:`vertex_face`.
+
+    Returns:
+        Float64 array of shape (n, 2), as in :func:`vertex_face_toi`.
+
+    Raises:
+        ValueError: As in :func:`vertex_face`.
+    """
+    return _answer(_earliest, "vertex_vertex", points, min_distance)
 
 
 def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
@@ -138,7 +252,7 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
     """
     edges, faces = _checked_pairs(edges, faces)
     points = np.concatenate([edges[:, :1], faces, edges[:, 1:], faces], axis=1)
-    return _collides(points, _VERTEX_FACE)
+    return _collides(_undecided_triangles(points, _VERTEX_FACE), np.zeros(len(points), dtype=bool))
 
 
 def edges_pass_faces(edges: ArrayLike, faces: ArrayLike, across: ArrayLike) -> np.ndarray:
@@ -188,19 +302,43 @@ def _checked_pairs(edges, faces):
     return edges, faces
 
 
-def _collides(points, pairs):
-    """Returns which queries collide, bool (n,)."""
-    hit = np.zeros(len(points), dtype=bool)
-    for query, triangle in _undecided_triangles(points, pairs):
-        hit[query] = hit[query] or any(True for _ in _contacts(triangle))
+def _answer(
+    ask: Callable[[Iterable, np.ndarray], np.ndarray], kind: str, points: ArrayLike, min_distance: ArrayLike
+) -> np.ndarray:
+    """Returns what ``ask`` makes of the queries of a kind; raises ValueError as :func:`vertex_face`."""
+    points = checked_coordinates(points, (2 * (_POLYGONS[kind].max() + 1), 3), "points")
+    distance = np.asarray(min_distance, dtype=np.float64)
+    if distance.shape not in ((), (len(points),)):
+        raise ValueError(f"min_distance must be one number or {len(points)}, one a query, got {distance.shape}")
+    if not (np.isfinite(distance) & (distance >= 0.0)).all():
+        raise ValueError("min_distance must be finite and at least 0")
+    distance = np.broadcast_to(distance, len(points))
+    answer = np.zeros(len(points), dtype=bool) if ask is _collides else np.full((len(points), 2), np.nan)
+    triangles = {"vertex_face": _VERTEX_FACE, "edge_edge": _EDGE_EDGE}.get(kind)
+    touching = (distance == 0.0) & (triangles is not None)
+    if touching.any():
+        answer[touching] = ask(_undecided_triangles(points[touching], triangles), answer[touching])
+    which = np.flatnonzero(~touching)
+    near, hit = _near_by_filter(points[which], _POLYGONS[kind], distance[which])
+    if ask is _collides:
+        answer[which[hit]] = True
+        near &= ~hit
+    which = which[near]
+    answer[which] = ask(_polygons(points[which], _POLYGONS[kind], distance[which]), answer[which])
+    return answer
+
+
+def _collides(undecided, hit):
+    """Returns which queries collide, bool (n,): those that ``hit`` has, and the undecided ones that have a contact."""
+    for query, shape in undecided:
+        hit[query] = hit[query] or any(True for _ in _contacts(shape))
     return hit
 
 
-def _earliest(points, pairs):
-    """Returns the doubles around each query's earliest contact, float64 (n, 2)."""
-    toi = np.full((len(points), 2), np.nan)
-    for query, triangle in _undecided_triangles(points, pairs):
-        for contact in _contacts(triangle):
+def _earliest(undecided, toi):
+    """Returns the doubles around each query's earliest contact, float64 (n, 2), NaN as in ``toi`` where none is."""
+    for query, shape in undecided:
+        for contact in _contacts(shape):
             # Rounding is monotone, so the earlier of two times has the smaller bounds.
             toi[query] = np.fmin(toi[query], _doubles_around(*contact))
     return toi
@@ -216,10 +354,22 @@ def _undecided_triangles(points, pairs):
             yield start + query, _Triangle(*([[a, b - a] for a, b in corner] for corner in (x, y, z)))
 
 
+def _polygons(points, pairs, distance):
+    """Yields (query, _Polygon) for every query."""
+    # the distance as one more coordinate, scaled with the others
+    parts = zip(
+        _decomposed(points.reshape(len(points), 3 * points.shape[1])), _decomposed(distance[:, None]), strict=True
+    )
+    integers = _scaled_integers(*(np.concatenate(part, axis=1) for part in parts))
+    corners = np.moveaxis(_corners(integers[:, :-1].reshape(points.shape), pairs), 2, 3)
+    for query, (polygon, d) in enumerate(zip(corners.tolist(), integers[:, -1].tolist(), strict=True)):
+        yield query, _Polygon([[[a, b - a] for a, b in corner] for corner in polygon], d)
+
+
 def _corners(points, pairs):
-    """Returns the corners of the queries' triangles around the origin: shape (n, triangles, 3 corners, 2 ends, 3)."""
-    points = points.reshape(-1, 2, 4, 3)
-    return np.moveaxis(points[:, :, pairs[..., 0]] - points[:, :, pairs[..., 1]], 1, 3)
+    """Returns the corners of the queries' polygons around the origin: shape (n, ..., corners, 2 ends, 3)."""
+    points = points.reshape(len(points), 2, points.shape[1] // 2, 3)
+    return np.moveaxis(points[:, :, pairs[..., 0]] - points[:, :, pairs[..., 1]], 1, -2)
 
 
 def _decomposed(points):
@@ -233,11 +383,16 @@ def _decomposed(points):
 
 def _integers(points):
     """Scales each query by a power of two that makes its coordinates integers: an object array of Python integers."""
-    mantissa, exponent = _decomposed(points)
+    mantissa, exponent = _decomposed(points.reshape(len(points), 3 * points.shape[1]))
+    return _scaled_integers(mantissa, exponent).reshape(points.shape)
+
+
+def _scaled_integers(mantissa, exponent):
+    """Returns mantissa 2^exponent, each row times a power of two that makes it integers: an object array."""
     zeros = np.where(mantissa == 0, 0, np.frexp((mantissa & -mantissa).astype(np.float64))[1] - 1)
-    mantissa >>= zeros  # Trailing zeros go to the exponent, which keeps the integers of coarse data small.
+    mantissa = mantissa >> zeros  # Trailing zeros go to the exponent, which keeps the integers of coarse data small.
     exponent = exponent + zeros
-    lowest = np.where(mantissa == 0, np.iinfo(exponent.dtype).max, exponent).min(axis=(1, 2), keepdims=True)
+    lowest = np.where(mantissa == 0, np.iinfo(exponent.dtype).max, exponent).min(axis=1, keepdims=True)
     shift = np.where(mantissa == 0, 0, exponent - lowest)
     return mantissa.astype(object) << shift.astype(object)
 
@@ -258,10 +413,9 @@ def _may_touch(points, pairs):
     within _MARGIN for the rounding of the sums of absolute values.
     """
     # |points| <= 1 cannot overflow. What underflows here is off by less than 2^-1022, nothing beside a size of 2^-500.
-    mantissa, exponent = _decomposed(points)
-    share, power = np.frexp(mantissa.astype(np.float64))
-    power = np.where(share == 0.0, -4096, power + exponent)
-    corners = _corners(np.ldexp(share, power - power.max(axis=(1, 2), keepdims=True, initial=-4096)), pairs)
+    corners = _corners(
+        _scaled_floats(*_decomposed(points.reshape(len(points), 3 * points.shape[1]))).reshape(points.shape), pairs
+    )
     # Differences have the sign of the exact ones, or are 0.
     sides = np.sign(corners).sum(axis=(2, 3))
     may_touch = (np.abs(sides) < 6).all(axis=-1)
@@ -285,6 +439,79 @@ def _may_touch(points, pairs):
         unsure |= ~free
     may_touch[filtered] = unsure
     return may_touch
+
+
+def _scaled_floats(mantissa, exponent):
+    """Returns mantissa 2^exponent, each row times a power of two that makes its largest number at most 1."""
+    share, power = np.frexp(mantissa.astype(np.float64))
+    power = np.where(share == 0.0, -4096, power + exponent)
+    return np.ldexp(share, power - power.max(axis=1, keepdims=True, initial=-4096))
+
+
+def _near_by_filter(points, pairs, distance):
+    """Returns which queries are not proven to be free, and which are proven to collide; two bool arrays (n,).
+
+    In a part of the step a polygon stays farther than d from the origin when along a fixed direction g all its corners
+    are farther than d at both ends, thus always. It is within d when one of its points is, at one time. Where both
+    fail in a part, its halves are tried.
+
+    The bound, u = 2^-53: coordinates and d are scaled to at most 1, and the components of g are at most 1. A corner is
+    the difference of two coordinates, interpolated: off by less than 10 u in each component, and a product with g by
+    less than 100 u. A point of the polygon has weights that add up to 1 but for 4 u, and is off by less than 40 u.
+    """
+    parts = zip(
+        _decomposed(points.reshape(len(points), 3 * points.shape[1])), _decomposed(distance[:, None]), strict=True
+    )
+    scaled = _scaled_floats(*(np.concatenate(part, axis=1) for part in parts))
+    corners, limit = _corners(scaled[:, :-1].reshape(points.shape), pairs), scaled[:, -1]
+    hit = np.zeros(len(points), dtype=bool)
+    queries, starts, width = np.arange(len(points)), np.zeros(len(points)), 1.0
+    for _ in range(_HALVINGS):
+        of_part, far = corners[queries], limit[queries] + _DISTANCE_MARGIN
+
+        def at(time, ends=of_part):
+            return (1.0 - time)[:, None, None] * ends[:, :, 0] + time[:, None, None] * ends[:, :, 1]
+
+        low, middle, high = at(starts), at(starts + 0.5 * width), at(starts + width)
+        nearest = _nearest_point(middle)
+        hit[queries[np.linalg.norm(nearest, axis=1) + _DISTANCE_MARGIN <= limit[queries]]] = True
+        size = np.abs(nearest).max(axis=1, keepdims=True)
+        g = np.divide(nearest, size, out=np.zeros_like(nearest), where=size > 1e-100)
+        along = np.minimum(*((g[:, None] * end).sum(axis=2).min(axis=1) for end in (low, high)))
+        unsure = ~(along > far * np.linalg.norm(g, axis=1) + _DISTANCE_MARGIN) & ~hit[queries]
+        queries, starts, width = np.repeat(queries[unsure], 2), np.repeat(starts[unsure], 2), 0.5 * width
+        starts[1::2] += width
+    near = hit.copy()
+    near[queries] = True
+    return near, hit
+
+
+def _nearest_point(polygons):
+    """Returns about the nearest point to the origin of each polygon, shape (n, corners, 3): one of its points."""
+    best, least = polygons[:, 0], (polygons[:, 0] ** 2).sum(axis=1)
+
+    def compare(candidates):
+        nonlocal best, least
+        square = (candidates**2).sum(axis=1)
+        best = np.where((square < least)[:, None], candidates, best)
+        least = np.minimum(least, square)
+
+    n = polygons.shape[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for i in range(n if n > 2 else n - 1):
+            q, e = polygons[:, i], polygons[:, (i + 1) % n] - polygons[:, i]
+            s = np.nan_to_num(-(q * e).sum(axis=1) / (e * e).sum(axis=1), nan=0.0)
+            compare(q + s.clip(0.0, 1.0)[:, None] * e)
+        for i in range(1, n - 1):
+            x, y, z = (polygons[:, j] for j in (0, i, i + 1))
+            areas = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
+            weights = (areas * areas.sum(axis=1, keepdims=True)).sum(axis=2)
+            weights = np.where((weights >= 0.0).all(axis=1, keepdims=True), weights, np.nan)
+            weights /= weights.sum(axis=1, keepdims=True)
+            inside = np.isfinite(weights).all(axis=1)
+            weights[~inside] = 1.0, 0.0, 0.0
+            compare((weights[:, :, None] * np.stack([x, y, z], axis=1)).sum(axis=1))
+    return best
 
 
 def _variation(f):
@@ -311,8 +538,12 @@ def _dot(x, y):
     return functools.reduce(_add, map(_multiply, x, y))
 
 
+def _negated(f):
+    return [-a for a in f]
+
+
 def _cross(x, y):
-    minus_y = [[-a for a in f] for f in y]
+    minus_y = [_negated(f) for f in y]
     return [_add(_multiply(x[i], y[j]), _multiply(x[j], minus_y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
@@ -364,7 +595,9 @@ def _signed_remainders(f, g):
             for i, a in enumerate(g[:-1], start=len(remainder) - len(g)):
                 rest[i] -= factor * a
             remainder = rest
-        g = [-a for a in _trimmed(remainder)]
+        g = _trimmed(remainder)
+        content = math.gcd(*g)
+        g = [-a // content for a in g]
     return sequence
 
 
@@ -460,26 +693,79 @@ class _Triangle:
         return any(sign(square) == 0 and sign(dot) <= 0 for square, dot in self.edges)
 
     def critical(self):
-        """Returns the polynomials among whose roots the first time of contact is, unless it is 0."""
+        """Yields the polynomials among whose roots the first time of contact is, unless it is 0, each with a test."""
         if self.volume:
-            return [self.volume]
-        return [critical for square, dot in self.edges if (critical := square or dot)]
+            yield self.volume, self.touches
+        else:
+            for square, dot in self.edges:
+                if critical := square or dot:
+                    yield critical, self.touches
 
 
-def _contacts(triangle):
-    """Yields times of contact, the earliest one among them.
+class _Polygon:
+    """The polynomials of the module docstring for one moving polygon and a distance; a corner is three polynomials.
+
+    Attributes:
+        lines: The lines of the docstring, each as the polynomial of its last condition, which is at most 0; those that
+            must be positive; and those that must not be negative.
+    """
+
+    def __init__(self, corners, distance):
+        minus_d2 = -distance * distance
+
+        def line(square, length, *inside):
+            positive = [_trimmed(length)] if length != [1] else []
+            last = _add(square, [minus_d2 * a for a in length])
+            return _trimmed(last), positive, [_trimmed(f) for f in inside]
+
+        def minus(x, y):
+            return [_add(f, _negated(g)) for f, g in zip(x, y, strict=True)]
+
+        n = len(corners)
+        sides = [(corners[i], corners[(i + 1) % n]) for i in range(n if n > 2 else n - 1)]
+        areas = [_cross(q, r) for q, r in sides]
+        self.lines = [line(_dot(q, q), [1]) for q in corners]
+        for (q, r), area in zip(sides, areas, strict=True):
+            e = minus(r, q)
+            self.lines.append(line(_dot(area, area), _dot(e, e), _negated(_dot(q, e)), _dot(r, e)))
+        if n > 2:
+            x, y, z = corners[:3]
+            normal = _cross(minus(y, x), minus(z, y))
+            volume = _dot(x, normal)
+            self.lines.append(
+                line(_multiply(volume, volume), _dot(normal, normal), *(_dot(normal, area) for area in areas))
+            )
+
+    def touches(self, sign):
+        """Returns whether the polygon is within the distance at the time at which sign(polynomial) gives the signs."""
+        return any(sign(last) <= 0 and self._foot_is_inside(i, sign) for i, (last, *_) in enumerate(self.lines))
+
+    def critical(self):
+        """Yields the polynomials among whose roots the first time of contact is, unless it is 0, each with a test."""
+        for i, (last, *_) in enumerate(self.lines):
+            if last:
+                yield last, functools.partial(self._foot_is_inside, i)
+
+    def _foot_is_inside(self, i, sign):
+        """Returns whether all conditions but the last of a line hold."""
+        _, positive, inside = self.lines[i]
+        return all(sign(f) > 0 for f in positive) and all(sign(f) >= 0 for f in inside)
+
+
+def _contacts(shape):
+    """Yields times of contact of a _Triangle or a _Polygon, the earliest one among them.
 
     Yields:
         (f, lower, upper): the only root of f between two times; or (None, time, time).
     """
-    if triangle.touches(lambda q: _sign_at(q, 0)):
+    if shape.touches(lambda q: _sign_at(q, 0)):
         yield None, 0, 0
         return
-    for critical in triangle.critical():
+    for critical, touches in shape.critical():
         f = _inner_part(critical)
         for lower, upper in _isolated_roots(f):
-            if triangle.touches(lambda q, f=f, lower=lower, upper=upper: _sign_at_root(q, f, lower, upper)):
+            if touches(lambda q, f=f, lower=lower, upper=upper: _sign_at_root(q, f, lower, upper)):
                 yield f, lower, upper
                 break
-    if triangle.touches(lambda q: _sign_at(q, 1)):
+    if shape.touches(lambda q: _sign_at(q, 1)):
         yield None, 1, 1

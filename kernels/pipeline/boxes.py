@@ -25,6 +25,23 @@ def rounded(x: Any) -> wp.vec3:
 
 
 @wp.func
+def lowered(x: Any, padding: wp.float64) -> wp.vec3:
+    """A corner moved down by a padding, in single precision, rounded as by :func:`rounded`.
+
+    Both roundings keep order: boxes of elements overlap that are at most the sum of their paddings apart.
+    """
+    pad = wp.vec3d(padding, padding, padding)
+    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) - pad)
+
+
+@wp.func
+def raised(x: Any, padding: wp.float64) -> wp.vec3:
+    """A corner moved up by a padding, see :func:`lowered`."""
+    pad = wp.vec3d(padding, padding, padding)
+    return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) + pad)
+
+
+@wp.func
 def boxes_overlap(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3) -> bool:
     """Whether two closed boxes overlap."""
     return (

@@ -6,7 +6,7 @@ have representatives with overlapping boxes, so that one traversal over faces fi
 
 import warp as wp
 
-from ..polynomials import VERTEX_FACE
+from ..polynomials import VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 
 @wp.func
@@ -29,3 +29,16 @@ def vertices_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp
     if kind == VERTEX_FACE:
         return wp.vec4i(first, elements[second, 0], elements[second, 1], elements[second, 2])
     return wp.vec4i(elements[first, 0], elements[first, 1], elements[second, 0], elements[second, 1])
+
+
+@wp.func
+def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.vec4i:
+    """The vertices of a pair of any kind, as queries with a minimum distance take them: p a b a, or p q q q.
+
+    Elements are faces, or edges for (edge, edge) and (vertex, edge); (vertex, vertex) has none.
+    """
+    if kind == VERTEX_EDGE:
+        return wp.vec4i(pair[0], elements[pair[1], 0], elements[pair[1], 1], elements[pair[1], 0])
+    if kind == VERTEX_VERTEX:
+        return wp.vec4i(pair[0], pair[1], pair[1], pair[1])
+    return vertices_of_pair(kind, elements, pair)

@@ -31,6 +31,28 @@ def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here
+    const unsigned mask = __activemask();
+    const int lane = threadIdx.x & 31;
+    const int leader = __ffs(mask) - 1;
+    int base = 0;
+    if (lane == leader)
+        base = atomicAdd(&count.data[0], __popc(mask));
+    base = __shfl_sync(mask, base, leader);
+    return base + __popc(mask & ((1u << lane) - 1u));
+#else
+    return __atomic_fetch_add(&count.data[0], 1, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def take_place(count: wp.array[int]) -> int:
+    """Raises a count that a conditional of a CUDA graph may read by one, and returns what it was."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     // one atomic for all threads of a warp that are here; the sum over lower lanes, bit by bit
     const unsigned mask = __activemask();
     const int lane = threadIdx.x & 31;

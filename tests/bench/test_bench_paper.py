@@ -17,7 +17,7 @@ from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench.worst_case import find_worst
 from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
-from warp_bsc.detection.launch import one_core
+from warp_bsc.detection.launch import cores
 from warp_bsc.detection.settings import PairKind
 
 TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries=50, repeat=1)
@@ -145,7 +145,7 @@ def test_usd_scene_has_intervals(request):
 def test_worst_query_is_one_of_those_asked():
     intervals = load_intervals("crash:1000", most=1)
     queries, _ = bench_paper._gather(intervals, wp.get_device("cpu"), 2000)
-    with one_core():
+    with cores(1):
         worst = find_worst(queries[PairKind.EDGE_EDGE], wp.get_device("cpu"), repeat=1)
     assert list(worst) == list(METHODS)
     for method, query in worst.items():

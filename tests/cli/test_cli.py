@@ -248,6 +248,18 @@ def test_query_of_a_folder_with_truth_beside(capsys, tmp_path):
     assert "Truth of pairs_vf.csv from pairs_vf_mma_bool.json." in output
 
 
+def test_query_with_a_minimum_distance(capsys, tmp_path):
+    """The second vertex passes the corner (4, 0) of the face at (9, 1), sqrt(26), about 5.099, away."""
+    path = write_queries(tmp_path)
+    for distance, hits in ((5.09, [True, False]), (5.1, [True, True])):
+        found = json.loads(run(capsys, "query", path, "--min-distance", distance, "--json"))
+        assert found["min_distance"] == distance
+        assert found["files"][0]["hit"] == hits
+        assert found["files"][0]["confusion"] is None
+    assert "minimum distance 5.1" in run(capsys, "query", path, "--min-distance", "5.1")
+    assert "more than 0" in fail(capsys, "query", path, "--min-distance", "-1")
+
+
 def test_query_of_edges(capsys, tmp_path):
     rows = [(-1, 0, 1), (1, 0, 1), (0, -1, 0), (0, 1, 0), (-1, 0, -1), (1, 0, -1), (0, -1, 0), (0, 1, 0)]
     path = tmp_path / "pairs.csv"

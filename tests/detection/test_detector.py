@@ -390,7 +390,7 @@ def test_results_that_someone_holds_outlive_the_next_detection():
 
 def buffer_addresses(c):
     """Addresses of all arrays that a result owns on the device."""
-    buffers = c._vertex_face.buffer, c._edge_edge.buffer
+    buffers = [rows.buffer for rows in c._rows.values()]
     return {getattr(buffer, name).ptr for buffer in buffers for name in ContactBuffer.vars}
 
 

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
+from distances import squared_distances
 from sheets import crumpled
 
 import warp_bsc as bsc
@@ -15,7 +16,7 @@ from warp_bsc.detection.proximities import ProximityFinder
 from warp_bsc.kernels.distance import closest_points
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
-KINDS = [int(VERTEX_FACE), int(EDGE_EDGE)]
+KINDS = {"vertex_face": int(VERTEX_FACE), "edge_edge": int(EDGE_EDGE)}
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -28,38 +29,6 @@ def find_distances(
     found[i, 1] = coordinates[1]
     found[i, 2] = distance
     found[i, 3] = error
-
-
-def dot(x, y):
-    return (x * y).sum(axis=-1)
-
-
-def share(x, y):
-    """x / y in [0, 1], 0 where y is 0."""
-    positive = y > 0
-    return np.where(positive, np.minimum(np.maximum(x / np.where(positive, y, 1), 0), 1), 0)[:, None]
-
-
-def squared_distances(kind, u, v, w):
-    """Least squared distances, shape [n]: of floating-point numbers, or without rounding of fractions."""
-    uu, vv, uv, uw, vw = dot(u, u), dot(v, v), dot(u, v), dot(u, w), dot(v, w)
-    det = uu * vv - uv * uv
-    regular = np.where(det > 0, det, 1)
-    first = (uw * vv - uv * vw) / regular
-    if kind == KINDS[0]:
-        second = (vw * uu - uv * uw) / regular
-        inside = (first >= 0) & (second >= 0) & (first + second <= 1)
-        borders = [w - share(uw, uu) * u, w - share(vw, vv) * v]
-        borders.append(w - u - share(dot(w - u, v - u), dot(v - u, v - u)) * (v - u))
-        within = w - first[:, None] * u - second[:, None] * v
-    else:
-        second = (first * uv - vw) / np.where(vv > 0, vv, 1)
-        inside = (first >= 0) & (first <= 1) & (second >= 0) & (second <= 1)
-        borders = [w - share(uw, uu) * u, w + v - share(dot(w + v, u), uu) * u]
-        borders += [w + share(-vw, vv) * v, w - u + share(dot(u - w, v), vv) * v]
-        within = first[:, None] * u - w - second[:, None] * v
-    least = np.min([dot(border, border) for border in borders], axis=0)
-    return np.where((det > 0) & inside, np.minimum(least, dot(within, within)), least)
 
 
 def hard_cases(rng, n):
@@ -82,7 +51,7 @@ def test_distances_are_within_their_bound(kind):
     u, v, w = hard_cases(np.random.default_rng(3), 3000)
     arrays = [wp.array(x, dtype=wp.vec3d) for x in (u, v, w)]
     found = wp.zeros((len(u), 4), dtype=wp.float64)
-    wp.launch(find_distances, len(u), inputs=[kind, *arrays], outputs=[found])
+    wp.launch(find_distances, len(u), inputs=[KINDS[kind], *arrays], outputs=[found])
     found = found.numpy()
     assert ((found[:, :2] >= 0) & (found[:, :2] <= 1)).all()
     exact = [np.vectorize(Fraction, otypes=[object])(x) for x in (u, v, w)]
@@ -103,21 +72,24 @@ def all_near(mesh, x, distance):
     joined[tuple(np.array(sorted(neighbours)).T)] = True
     x = x.astype(np.float64)
     near = []
-    for kind, elements, firsts in ((0, mesh.faces, mesh.vertices[:, None]), (1, mesh.edges, mesh.edges)):
+    for kind, elements, firsts in (
+        ("vertex_face", mesh.faces, mesh.vertices[:, None]),
+        ("edge_edge", mesh.edges, mesh.edges),
+    ):
         i, j = (index.ravel() for index in np.indices((len(firsts), len(elements))))
         first, second = firsts[i], elements[j]
         apart = ~joined[first[:, :, None], second[:, None, :]].any(axis=(1, 2))
         if mesh.world is not None:
             apart &= mesh.world[first[:, 0]] == mesh.world[second[:, 0]]
-        if kind:
+        if kind == "edge_edge":
             apart &= i < j
         i, j, first, second = i[apart], j[apart], x[first[apart]], x[second[apart]]
-        if kind:
+        if kind == "edge_edge":
             u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], second[:, 0] - first[:, 0]
         else:
             u, v, w = second[:, 1] - second[:, 0], second[:, 2] - second[:, 0], first[:, 0] - second[:, 0]
             i = mesh.vertices[i]
-        distances = np.sqrt(squared_distances(KINDS[kind], u, v, w))
+        distances = np.sqrt(squared_distances(kind, u, v, w))
         kept = distances <= distance
         near.append(
             {pair: d for *pair, d in zip(i[kept], j[kept], distances[kept], strict=True) for pair in [tuple(pair)]}

@@ -9,7 +9,7 @@ from generators import GENERATORS
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.launch import one_core
+from warp_bsc.detection.launch import cores
 from warp_bsc.kernels import FREE, HIT, UNSURE, impact_edge_edge, impact_vertex_face, roots
 from warp_bsc.kernels.exact.polygon import BITS
 
@@ -64,7 +64,7 @@ def test_answers_are_true(kind, dtype):
     status, toi = wp.zeros(n, dtype=int, device="cpu"), wp.zeros(n, dtype=wp.float64, device="cpu")
     x = wp.array(points, dtype=wp.vec3 if dtype is np.float32 else wp.vec3d, device="cpu")
     query = getattr(bsc, f"query_{kind}")
-    with subnormals_flushed(), one_core():
+    with subnormals_flushed(), cores(1):
         conservative, exact = (query(points, method=method, device="cpu") for method in ("conservative", "exact"))
         wp.launch(KERNELS[dtype], n, inputs=[kind == "edge_edge", x], outputs=[status, toi], device="cpu")
         checked = getattr(checker, kind)(points)
@@ -93,7 +93,7 @@ def test_intersections_are_true(dtype):
     faces = mesh.edges[:, 0] // 3 ^ 1  # the other one of the pair
     truth = checker.edge_face_crossings(x[mesh.edges], x[mesh.faces[faces]])
     assert 50 < truth.sum() < len(edges) - 50
-    with subnormals_flushed(), one_core():
+    with subnormals_flushed(), cores(1):
         found = bsc.CollisionDetector(mesh).find_intersections(x)
     assert np.array_equal(found, np.stack([edges, faces], axis=1)[truth])
 

@@ -10,7 +10,7 @@ from pxr import Ts
 from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
-from warp_bsc.replay.intervals import IntervalResult, IntervalSummary
+from warp_bsc.replay.results import IntervalResult, IntervalSummary
 from warp_bsc.usd.interval import Interval
 from warp_bsc.usd.scene import FrameRange
 
@@ -102,7 +102,7 @@ def test_the_program_of_the_documentation(stage, capsys):
     "import warp_bsc as bsc; bsc.replay; import warp_bsc.replay.summary",
     "import warp_bsc.replay.summary; import warp_bsc as bsc",
     "import warp_bsc as bsc; from warp_bsc.replay import summary, html_report",
-    "from warp_bsc.replay.intervals import IntervalResult; import warp_bsc as bsc",
+    "from warp_bsc.replay.results import IntervalResult; import warp_bsc as bsc",
     "import warp_bsc.cli.replay; import warp_bsc as bsc; bsc.Scene",
 ])  # fmt: skip
 def test_the_function_is_found_whatever_is_imported(script):

@@ -67,7 +67,11 @@ def replay(stage, *options, status=0):
 def errors_of(stage):
     """What usdchecker finds wrong."""
     validation = pytest.importorskip("pxr.UsdValidation")
-    validators = validation.ValidationRegistry().GetOrLoadAllValidators()
+    validators = [
+        validator
+        for validator in validation.ValidationRegistry().GetOrLoadAllValidators()
+        if not validator.GetMetadata().name.startswith("warp_bsc.")  # our own rule finds the collisions
+    ]
     return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
 
 

@@ -119,6 +119,24 @@ def test_plates_that_close_on_cloth(iterations, device):
     assert rollout.solver.report.frozen_steps == rollout.solver.report.truncated_steps == 0
 
 
+def test_a_pile_takes_few_rounds(device):
+    """All near pairs are divided at once: one layer after the other would take up to 14 rounds."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
+    for layer in range(16):
+        add_patch(builder, 5, 0.02, (0.002 * layer, 0.0015 * layer, 0.0002 * (layer + 1)))
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
+    rounds = []
+    for _ in range(16):
+        rollout.step(1.0 / 600.0)
+        rounds.append(rollout.solver.report.rounds)
+    report = rollout.solver.report
+    assert report.uncertified_steps == report.truncated_steps == 0
+    assert rollout.collisions == 0 and report.hits > 50
+    assert max(rounds) <= 4, rounds
+
+
 @wp.kernel(enable_backward=False)
 def _divide(
     # in

@@ -15,10 +15,10 @@ from warp_bsc.response.buffers import NEVER
 CAPACITY = 4
 
 
-def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None):
+def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, padding=None):
     """The broad phase of a GPU, which stages on the CPU get here too."""
     assert checked_vertices is None
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, padding=padding)
 
 
 def stage(model, monkeypatch, *, tiny):

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from ..detection.launch import one_core, retry_until_fits
+from ..detection.launch import cores, retry_until_fits
 from ..detection.mesh import CollisionMesh
 from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import PairKind
@@ -346,7 +346,7 @@ def _compare(
 def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
     """Mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
     if place.cores == 1:
-        with one_core():
+        with cores(1):
             return _time_methods_here(queries, place, effort, worst=True)
     return _time_methods_here(queries, place, effort, worst=place.device.is_cuda)
 
@@ -362,7 +362,7 @@ def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Pl
     for place in places:
         if place.cores in (1, None):
             queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
-            with one_core() if place.cores == 1 else contextlib.nullcontext():
+            with cores(1) if place.cores == 1 else contextlib.nullcontext():
                 found.append((place, _find_slowest(queries, place, effort)))
     return found
 

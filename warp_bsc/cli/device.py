@@ -1,8 +1,6 @@
 """Finds the Warp device and loads kernels, with a message if they have to be compiled."""
 
 import contextlib
-import os
-import sys
 import threading
 from collections.abc import Iterator
 
@@ -10,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ..detection import start
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
@@ -26,27 +25,10 @@ def find_device(name: str | None) -> wp.Device:
     Raises:
         ValueError: If there is no such device.
     """
-    _start_warp()
-    if name is None:
-        return wp.get_preferred_device()
-    known = [device.alias for device in wp.get_devices()] + ["cuda"] * wp.is_cuda_available()
-    if name not in known:
-        raise ValueError(f"--device {name}: there is no such device here, only {', '.join(known)}")
-    return wp.get_device(name)
-
-
-def _start_warp() -> None:
-    """Initializes Warp without the line that its native library prints to standard error if there is no CUDA driver."""
-    wp.config.log_level = wp.LOG_WARNING
-    sys.stderr.flush()
-    stderr = os.dup(2)
     try:
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-            wp.init()
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+        return start.find_device(name)
+    except ValueError as error:
+        raise ValueError(f"--device {error}") from None
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """The command ``warp-bsc query``: answers the elementary queries of CSV files."""
 
 import argparse
+import dataclasses
 import json
 import time
 from collections.abc import Callable
@@ -9,7 +10,15 @@ import numpy as np
 
 from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
-from .options import EXIT_STATUS, Commands, add_command, add_detection_options, add_fail_on_collision, add_json
+from .options import (
+    EXIT_STATUS,
+    Commands,
+    add_command,
+    add_detection_options,
+    add_fail_on_collision,
+    add_json,
+    positive_number,
+)
 from .query_file import KINDS, find_query_files, read_query_file
 from .query_tables import QueryAnswers, print_queries, queries_to_dict
 from .tables import Console
@@ -27,6 +36,7 @@ examples:
   warp-bsc query 227vf.csv 227ee.csv
   warp-bsc query unit-tests --method float
   warp-bsc query pairs.csv --kind edge-edge --json > answers.json
+  warp-bsc query 227vf.csv --min-distance 0.001
 
 {EXIT_STATUS}"""
 
@@ -46,6 +56,14 @@ def add_to(commands: Commands) -> None:
         choices=KINDS,
         help="kind of the queries (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
     )
+    command.add_argument(
+        "--min-distance",
+        type=positive_number,
+        default=0.0,
+        metavar="D",
+        help="pairs collide that come within D of each other, in the unit of the points (default: that touch); true "
+        "answers in the files, which are those without a distance, are not compared then",
+    )
     add_detection_options(command, method="exact")
     add_json(command)
     add_fail_on_collision(command)
@@ -54,7 +72,10 @@ def add_to(commands: Commands) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     files = [read_query_file(path, kind=arguments.kind) for path in find_query_files(arguments.paths)]
     device = find_device(arguments.device)
-    options = {"method": arguments.method, "toi": arguments.json, "device": device}
+    if arguments.min_distance:
+        files = [dataclasses.replace(file, truth=None, truth_path=None) for file in files]
+    options = {"method": arguments.method, "min_distance": arguments.min_distance, "toi": arguments.json}
+    options["device"] = device
     with loading_kernels(device):
         for kind in {file.kind for file in files}:
             _QUERIES[kind](np.zeros((1, 8, 3)), **options)
@@ -63,8 +84,9 @@ def _run(arguments: argparse.Namespace) -> int:
         start = time.perf_counter()
         result = _QUERIES[file.kind](file.points, **options)
         answers.append(QueryAnswers(file, result, 1e3 * (time.perf_counter() - start)))
+    said = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
     if arguments.json:
-        print(json.dumps(queries_to_dict(answers, method=arguments.method, device=str(device))))
+        print(json.dumps(queries_to_dict(answers, **said)))
     else:
-        print_queries(Console(), answers, method=arguments.method, device=str(device))
+        print_queries(Console(), answers, **said)
     return 1 if arguments.fail_on_collision and any(answer.hits for answer in answers) else 0

@@ -55,7 +55,9 @@ class QueryAnswers:
         }
 
 
-def print_queries(console: Console, answers: list[QueryAnswers], *, method: str, device: str) -> None:
+def print_queries(
+    console: Console, answers: list[QueryAnswers], *, method: str, device: str, min_distance: float
+) -> None:
     """Prints the answers to query files and, where the truth is known, compares them with it.
 
     Args:
@@ -63,9 +65,11 @@ def print_queries(console: Console, answers: list[QueryAnswers], *, method: str,
         answers: The answers to each file.
         method: The method.
         device: The device.
+        min_distance: Distance up to which pairs collide; 0 if they must touch.
     """
     folder = os.path.commonpath([answer.file.path.absolute().parent for answer in answers])
-    say(console, f"{count(len(answers), 'file')} in {folder}; method {method} on {device}")
+    distance = f"; minimum distance {min_distance:g}" if min_distance else ""
+    say(console, f"{count(len(answers), 'file')} in {folder}; method {method} on {device}{distance}")
     say(console, "Free, hit and unsure: the certificates of floating point, the same for every method.")
     table = make_table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
     _add_files(
@@ -86,11 +90,12 @@ def print_queries(console: Console, answers: list[QueryAnswers], *, method: str,
             say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
 
 
-def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str) -> dict[str, Any]:
+def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str, min_distance: float) -> dict[str, Any]:
     """The answers as plain data for JSON. Arguments: as of :func:`print_queries`."""
     return {
         "method": method,
         "device": device,
+        "min_distance": min_distance,
         "files": [
             {
                 "path": str(answer.file.path),

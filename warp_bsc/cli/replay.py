@@ -9,20 +9,23 @@ import os
 import shlex
 import time
 from collections.abc import Generator
+from dataclasses import asdict
 from typing import Any
 
-import warp as wp
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .._atomic_file import STDOUT, naming
 from ..replay.baseline import Baseline
-from ..replay.hit_files import HitsCsv, HitsJson
+from ..replay.earlier import EarlierReplay
+from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
 from ..replay.html_report import ReportPage
-from ..replay.intervals import IntervalResult, replay
+from ..replay.intervals import replay
 from ..replay.outputs import ReplayOutput
+from ..replay.results import IntervalResult
 from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
 from ..replay.usd_overlay import SHOWN_BY, Overlay
+from ..replay.workers import device_of_cluster
 from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
@@ -37,7 +40,7 @@ from .options import (
     positive,
     positive_number,
 )
-from .replay_tables import print_new, print_replay
+from .replay_tables import print_new, print_replay, print_work
 from .tables import Console, say
 
 __all__ = ["add_to", "open_scene", "run_replay"]
@@ -65,6 +68,8 @@ examples:
   warp-bsc replay cloth.usd --min-distance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
+  warp-bsc replay shot.usd --workers 16 --json hits.json --resume
+  warp-bsc replay shot.usd --scheduler tcp://head:8786 --report hits.html
 
   a recording of one of Newton's examples:
   python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
@@ -215,11 +220,37 @@ def add_to(commands: Commands) -> None:
         help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces), "
         "collisions, distance (what --min-distance finds), new (what --baseline does not have)",
     )
+    run = command.add_argument_group("running")
+    run.add_argument(
+        "--workers",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="check intervals in N processes on this machine, which share its cores, or use a GPU each, in turns, "
+        "unless --device names one (default: 1)",
+    )
+    run.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="check intervals in the workers of a Dask cluster with this scheduler, which must see the scene by the "
+        "same path; needs pip install 'warp-bsc[cluster]'",
+    )
+    run.add_argument(
+        "--resume",
+        action="store_true",
+        help="take what the file of --json has of an earlier run with the same options and files, which was stopped, "
+        "and check the rest; without that file, check all",
+    )
     add_detection_options(command, method="exact")
 
 
 def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
+    if arguments.scheduler:
+        try:
+            return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device))
+        except ModuleNotFoundError as error:
+            raise ValueError(f"--scheduler: {error}") from error
     device = find_device(arguments.device)
     with loading_kernels(device):
         load_detector(
@@ -229,7 +260,7 @@ def _run(arguments: argparse.Namespace) -> int:
             intersections=arguments.intersections,
             proximities=arguments.min_distance is not None,
         )
-    return run_replay(scene, arguments, device)
+    return run_replay(scene, arguments, str(device))
 
 
 def open_scene(arguments: argparse.Namespace) -> Scene:
@@ -253,6 +284,10 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--fail-on distance needs --min-distance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
         raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
+    if arguments.resume and arguments.json in (None, STDOUT):
+        raise ValueError("--resume needs --json FILE")
+    if arguments.scheduler and arguments.workers > 1:
+        raise ValueError("--workers, --scheduler: either processes on this machine, or those of a cluster")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
     places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
@@ -290,35 +325,44 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     return scene
 
 
-def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> int:
+def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
     """Replays a scene, writes the files that the options name, and returns the exit status.
 
     Args:
         scene: The scene.
         arguments: The options.
-        device: The Warp device.
+        device: Name of the Warp device.
 
     Raises:
         ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
             disk, as far as it has space.
     """
-    settings = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
+    settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
+    facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
     baseline = Baseline(arguments.baseline) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
-        outputs = _open_outputs(stack, scene, arguments, settings)
+        earlier = None
+        if arguments.resume and os.path.exists(arguments.json):
+            earlier = stack.enter_context(contextlib.closing(EarlierReplay(arguments.json, facts)))
+        outputs = _open_outputs(stack, scene, arguments, facts)
         intervals, interrupt, problems = [], None, []
+        works, writing = [], 0.0
 
         def write(result: IntervalResult) -> None:
+            nonlocal writing
+            started = time.perf_counter()
             scene.files.check()
             for output in outputs:
                 with naming(output.file.name):
                     output.add(result)
             intervals.append(result.summary)
+            works.append(result.work)
+            writing += time.perf_counter() - started
 
         written = stack.enter_context(contextlib.closing(WriteBehind(write)))
         with INTERRUPTS.held():
             try:
-                with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, device)) as found:
+                with INTERRUPTS.raised(), contextlib.closing(_track(scene, arguments, earlier)) as found:
                     for result in found:
                         written.put(result)
                         INTERRUPTS.check()
@@ -351,6 +395,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -
             with naming("standard output"):
                 console = Console()
                 print_replay(console, summary)
+                print_work(console, works, writing)
                 if baseline:
                     print_new(console, baseline.new_in(summary))
                 for output in finished:
@@ -414,11 +459,11 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
 
 
 def _open_outputs(
-    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, settings: dict[str, Any]
+    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, facts: dict[str, Any]
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
-        (arguments.json, lambda path: HitsJson(path, scene=scene, **settings)),
+        (arguments.json, lambda path: HitsJson(path, facts=facts)),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
@@ -468,21 +513,35 @@ class _Progress:
             say(self._bar.console, f"{self._what}: {done} of {total}, {note}, about {left:,.0f} s left")
 
 
-def _track(scene: Scene, arguments: argparse.Namespace, device: wp.Device) -> Generator[IntervalResult, None, None]:
-    """Yields the intervals as they are found, and shows progress, rate and time left."""
+def _track(
+    scene: Scene, arguments: argparse.Namespace, earlier: EarlierReplay | None
+) -> Generator[IntervalResult, None, None]:
+    """Yields the intervals of an earlier replay, then the others as they are found; shows progress and time left."""
     with _Progress("Replaying") as progress:
         progress.show(0, len(scene))
         for result in replay(
             scene,
             method=arguments.method,
-            device=device,
+            device=arguments.device,
             intersections=arguments.intersections,
             ignore_initial=arguments.ignore_initial,
             min_distance=arguments.min_distance,
             validate_most=arguments.validate,
+            earlier=earlier.results(scene) if earlier else (),
+            workers=arguments.workers,
+            scheduler=arguments.scheduler,
         ):
             yield result
             progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
+
+
+def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
+    selection = asdict(scene.selection)
+    del selection["ignored_names"]  # found, not chosen
+    names = "frames", "subdivide", "strict", "intersections", "ignore_initial", "validate"
+    options = {name: getattr(arguments, name) for name in names}
+    return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}
 
 
 def _reasons(text: str) -> frozenset[str]:

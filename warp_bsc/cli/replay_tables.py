@@ -5,12 +5,12 @@ from collections import defaultdict
 from rich.console import Console
 from rich.text import Text
 
-from ..replay.intervals import IntervalSummary
+from ..replay.results import IntervalSummary, Work
 from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .tables import LONGEST, count, make_table, say
 
-__all__ = ["print_new", "print_replay"]
+__all__ = ["print_new", "print_replay", "print_work"]
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -73,10 +73,40 @@ def print_replay(console: Console, summary: Summary) -> None:
         )
     if summary.validation:
         _print_validation(console, summary.validation)
-    if scene.is_still:
+
+
+def print_work(console: Console, works: list[Work | None], writing: float) -> None:
+    """Prints which part of the work took how long.
+
+    Args:
+        console: The terminal or file to print to.
+        works: The work for each interval, None for those found earlier.
+        writing: Time to write all of them [s].
+    """
+    done = [work for work in works if work]
+    if len(done) < len(works):
+        say(console, f"Taken from an earlier run: {count(len(works) - len(done), 'interval')}.")
+    if not done:
         return
-    total = sum(summary.milliseconds.values())
-    say(console, f"Detection took {total:,.0f} ms, {total / max(1, len(intervals)):,.1f} ms an interval.")
+    times = {"reading": sum(work.reading for work in done), "checking": sum(work.checking for work in done)}
+    times["writing"] = writing
+    total = max(sum(times.values()), 1e-9)
+    shares = ", ".join(f"{name} {seconds:,.2f} s ({seconds / total:.0%})" for name, seconds in times.items())
+    longest = max(work.reading + work.checking for work in done)
+    say(
+        console,
+        f"Work: {shares}. Reading and checking took {1e3 * (total - writing) / len(done):,.1f} ms an interval, at most "
+        f"{1e3 * longest:,.1f} ms.",
+    )
+    by_worker = defaultdict(list)
+    for work in done:
+        by_worker[work.worker].append(work.reading + work.checking)
+    if "" in by_worker:  # this process alone
+        return
+    for worker, seconds in sorted(by_worker.items())[:LONGEST]:
+        say(console, f"  {worker}: {count(len(seconds), 'interval')}, {sum(seconds):,.2f} s")
+    if len(by_worker) > LONGEST:
+        say(console, f"  and {len(by_worker) - LONGEST} more workers.")
 
 
 def print_new(console: Console, new: list[tuple[tuple[str, str], float, float]]) -> None:
@@ -115,7 +145,7 @@ def _print_certificate(console: Console, summary: Summary) -> None:
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
     """Prints the intervals, those with the most collisions first."""
     arrow = "->" if console.options.ascii_only else "→"
-    stages = list(listed[0].stats.milliseconds)
+    stages = list(dict.fromkeys(stage for interval in listed for stage in interval.stats.milliseconds))
     at_rest = listed[0].intersections is not None
     while True:
         headers = [
@@ -138,7 +168,7 @@ def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
                 f"{interval.hits:,}",
                 f"{round(interval.earliest.time, 6):.6g}",
                 *(f"{found.crossings + found.touches:,}" for found in (interval.intersections or ())[:1]),
-                *(f"{interval.stats.milliseconds[stage]:,.1f}" for stage in stages),
+                *(f"{times[stage]:,.1f}" if (times := interval.stats.milliseconds) else "" for stage in stages),
             )
         wide = console.options.update(width=1000)
         if not stages or console.measure(table, options=wide).maximum <= console.width:

@@ -64,6 +64,26 @@ class BroadPhase(Protocol):
         """
         ...
 
+    def pair_points(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_edge_counts: wp.array,
+        vertex_edge: wp.array,
+        vertex_vertex_counts: wp.array,
+        vertex_vertex: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+    ) -> None:
+        """Counts and enqueues the candidates of points with the edges that no face has, and with points.
+
+        Call it after :meth:`pair_elements`, with the same arguments but queues for (point, edge) and (point, point),
+        the smaller first. A mesh without points has none.
+        """
+        ...
+
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
@@ -93,6 +113,7 @@ def make_broad_phase(
     capacity: int | None = None,
     not_finite: wp.array | None = None,
     checked_vertices: np.ndarray | None = None,
+    padding: wp.array | None = None,
 ) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
 
@@ -103,10 +124,12 @@ def make_broad_phase(
         not_finite: Number of vertices with a position that is not finite, array of one int64, which a run on a GPU adds
             to; None to count none.
         checked_vertices: Indices of the vertices that are counted; None for all.
+        padding: How far the box of each vertex reaches beyond it, those of an edge or a face as far as the largest of
+            its vertices, array of float64; None for boxes without a padding.
     """
     if mesh.device.is_cpu:
-        return BroadPhaseSimd(mesh, count)
+        return BroadPhaseSimd(mesh, count, padding=padding)
     checked = None
     if checked_vertices is not None and len(checked_vertices) < mesh.vertex_count:
         checked = wp.array(np.isin(np.arange(mesh.vertex_count), checked_vertices), dtype=int, device=mesh.device)
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked, padding=padding)

@@ -1,8 +1,9 @@
 """The broad phase of a GPU: one traversal of a hierarchy of boxes over the faces finds all pairs of elements.
 
 The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
-compact however a mesh moves. A run only fits its boxes. Faces without neighbours have no such order, and are compared
-by brute force in the worst case, 1,024 pairs of faces at a time.
+compact however a mesh moves. A run only fits its boxes. Edges that no face has and points have places as well, as faces
+that have collapsed: the cells of the mesh are its faces, then these edges, then the points. Cells without neighbours
+have no such order, and are compared by brute force in the worst case, 1,024 pairs of cells at a time.
 """
 
 import functools
@@ -13,7 +14,16 @@ import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.bits import lowest_bit
-from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box, rounded, write_box
+from ..kernels.pipeline.boxes import (
+    BoxRows,
+    boxes_apart,
+    boxes_overlap,
+    lowered,
+    raised,
+    read_box,
+    rounded,
+    write_box,
+)
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
@@ -26,7 +36,7 @@ from ..kernels.pipeline.hierarchy import (
     overlapping_faces,
 )
 from ..kernels.pipeline.pairs import owns_edge, owns_vertex
-from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slots, write
+from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
 from .launch import most_blocks
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, Count, capacity_for
@@ -45,7 +55,9 @@ _QUEUED = wp.constant(int(Count.QUEUED))
 _WIDTH = wp.constant(WIDTH)
 
 _PAIRS_OF_THREAD = wp.constant(4)
-"""Pairs of faces whose elements a thread pairs."""
+"""Most pairs of faces whose elements a thread pairs."""
+_PAIRS_AT_ONCE = wp.constant(wp.int64(1 << 17))
+"""Pairs of faces that a GPU works on at once, each by a thread of its own."""
 _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
 
@@ -67,7 +79,9 @@ class FaceHierarchy:
     are not set.
 
     Attributes:
-        order: Face at each place, -1 for none.
+        face_count: Number of faces; greater cells are edges.
+        point_start: First cell that is a point.
+        order: Cell at each place, -1 for none.
         faces: Vertices of the face at each place.
         face_edges: Edges of the face at each place.
         owned: What the face at each place is the representative of.
@@ -82,6 +96,8 @@ class FaceHierarchy:
         groups: Highest level; without arrays in a small mesh, where all groups are traversed.
     """
 
+    face_count: int
+    point_start: int
     order: wp.array[int]
     faces: wp.array2d[int]
     face_edges: wp.array2d[int]
@@ -105,25 +121,47 @@ def empty_box() -> BoxRows:
 
 
 @functools.cache
-def _box_elements(dtype: type) -> wp.Kernel:
-    """The kernel that boxes moving elements and clusters, for one type of position.
+def _box_elements(dtype: type, padded: bool) -> wp.Kernel:
+    """The kernel that boxes moving elements and clusters, for one type of position, with or without a padding.
 
     Its threads are the places of faces, then the edges, then the vertices.
     """
+
+    @wp.func
+    def padding_of(padding: wp.array[wp.float64], vertex: int) -> wp.float64:
+        """Returns the padding of a vertex; without one the array is not read."""
+        if wp.static(padded):
+            return padding[vertex]
+        return wp.float64(0.0)
+
+    @wp.func
+    def lowest(x: Any, pad: wp.float64) -> wp.vec3:
+        if wp.static(padded):
+            return lowered(x, pad)
+        return rounded(x)
+
+    @wp.func
+    def highest(x: Any, pad: wp.float64) -> wp.vec3:
+        if wp.static(padded):
+            return raised(x, pad)
+        return rounded(x)
 
     @wp.func
     def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
         return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
 
     @wp.func
-    def box_of_two(x0: wp.array[dtype], x1: wp.array[dtype], a: int, b: int, finite: bool) -> BoxRows:
+    def box_of_two(
+        x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], a: int, b: int, finite: bool
+    ) -> BoxRows:
         """Returns the box of two vertices, an empty one if that is not finite."""
         if finite:
+            pad = wp.max(padding_of(padding, a), padding_of(padding, b))
             return wp.matrix_from_rows(
-                rounded(wp.min(x0[a], x0[b])),
-                rounded(wp.max(x0[a], x0[b])),
-                rounded(wp.min(x1[a], x1[b])),
-                rounded(wp.max(x1[a], x1[b])),
+                lowest(wp.min(x0[a], x0[b]), pad),
+                highest(wp.max(x0[a], x0[b]), pad),
+                lowest(wp.min(x1[a], x1[b]), pad),
+                highest(wp.max(x1[a], x1[b]), pad),
             )
         return empty_box()
 
@@ -134,6 +172,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
         x1: wp.array[dtype],
         changed: wp.array[int],
         checked: wp.array[int],
+        padding: wp.array[wp.float64],
         # in and out
         mesh: FaceHierarchy,
         # out
@@ -150,10 +189,11 @@ def _box_elements(dtype: type) -> wp.Kernel:
                 a = mesh.faces[i, 0]
                 b = mesh.faces[i, 1]
                 c = mesh.faces[i, 2]
-                low0 = rounded(wp.min(wp.min(x0[a], x0[b]), x0[c]))
-                high0 = rounded(wp.max(wp.max(x0[a], x0[b]), x0[c]))
-                low1 = rounded(wp.min(wp.min(x1[a], x1[b]), x1[c]))
-                high1 = rounded(wp.max(wp.max(x1[a], x1[b]), x1[c]))
+                pad = wp.max(wp.max(padding_of(padding, a), padding_of(padding, b)), padding_of(padding, c))
+                low0 = lowest(wp.min(wp.min(x0[a], x0[b]), x0[c]), pad)
+                high0 = highest(wp.max(wp.max(x0[a], x0[b]), x0[c]), pad)
+                low1 = lowest(wp.min(wp.min(x1[a], x1[b]), x1[c]), pad)
+                high1 = highest(wp.max(wp.max(x1[a], x1[b]), x1[c]), pad)
                 finite = is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c)
                 if not finite:  # the place covers the other elements that it represents
                     low0 = low
@@ -163,12 +203,10 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     for corner in range(3):
                         vertex = mesh.faces[i, corner]
                         if is_finite(x0, x1, vertex):
-                            start = rounded(x0[vertex])
-                            end = rounded(x1[vertex])
-                            low0 = wp.min(low0, start)
-                            high0 = wp.max(high0, start)
-                            low1 = wp.min(low1, end)
-                            high1 = wp.max(high1, end)
+                            low0 = wp.min(low0, lowest(x0[vertex], pad))
+                            high0 = wp.max(high0, highest(x0[vertex], pad))
+                            low1 = wp.min(low1, lowest(x1[vertex], pad))
+                            high1 = wp.max(high1, highest(x1[vertex], pad))
                 low = wp.min(low0, low1)
                 high = wp.max(high0, high1)
                 box = wp.matrix_from_rows(low0, high0, low1, high1)
@@ -188,7 +226,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
             a = mesh.edges[edge, 0]
             b = mesh.edges[edge, 1]
             finite = is_finite(x0, x1, a) and is_finite(x0, x1, b)
-            write_box(box_of_two(x0, x1, a, b, finite), mesh.edge_boxes, mesh.edge_rows[edge])
+            write_box(box_of_two(x0, x1, padding, a, b, finite), mesh.edge_boxes, mesh.edge_rows[edge])
             return
         vertex = edge - mesh.edges.shape[0]
         finite = is_finite(x0, x1, vertex)
@@ -201,7 +239,7 @@ def _box_elements(dtype: type) -> wp.Kernel:
                     raise_count(not_finite, 0, 1)
         row = mesh.vertex_rows[vertex]
         if row >= 0:
-            write_box(box_of_two(x0, x1, vertex, vertex, finite), mesh.vertex_boxes, row)
+            write_box(box_of_two(x0, x1, padding, vertex, vertex, finite), mesh.vertex_boxes, row)
 
     return box_elements
 
@@ -317,7 +355,7 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
     """
     owned = mesh.owned[face]
     found = int(0)
-    if owned & 7 == 0:
+    if owned & 7 == 0 or mesh.order[other] >= mesh.face_count:
         return found
     other_box = read_box(mesh.face_boxes, other)
     corners = int(3)  # not a constant, as the body would be repeated
@@ -368,22 +406,25 @@ def _pair_elements(
     mesh: FaceHierarchy,
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
+    threads: int,
     keep_separated: bool,
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """First finds all pairs, then takes slots for them: one atomic of a warp for 128 pairs of faces.
+    """First finds all pairs, then takes slots for them: where pairs of faces are many, one atomic of a warp for 128.
 
     Atomics on one address take turns, so that few of them are better.
     """
     i = wp.tid()
-    first = (i / _WIDTH) * _PAIRS_OF_THREAD * _WIDTH + i % _WIDTH
+    count = face_pair_count[0]
+    turns = int(wp.max((count - wp.int64(1)) / wp.int64(threads) + wp.int64(1), count / _PAIRS_AT_ONCE))
+    turns = wp.min(turns, _PAIRS_OF_THREAD)
+    first = (i / _WIDTH) * turns * _WIDTH + i % _WIDTH
     found = wp.uint64(0)
     candidates = wp.vec2i()  # vertex-face, edge-edge
     queued = wp.vec2i()
-    turns = int(_PAIRS_OF_THREAD)  # not a constant, as the body would be repeated
     for turn in range(turns):
         at = first + turn * _WIDTH
         if is_filled(at, face_pairs, face_pair_count, 0):
@@ -430,7 +471,7 @@ def _pair_edges_with_face(
 ):
     """Enqueues the edges that a face owns with another face."""
     owned = mesh.owned[face]
-    sides = wp.where(owned >> 3 == 0, 0, 3)
+    sides = wp.where(owned >> 3 == 0 or mesh.order[other] >= mesh.face_count, 0, 3)
     for side in range(sides):
         if owns_edge(owned, side):
             row = 3 * face + side
@@ -456,6 +497,57 @@ def _pair_edges_with_faces(
     other = face_pairs[i][1]
     _pair_edges_with_face(mesh, face, other, counts, pairs)
     _pair_edges_with_face(mesh, other, face, counts, pairs)
+
+
+@wp.func
+def _pair_point(
+    mesh: FaceHierarchy,
+    place: int,
+    other: int,
+    keep_separated: bool,
+    vertex_edge_counts: wp.array[wp.int64],
+    vertex_edge: wp.array[wp.vec2i],
+):
+    """Enqueues a point with an edge that no face has, if the cells at two places are that."""
+    cell = mesh.order[other]
+    if mesh.order[place] >= mesh.point_start and cell >= mesh.face_count and cell < mesh.point_start:
+        box = read_box(mesh.vertex_boxes, 3 * place)
+        other_box = read_box(mesh.edge_boxes, 3 * other)
+        if _overlap(box, other_box):
+            take_slot(vertex_edge_counts, _CANDIDATES)
+            if keep_separated or not _apart(box, other_box):
+                append(
+                    wp.vec2i(mesh.faces[place, 0], mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED
+                )
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _pair_points(
+    mesh: FaceHierarchy,
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    keep_separated: bool,
+    vertex_edge_counts: wp.array[wp.int64],
+    vertex_edge: wp.array[wp.vec2i],
+    vertex_vertex_counts: wp.array[wp.int64],
+    vertex_vertex: wp.array[wp.vec2i],
+):
+    i = wp.tid()
+    if not is_filled(i, face_pairs, face_pair_count, 0):
+        return
+    place = face_pairs[i][0]
+    other = face_pairs[i][1]
+    _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)
+    _pair_point(mesh, other, place, keep_separated, vertex_edge_counts, vertex_edge)
+    if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
+        box = read_box(mesh.vertex_boxes, 3 * place)
+        other_box = read_box(mesh.vertex_boxes, 3 * other)
+        if _overlap(box, other_box):
+            take_slot(vertex_vertex_counts, _CANDIDATES)
+            if keep_separated or not _apart(box, other_box):
+                p = mesh.faces[place, 0]
+                q = mesh.faces[other, 0]
+                append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
 
 
 def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
@@ -492,15 +584,16 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
         return wp.array(values[order] if len(order) else values, dtype=int, device=device)
 
     hierarchy.order = wp.array(order, dtype=int, device=device)
-    hierarchy.faces = by_place(mesh.faces)
-    hierarchy.face_edges = by_place(mesh.face_edges)
-    hierarchy.owned = by_place(mesh.owned)
+    hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
+    hierarchy.faces = by_place(mesh.cells)
+    hierarchy.face_edges = by_place(mesh.cell_edges)
+    hierarchy.owned = by_place(mesh.cell_owned)
     hierarchy.edges = mesh.device_edges
     vertex_rows, edge_rows = np.full(mesh.vertex_count, -1), np.empty(len(mesh.edges))
     filled = np.flatnonzero(order >= 0)
     for i in range(3):
-        for rows, elements, bit in ((vertex_rows, mesh.faces, i), (edge_rows, mesh.face_edges, 3 + i)):
-            representing = filled[(mesh.owned[order[filled]] >> bit) & 1 == 1]
+        for rows, elements, bit in ((vertex_rows, mesh.cells, i), (edge_rows, mesh.cell_edges, 3 + i)):
+            representing = filled[(mesh.cell_owned[order[filled]] >> bit) & 1 == 1]
             rows[elements[order[representing], i]] = 3 * representing + i
     hierarchy.vertex_rows = wp.array(vertex_rows.astype(np.int32), dtype=int, device=device)
     hierarchy.edge_rows = wp.array(edge_rows.astype(np.int32), dtype=int, device=device)
@@ -509,7 +602,7 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
     hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)
     worlds = None
     if mesh.world is not None and len(order):
-        world = mesh.world[mesh.faces[:, 0]][order]
+        world = mesh.world[mesh.cells[:, 0]][order]
         # empty places have the worlds of the faces before, which keeps those of nodes
         filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
         worlds = np.stack([world[filled], world[filled]])
@@ -537,6 +630,7 @@ class BroadPhaseHierarchy:
         capacity: int | None = None,
         not_finite: wp.array | None = None,
         checked: wp.array | None = None,
+        padding: wp.array | None = None,
     ):
         """Allocates the hierarchy and the queue for pairs of faces.
 
@@ -547,7 +641,9 @@ class BroadPhaseHierarchy:
             not_finite: Number of vertices with a position that is not finite, which a run adds to, array of one int64;
                 None to count none.
             checked: Nonzero for each vertex that is counted, array of int; None for all.
+            padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+        self._padding = padding
         self._device = device = mesh.device
         self._count = count
         self._not_finite, self._checked = not_finite, checked
@@ -560,7 +656,7 @@ class BroadPhaseHierarchy:
         if device.is_cuda and self._clusters:
             wanted = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
             self._warps_of_cluster = max(1, min(_MOST_WARPS_OF_CLUSTER, wanted))
-        capacity = 8 * len(mesh.faces) if capacity is None else capacity
+        capacity = 8 * len(mesh.cells) if capacity is None else capacity
         self._face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
 
     @property
@@ -595,6 +691,23 @@ class BroadPhaseHierarchy:
         self._pair_faces(x0, x1, changed)
         self._pair_elements(keep_separated, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
+    def pair_points(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_edge_counts: wp.array,
+        vertex_edge: wp.array,
+        vertex_vertex_counts: wp.array,
+        vertex_vertex: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+    ) -> None:
+        """Counts and enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
+        queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
+        self._launch_over_pairs(_pair_points, self.capacity, keep_separated, *queues)
+
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
@@ -616,8 +729,8 @@ class BroadPhaseHierarchy:
             x1: Positions at the end, of the same type.
             changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all.
         """
-        inputs, outputs = [x0, x1, changed, self._checked, self.hierarchy], [self._not_finite]
-        kernel = _box_elements(x0.dtype)
+        inputs, outputs = [x0, x1, changed, self._checked, self._padding, self.hierarchy], [self._not_finite]
+        kernel = _box_elements(x0.dtype, self._padding is not None)
         wp.launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
         if self._groups:
             inputs = [self.hierarchy.clusters, self.hierarchy.groups]
@@ -639,7 +752,7 @@ class BroadPhaseHierarchy:
     def _pair_elements(self, keep_separated, *queues):
         """Enqueues the pairs of elements of all pairs of faces."""
         threads = -(-self.capacity // (int(_PAIRS_OF_THREAD) * WIDTH)) * WIDTH
-        self._launch_over_pairs(_pair_elements, threads, keep_separated, *queues)
+        self._launch_over_pairs(_pair_elements, threads, threads, keep_separated, *queues)
 
     def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import rounded
+from ..kernels.pipeline.boxes import lowered, raised, rounded
 from ..kernels.pipeline.wide_bvh import pair_packet
 from .launch import launch_over
 from .mesh import CollisionMesh
@@ -28,8 +28,11 @@ _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
 @functools.cache
-def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that encode elements and fill packets, for one type of position."""
+def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that encode elements and fill packets, for one type of position, with or without a padding.
+
+    Without one, code for it is not compiled, as ``padded`` is a constant of the kernel.
+    """
 
     @wp.kernel(**NO_GRADIENTS)
     def encode(
@@ -70,6 +73,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         worlds: wp.array[int],
         order: wp.array[int],
         changed: wp.array[int],
+        padding: wp.array[wp.float64],
         # out
         boxes: wp.array3d[wp.float32],
         elements: wp.array2d[int],
@@ -89,6 +93,10 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
             low1 = wp.vec3(wp.inf)
             high1 = wp.vec3(-wp.inf)
             finite = bool(True)
+            pad = wp.float64(0.0)
+            if wp.static(padded):
+                for corner in range(corners.shape[1]):
+                    pad = wp.max(pad, padding[corners[i, corner]])
             elements[packet, lane] = numbers[i]
             elements[packet, 32 + lane] = worlds[i]
             for corner in range(corners.shape[1]):
@@ -97,12 +105,18 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
                 if not changed or changed[vertex] != 0:
                     changed_lanes = changed_lanes | (1 << lane)
                 finite = finite and wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
-                start = rounded(x0[vertex])
-                end = rounded(x1[vertex])
-                low0 = wp.min(low0, start)
-                high0 = wp.max(high0, start)
-                low1 = wp.min(low1, end)
-                high1 = wp.max(high1, end)
+                if wp.static(padded):
+                    low0 = wp.min(low0, lowered(x0[vertex], pad))
+                    high0 = wp.max(high0, raised(x0[vertex], pad))
+                    low1 = wp.min(low1, lowered(x1[vertex], pad))
+                    high1 = wp.max(high1, raised(x1[vertex], pad))
+                else:
+                    start = rounded(x0[vertex])
+                    end = rounded(x1[vertex])
+                    low0 = wp.min(low0, start)
+                    high0 = wp.max(high0, start)
+                    low1 = wp.min(low1, end)
+                    high1 = wp.max(high1, end)
             if not finite:  # an empty box overlaps none
                 low0 = wp.vec3(wp.inf)
                 high0 = wp.vec3(-wp.inf)
@@ -172,14 +186,19 @@ def _pair_packets(
 class _Tree:
     """A wide BVH over the elements of one kind: vertices, edges or faces."""
 
-    def __init__(self, corners: np.ndarray, numbers: np.ndarray, world: np.ndarray | None):
+    def __init__(
+        self, corners: np.ndarray, numbers: np.ndarray, world: np.ndarray | None, padding: wp.array | None = None
+    ):
         """Allocates a tree without boxes.
 
         Args:
             corners: Vertex indices of the elements, int32, shape [n, 1 to 3].
             numbers: Number of each element in pairs, int32, shape [n].
             world: World of each vertex, int32, shape [vertex_count]; None for one world.
+            padding: How far boxes reach beyond an element, for each vertex, the largest of an element's, array of
+                float64; None for boxes without a padding.
         """
+        self._padding = padding
         n = len(corners)
         packets = -(-n // 8)
         starts = [0]
@@ -219,7 +238,7 @@ class _Tree:
             low: Lowest corner of the grid, float64, shape [3].
             scale: Cells of the grid per unit of length along each axis, float64, shape [3].
         """
-        encode, _ = _kernels(x0.dtype)
+        encode, _ = _kernels(x0.dtype, self._padding is not None)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
@@ -234,8 +253,8 @@ class _Tree:
             x1: Positions at the end, of the same type.
             changed: Nonzero for each changed vertex, array of int; None for all.
         """
-        _, fill_packets = _kernels(x0.dtype)
-        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed]
+        _, fill_packets = _kernels(x0.dtype, self._padding is not None)
+        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed, self._padding]
         outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
         device = self._corners.device
         launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
@@ -264,6 +283,8 @@ class _Tree:
             keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
         """
+        if not len(other._boxes):
+            return
         inputs = [
             self._boxes.flatten(),
             self._elements.flatten(),
@@ -293,18 +314,29 @@ def _join(children: np.ndarray, parents: np.ndarray) -> None:
 class BroadPhaseSimd:
     """The broad phase by wide BVHs, one a kind of element; a :class:`warp_bsc.detection.broad_phase.BroadPhase`.
 
-    It pairs elements directly, and has no queue for pairs of faces.
+    It pairs elements directly, and has no queue for pairs of faces. Points and the edges that no face has, whose pairs
+    count with a minimum distance only, have trees of their own.
     """
 
     buffers: tuple[wp.array, ...] = ()
     capacity: int = UNLIMITED
 
-    def __init__(self, mesh: CollisionMesh, count: wp.array):
-        """Allocates trees over the vertices, the edges and the faces of a mesh; ``count`` is not used."""
+    def __init__(self, mesh: CollisionMesh, count: wp.array, *, padding: wp.array | None = None):
+        """Allocates trees over the vertices, the edges and the faces of a mesh.
+
+        Args:
+            mesh: The mesh.
+            count: Not used.
+            padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
+        """
         self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
-        self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world)
-        self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world)
-        self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world)
+        self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world, padding)
+        self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world, padding)
+        self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world, padding)
+        self._points = self._free_edges = None
+        if len(mesh.points):
+            self._points = _Tree(mesh.points.reshape(-1, 1), mesh.points, mesh.world, padding)
+            self._free_edges = _Tree(mesh.edges[mesh.free_edges], mesh.free_edges, mesh.world, padding)
 
     def grow(self, count: int) -> None:
         """Does nothing, as there is no queue."""
@@ -326,6 +358,26 @@ class BroadPhaseSimd:
         self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=keep_separated)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=keep_separated)
+
+    def pair_points(
+        self,
+        x0: wp.array,
+        x1: wp.array,
+        vertex_edge_counts: wp.array,
+        vertex_edge: wp.array,
+        vertex_vertex_counts: wp.array,
+        vertex_vertex: wp.array,
+        *,
+        refit: bool = False,
+        changed: wp.array | None = None,
+        keep_separated: bool = False,
+    ) -> None:
+        """Counts and enqueues the candidates of points with edges that no face has, and with points."""
+        if self._points is None or self._free_edges is None:
+            return
+        self._build([self._points, self._free_edges], x0, x1, refit, changed)
+        self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, keep_separated=keep_separated)
+        self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, keep_separated=keep_separated)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .contact_buffer import ContactRows, HostContacts
+from .contact_buffer import ContactRows, HostContacts, empty_contacts
 from .differentiable import CollisionArrays
-from .settings import Counts, PairCounts
+from .settings import Counts, DistanceKind, PairCounts
 from .stage_timer import StageTimer
 
 __all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts"]
@@ -25,8 +25,8 @@ class StageCounts:
         hits: Candidates certified to collide.
         unsure: Candidates that floating point could not certify either way.
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
-        host: Candidates whose exponents are too far apart for that. The host decides them, but not in a CUDA graph,
-            where they stay unsure.
+        host: Candidates whose exponents are too far apart for that, or that have a minimum distance. The host decides
+            them, but not in a CUDA graph, where they stay unsure.
     """
 
     candidates: int
@@ -47,7 +47,7 @@ class StageCounts:
             hits=counts.found - counts.unsure,
             unsure=counts.unsure,
             exact=counts.for_exact - counts.too_wide_8 if exact else 0,
-            host=counts.too_wide_8,
+            host=counts.too_wide_8 if exact else 0,
         )
 
 
@@ -58,12 +58,16 @@ class DetectionStats:
     Attributes:
         vertex_face: Numbers of vertex-face pairs that entered or left each stage.
         edge_edge: Numbers of edge-edge pairs that entered or left each stage.
+        vertex_edge: Numbers of pairs of a point and an edge that no face has.
+        vertex_vertex: Numbers of pairs of points.
         milliseconds: Time by stage: "broad phase", "cull", "classify", "time of impact", "sort", "exact". Empty for a
             detection in a CUDA graph.
     """
 
     vertex_face: StageCounts
     edge_edge: StageCounts
+    vertex_edge: StageCounts
+    vertex_vertex: StageCounts
     milliseconds: dict[str, float]
 
 
@@ -89,17 +93,28 @@ class Collisions:
     arrays: CollisionArrays | None
     _method: str = field(repr=False)
     _counts: Counts = field(repr=False)
-    _vertex_face: ContactRows = field(repr=False)
-    _edge_edge: ContactRows = field(repr=False)
+    _rows: dict[DistanceKind, ContactRows] = field(repr=False)
     _timer: StageTimer = field(repr=False)
 
     @functools.cached_property
     def _vertex_face_contacts(self) -> HostContacts:
-        return self._vertex_face.read()
+        return self._rows[DistanceKind.VERTEX_FACE].read()
 
     @functools.cached_property
     def _edge_edge_contacts(self) -> HostContacts:
-        return self._edge_edge.read()
+        return self._rows[DistanceKind.EDGE_EDGE].read()
+
+    @functools.cached_property
+    def _vertex_edge_contacts(self) -> HostContacts:
+        return self._contacts_of_points(DistanceKind.VERTEX_EDGE)
+
+    @functools.cached_property
+    def _vertex_vertex_contacts(self) -> HostContacts:
+        return self._contacts_of_points(DistanceKind.VERTEX_VERTEX)
+
+    def _contacts_of_points(self, kind: DistanceKind) -> HostContacts:
+        """Returns the contacts of a kind that only meshes with points have."""
+        return self._rows[kind].read() if kind in self._rows else empty_contacts()
 
     @property
     def vertex_face(self) -> np.ndarray:
@@ -136,7 +151,10 @@ class Collisions:
 
     @property
     def vertex_face_normal(self) -> np.ndarray:
-        """Unit normals, against the velocity of the vertex relative to the face, float64, shape [n, 3]."""
+        """Unit normals, against the velocity of the vertex relative to the face, float64, shape [n, 3].
+
+        With a minimum distance those of all pairs are along the closest points, from the second element to the first.
+        """
         return self._vertex_face_contacts.normal
 
     @property
@@ -144,10 +162,49 @@ class Collisions:
         """Unit normals, against the velocity of the first edge relative to the second, float64, shape [m, 3]."""
         return self._edge_edge_contacts.normal
 
+    @property
+    def vertex_edge(self) -> np.ndarray:
+        """(point, edge), points as in ``mesh.points``, edges of no face, int32, shape [k, 2].
+
+        With a minimum distance only, as :attr:`vertex_vertex`: pairs of points with faces are in :attr:`vertex_face`.
+        """
+        return self._vertex_edge_contacts.pairs
+
+    @property
+    def vertex_vertex(self) -> np.ndarray:
+        """(point, point), the smaller first, int32, shape [l, 2]."""
+        return self._vertex_vertex_contacts.pairs
+
+    @property
+    def vertex_edge_toi(self) -> np.ndarray:
+        """Times of impact of points with edges, as :attr:`vertex_face_toi`, float64, shape [k]."""
+        return self._vertex_edge_contacts.toi
+
+    @property
+    def vertex_vertex_toi(self) -> np.ndarray:
+        """Times of impact of points with points, as :attr:`vertex_face_toi`, float64, shape [l]."""
+        return self._vertex_vertex_contacts.toi
+
+    @property
+    def vertex_edge_coordinates(self) -> np.ndarray:
+        """(s, 0, 0) along the edge, float64, shape [k, 3]."""
+        return self._vertex_edge_contacts.coordinates
+
+    @property
+    def vertex_edge_normal(self) -> np.ndarray:
+        """Unit normals from the edge to the point, float64, shape [k, 3]."""
+        return self._vertex_edge_contacts.normal
+
+    @property
+    def vertex_vertex_normal(self) -> np.ndarray:
+        """Unit normals from the second point to the first, float64, shape [l, 3]."""
+        return self._vertex_vertex_contacts.normal
+
     @functools.cached_property
     def earliest_toi(self) -> float:
         """The earliest time of impact, 2.0 if there is none."""
-        return float(min(self.vertex_face_toi.min(initial=2.0), self.edge_edge_toi.min(initial=2.0)))
+        times = self.vertex_face_toi, self.edge_edge_toi, self.vertex_edge_toi, self.vertex_vertex_toi
+        return float(min(toi.min(initial=2.0) for toi in times))
 
     @property
     def overflowed(self) -> bool:
@@ -161,10 +218,8 @@ class Collisions:
         if milliseconds:
             milliseconds["exact"] = milliseconds.pop("exact", 0.0)
         exact = self._method == "exact"
-        vertex_face, edge_edge = (
-            StageCounts.of(counts, exact=exact) for counts in (self._counts.vertex_face, self._counts.edge_edge)
-        )
-        return DetectionStats(vertex_face, edge_edge, milliseconds)
+        stages = {kind.label: StageCounts.of(counts, exact=exact) for kind, counts in self._counts.pairs.items()}
+        return DetectionStats(**stages, milliseconds=milliseconds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ __all__ = [
     "ContactRows",
     "HostContacts",
     "contacts_from_host",
+    "empty_contacts",
     "make_contact_buffer",
     "read_contacts",
 ]
@@ -77,6 +78,11 @@ class HostContacts:
     def rows(self, which: np.ndarray) -> "HostContacts":
         """Returns the contacts of some rows, bool, shape [n]."""
         return HostContacts(**{name: values[which] for name, values in vars(self).items()})
+
+
+def empty_contacts() -> HostContacts:
+    """Returns no contacts."""
+    return read_contacts(make_contact_buffer(0, wp.get_device("cpu")), 0)
 
 
 def make_contact_buffer(capacity: int, device: wp.Device) -> ContactBuffer:

@@ -8,13 +8,15 @@ from ..kernels.signs import UNSURE
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays
+from .distance_phase import decide_distances_on_host
 from .host_function import run_on_host
 from .intersections import IntersectionFinder, find_intersections
 from .launch import retry_until_fits
 from .mesh import CollisionMesh
-from .narrow_phase import NarrowPhase, decide_on_host
+from .narrow_phase import decide_on_host
 from .pipeline import DetectionPipeline
-from .settings import TOLERANCE, Counts
+from .proximities import Proximities, ProximityFinder
+from .settings import TOLERANCE, Counts, DistanceKind, PairKind
 from .stage_timer import StageTimer
 
 __all__ = ["CollisionDetector"]
@@ -23,6 +25,11 @@ __all__ = ["CollisionDetector"]
 class CollisionDetector:
     """Finds all collisions of a moving mesh: vertices with faces and edges with edges that share no vertex.
 
+    With a minimum distance, or with radii of the mesh, a pair collides if it comes within the sum of its two radii and
+    that distance, touching included. The radius of an edge or a face is the largest one of its vertices. Radii are
+    added and rounded in double precision; the sum counts as exact. Points of the mesh then also collide with edges that
+    no face has, and with each other. Pairs that a few edges join are excluded, since neighbours are always near.
+
     Run one detection first to size the buffers. After that a detection can be captured in a CUDA graph, where it
     allocates nothing and does not synchronize, and replayed on new positions in the same arrays.
 
@@ -30,9 +37,18 @@ class CollisionDetector:
         mesh: The mesh.
         method: The method.
         tolerance: Of the times of impact, as a share of the step.
+        min_distance: The minimum distance.
     """
 
-    def __init__(self, mesh: CollisionMesh, *, method: str = "conservative", tolerance: float = TOLERANCE):
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        *,
+        method: str = "conservative",
+        tolerance: float = TOLERANCE,
+        min_distance: float = 0.0,
+        rings: int = 1,
+    ):
         """Prepares detection for a mesh, on its device.
 
         Args:
@@ -40,14 +56,28 @@ class CollisionDetector:
             method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it
                 computes, "conservative" counts them as hits, "exact" decides them exactly.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+            min_distance: Distance up to which pairs collide, beside the radii of the mesh, in the unit of the
+                positions: 0, or from 2^-1021 to 2^1000. With 0 and without radii pairs collide that touch.
+            rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
+                a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
+                rest has no collisions at a distance below half of its shortest edge; triangles much thinner than their
+                edges are long need more.
 
         Raises:
-            ValueError: If there is no such method, or the tolerance is out of range.
+            ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
         """
         self.mesh = mesh
         self.method = method
         self.tolerance = tolerance
-        self._pipeline = DetectionPipeline(mesh, method=method, tolerance=tolerance, only_used_vertices=True)
+        self.min_distance = min_distance
+        self._pipeline = DetectionPipeline(
+            mesh,
+            method=method,
+            tolerance=tolerance,
+            min_distance=min_distance,
+            rings=rings,
+            only_used_vertices=True,
+        )
         self._result_buffers = ContactBufferPool(mesh.device)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
@@ -65,13 +95,16 @@ class CollisionDetector:
             All collisions; while a graph is captured :class:`CapturedCollisions`, to be read after a replay.
 
         Raises:
-            ValueError: If the positions have another shape or type, differ in type, or are not finite.
+            ValueError: If the positions have another shape or type, differ in type, are not finite, or require
+                gradients with a minimum distance.
             RuntimeError: If the first detection is captured in a CUDA graph.
         """
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
             raise ValueError("x0 and x1 must have the same type")
+        if self._pipeline.radius is not None and (x0.requires_grad or x1.requires_grad):
+            raise ValueError("collisions with a minimum distance have no gradients")
         if self.mesh.device.is_capturing:
             return (self._capture_on_cpu if self.mesh.device.is_cpu else self._capture_on_cuda)(x0, x1)
 
@@ -89,17 +122,15 @@ class CollisionDetector:
         differentiable = x0.requires_grad or x1.requires_grad
         with timer.stage("sort"):
             contacts = self._ordered_contacts(counts, recycle=not differentiable)
-        if counts.vertex_face.too_wide_8 or counts.edge_edge.too_wide_8:
+        if self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
             with timer.stage("exact"):  # now, while the positions are what they were
-                contacts = [
-                    self._decide_on_host(narrow_phase, rows, x0, x1)
-                    for narrow_phase, rows in zip(self._pipeline.narrow_phases, contacts, strict=True)
-                ]
+                for narrow_phase in self._pipeline.narrow_phases:
+                    kind = DistanceKind(narrow_phase.kind)
+                    contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
         arrays = None
         if differentiable:
-            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *(rows.buffer for rows in contacts))
-        vertex_face, edge_edge = contacts
-        return Collisions(self.method != "float", (), arrays, self.method, counts, vertex_face, edge_edge, timer)
+            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *(rows.buffer for rows in contacts.values()))
+        return Collisions(self.method != "float", (), arrays, self.method, counts, contacts, timer)
 
     def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
@@ -117,36 +148,57 @@ class CollisionDetector:
         """
         return find_intersections(self.mesh, x)
 
+    def find_proximities(self, x: np.ndarray | wp.array, distance: float, *, rings: int = 1) -> Proximities:
+        """Returns the pairs of elements that are near each other in one configuration, exactly.
+
+        Pairs are those of :meth:`detect`, points included, whether or not the detector has a minimum distance. Radii of
+        the mesh are not counted.
+
+        Args:
+            x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
+                vertices that take no part may be anything.
+            distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
+            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
+
+        Raises:
+            ValueError: If the positions have another shape or type, are not finite or more than 2^1000, the distance is
+                no finite number more than 0 or out of the range of their type, or the rings are less than 0.
+        """
+        return ProximityFinder(self.mesh, distance, rings=rings).find(x)
+
     def intersection_finder(self) -> IntersectionFinder:
         """Returns a finder of intersections that shares trees with this detector on a CPU."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
-    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> list[ContactRows]:
-        """Returns the sorted contacts of both kinds of pair, as far as the buffers held them.
+    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
+        """Returns the sorted contacts of each kind of pair, as far as the buffers held them.
 
         Args:
             counts: The counts of the detection.
             recycle: Whether to take buffers of earlier results that are garbage, and to let later results take these;
                 not where others refer to the arrays. Otherwise the buffers are new, with no row to spare.
         """
-        contacts = []
-        for narrow_phase, found in zip(
-            self._pipeline.narrow_phases, (counts.vertex_face, counts.edge_edge), strict=True
-        ):
-            count = min(found.collisions, len(narrow_phase.contacts.pairs))
+        contacts = {}
+        for narrow_phase in self._pipeline.narrow_phases:
+            kind = DistanceKind(narrow_phase.kind)
+            count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
             if recycle:
                 rows = self._result_buffers.take(count)
             else:
                 rows = ContactRows(make_contact_buffer(count, self.mesh.device), count)
             narrow_phase.ordered_contacts(count, rows.buffer)
-            contacts.append(rows)
+            contacts[kind] = rows
         return contacts
 
-    def _decide_on_host(self, narrow_phase: NarrowPhase, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
+    def _decide_on_host(self, kind: DistanceKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
         """Returns the contacts without those that the host refutes, and with what it finds of the others."""
         contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
-        decide_on_host(narrow_phase.kind, x0, x1, self.mesh.device_elements(narrow_phase.kind), contacts, which)
+        elements, radius = self.mesh.device_elements(kind), self._pipeline.radius
+        if radius is None:
+            decide_on_host(PairKind(kind), x0, x1, elements, contacts, which)
+        else:
+            decide_distances_on_host(kind, x0, x1, elements, radius, contacts, which)
         buffer = contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
         return ContactRows(buffer, len(buffer.pairs))
 
@@ -182,11 +234,10 @@ class CollisionDetector:
                 raise RuntimeError("the detector's buffers have grown since this detection was captured: capture again")
             counts = pipeline.counters.read()
             overflows = tuple(pipeline.overflows(counts))
-            left_to_host = counts.vertex_face.too_wide_8 + counts.edge_edge.too_wide_8
+            left_to_host = self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
             certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            vertex_face, edge_edge = self._ordered_contacts(counts, recycle=True)
-            timer = StageTimer(None)
-            return Collisions(certified, overflows, arrays, self.method, counts, vertex_face, edge_edge, timer)
+            contacts = self._ordered_contacts(counts, recycle=True)
+            return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
 
         arrays = None
         if x0.requires_grad or x1.requires_grad:

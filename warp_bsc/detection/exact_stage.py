@@ -22,7 +22,7 @@ from ..kernels.signs import FREE, HIT
 from ..kernels.time_of_impact import LEAST_DIGITS
 from .contact_buffer import ContactBuffer
 from .launch import launch_over_queue
-from .settings import NO_FUSED_OPERATIONS, PairKind
+from .settings import NO_FUSED_OPERATIONS, DistanceKind, PairKind
 
 __all__ = ["launch_exact_stage"]
 
@@ -106,7 +106,7 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
 
 
 def launch_exact_stage(
-    kind: PairKind,
+    kind: PairKind | DistanceKind,
     x0: wp.array,
     x1: wp.array,
     elements: wp.array,

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 import warp as wp
 
-__all__ = ["GrowingBuffers", "launch_over", "launch_over_queue", "most_blocks", "one_core", "retry_until_fits"]
+__all__ = ["GrowingBuffers", "cores", "launch_over", "launch_over_queue", "most_blocks", "retry_until_fits"]
 
 _THREADS = os.cpu_count() or 1
 
@@ -21,9 +21,9 @@ _threads = contextvars.ContextVar("threads", default=_THREADS)
 
 
 @contextlib.contextmanager
-def one_core() -> Iterator[None]:
-    """Keeps launches on the CPU that are made within to the thread that makes them."""
-    token = _threads.set(1)
+def cores(count: int) -> Iterator[None]:
+    """Keeps launches on the CPU that are made within to as many threads: if 1, to the one that makes them."""
+    token = _threads.set(count)
     try:
         yield
     finally:
@@ -31,9 +31,9 @@ def one_core() -> Iterator[None]:
 
 
 @functools.cache
-def _pool() -> ThreadPoolExecutor:
+def _pool(threads: int) -> ThreadPoolExecutor:
     """Threads for the CPU: Warp runs a kernel on one, but lets others run meanwhile."""
-    return ThreadPoolExecutor(_THREADS)
+    return ThreadPoolExecutor(threads)
 
 
 def _may_share(kernel: wp.Kernel) -> bool:
@@ -108,7 +108,7 @@ def launch_over(
         wp.launch(kernel, min(chunk, count - first), inputs=[first, *inputs], **options)
         for first in range(0, count, chunk)
     ]
-    run = map if len(commands) < 2 else _pool().map
+    run = map if len(commands) < 2 else _pool(threads).map
     list(run(wp.Launch.launch, commands))
 
 

@@ -1,6 +1,7 @@
-"""The collision mesh: the part of a triangle mesh that takes part in collision detection."""
+"""The collision mesh: the faces, edges and vertices that take part in collision detection."""
 
 import functools
+from collections.abc import Sequence
 from numbers import Integral
 
 import numpy as np
@@ -8,25 +9,31 @@ import warp as wp
 
 from .._arrays import checked_shape
 from .face_order import order_faces
-from .settings import PairKind
+from .settings import DistanceKind, PairKind
 
 __all__ = ["CollisionMesh"]
 
 
 class CollisionMesh:
-    """The faces, edges and vertices of a triangle mesh whose positions change and whose faces do not.
+    """The faces, edges and vertices of a mesh whose positions change and whose connectivity does not.
 
-    Vertices that no face uses (the inner particles of a soft body, say) take no part. Several bodies make one mesh:
-    their faces index one array of positions.
+    Vertices that no face uses (the inner particles of a soft body, say) take no part, unless they are ends of given
+    edges (ropes, strands) or given points. Several bodies make one mesh: their faces index one array of positions.
 
     Attributes:
         faces: Vertex indices of the faces, int32, shape [face_count, 3].
-        edges: Vertex indices of the edges, smaller first, sorted, int32, shape [edge_count, 2].
+        edges: Vertex indices of the edges, those of faces and given ones, smaller first, sorted, int32, shape
+            [edge_count, 2].
+        free_edges: Indices of the edges that no face has, sorted, int32, shape [free_edge_count].
+        points: Indices of the given vertices that no face and no edge has, sorted, int32, shape [point_count].
+        radius: Radius of each vertex, float64, shape [vertex_count]; None if all are 0. The radius of an edge or a face
+            is the largest one of its vertices.
         face_edges: Edges of the faces, edge i from corner i to the next, -1 where both are one vertex, int32, shape
             [face_count, 3].
         owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pipeline.pairs`, int32, shape
             [face_count].
-        vertices: Indices of the vertices that faces use, sorted, int32, shape [used_vertex_count].
+        vertices: Indices of the vertices that faces and edges use, and of the points, sorted, int32, shape
+            [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
         device: Warp device of the arrays that the detector uses.
@@ -37,6 +44,9 @@ class CollisionMesh:
         faces: np.ndarray | wp.array,
         vertex_count: int,
         *,
+        edges: np.ndarray | wp.array | None = None,
+        points: np.ndarray | wp.array | None = None,
+        radius: float | np.ndarray | wp.array | None = None,
         world: np.ndarray | wp.array | None = None,
         device: wp.DeviceLike = None,
     ):
@@ -45,62 +55,97 @@ class CollisionMesh:
         Args:
             faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
+            edges: Vertex indices of edges that take part although no face has them, integers, shape [n, 2], NumPy or
+                Warp array. Those that faces have are no others.
+            points: Vertices that take part although no face has them, integers, shape [n], NumPy or Warp array.
+            radius: Radius of each vertex, in the unit of the positions, at least 0, float, shape [vertex_count], NumPy
+                or Warp array; or one for all. A pair collides if it comes within the sum of its two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
             device: Warp device; default: Warp's default.
 
         Raises:
-            ValueError: If the faces have another shape or type, an index is not in [0, vertex_count), that is no
-                integer in [0, 2^31), or the worlds have another shape or type, are out of range, or differ within a
-                face.
+            ValueError: If the faces, edges, points, radii or worlds have another shape or type or are out of range, an
+                index is not in [0, vertex_count), that is no integer in [0, 2^31), an edge has one vertex twice, or the
+                worlds differ within a face or an edge.
         """
-        faces = np.asarray(faces.numpy() if isinstance(faces, wp.array) else faces)
-        if faces.shape == (0,):
-            faces = np.empty((0, 3), np.int32)
-        if faces.ndim != 2 or faces.shape[1] != 3:
-            raise ValueError(f"faces must have shape (n, 3), not {faces.shape}")
-        if len(faces) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
-            raise ValueError(f"a mesh must have less than 2^28 faces, not {len(faces)}")
-        if not np.issubdtype(faces.dtype, np.integer):
-            raise ValueError(f"faces must be integers, not {faces.dtype}")
         if not isinstance(vertex_count, Integral) or not 0 <= vertex_count < 2**31:
             raise ValueError(f"vertex_count must be an integer in [0, 2^31), not {vertex_count!r}")
-        bad = np.flatnonzero(((faces < 0) | (faces >= vertex_count)).any(axis=1))
-        if len(bad):
-            raise ValueError(
-                f"face {bad[0]} is {faces[bad[0]].tolist()}, but the mesh has {vertex_count} vertices"
-                + (f" ({len(bad)} such faces)" if len(bad) > 1 else "")
-            )
-        self.faces = np.ascontiguousarray(faces, dtype=np.int32)
+        self.vertex_count = int(vertex_count)
+        faces = self._checked_indices(faces, 3, "face")
+        if len(faces) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
+            raise ValueError(f"a mesh must have less than 2^28 faces, not {len(faces)}")
+        given_edges = self._checked_indices(() if edges is None else edges, 2, "edge")
+        same = np.flatnonzero(given_edges[:, 0] == given_edges[:, 1])
+        if len(same):
+            raise ValueError(f"edge {same[0]} has vertex {given_edges[same[0], 0]} twice")
+        given_points = self._checked_indices(() if points is None else points, 1, "point")
+        self.faces = faces
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        edges, first_sides, edge_of_side = np.unique(sides, axis=0, return_index=True, return_inverse=True)
+        all_edges, first_sides, edge_of_side = np.unique(
+            np.concatenate([sides, np.sort(given_edges, axis=1)]), axis=0, return_index=True, return_inverse=True
+        )
         # a face that names a vertex twice has an edge without length: its point belongs to the other edge
-        proper = edges[:, 0] != edges[:, 1]
-        self.edges = edges[proper]
-        face_edges = np.where(proper, np.cumsum(proper) - 1, -1)[edge_of_side].reshape(-1, 3)
-        self.vertices, first_corners = np.unique(self.faces, return_index=True)
+        proper = all_edges[:, 0] != all_edges[:, 1]
+        self.edges = all_edges[proper]
+        face_edges = np.where(proper, np.cumsum(proper) - 1, -1)[edge_of_side.ravel()[: len(sides)]].reshape(-1, 3)
+        self.free_edges = np.flatnonzero(first_sides[proper] >= len(sides)).astype(np.int32)
+        face_vertices, first_corners = np.unique(self.faces, return_index=True)
+        connected = np.union1d(face_vertices, given_edges)
+        self.points = np.setdiff1d(given_points, connected)
+        self.vertices = np.union1d(connected, self.points)
         # the representative of an element is the first face that has it: bits 0 to 2 corners, 3 to 5 edges
         owned = np.zeros(len(self.faces), dtype=np.int32)
         np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
-        first_sides = first_sides[proper]
+        first_sides = first_sides[proper & (first_sides < len(sides))]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
         self.face_edges, self.owned = face_edges.astype(np.int32), owned
-        self.vertex_count = int(vertex_count)
         self.device = wp.get_device(device)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
+        self.device_points = wp.array(self.points, dtype=int, device=self.device)
+        self.radius = None
+        if radius is not None:
+            self.radius = self._checked_radius(radius)
         self.world = None
         if world is not None:
             self.world = self._checked_world(world)
 
     @functools.cached_property
-    def face_order(self) -> np.ndarray:
-        """Face at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
-        return order_faces(self.faces, None if self.world is None else self.world[self.faces[:, 0]])
+    def cells(self) -> np.ndarray:
+        """Vertices of the faces, then of the free edges as faces a b b, then of the points, int32, shape [n, 3]."""
+        edges, points = self.edges[self.free_edges], self.points
+        return np.concatenate([self.faces, edges[:, [0, 1, 1]], np.stack([points] * 3, axis=1)]).astype(np.int32)
 
-    def device_elements(self, kind: PairKind) -> wp.array:
-        """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int."""
+    @functools.cached_property
+    def cell_edges(self) -> np.ndarray:
+        """Edges of the cells, as ``face_edges``, int32, shape [n, 3]."""
+        cell_edges = np.full((len(self.cells), 3), -1, dtype=np.int32)
+        cell_edges[: len(self.faces)] = self.face_edges
+        cell_edges[len(self.faces) : len(self.faces) + len(self.free_edges), 0] = self.free_edges
+        return cell_edges
+
+    @functools.cached_property
+    def cell_owned(self) -> np.ndarray:
+        """What each cell is the representative of, as ``owned``, int32, shape [n]."""
+        first, last = len(self.faces), len(self.faces) + len(self.free_edges)
+        owned = np.concatenate([self.owned, np.full(last - first, 8), np.ones(len(self.points))]).astype(np.int32)
+        ends, first_ends = np.unique(self.cells[first:last, :2], return_index=True)
+        first_ends = first_ends[~np.isin(ends, self.faces)]
+        np.bitwise_or.at(owned, first + first_ends // 2, 1 << (first_ends % 2))
+        return owned
+
+    @functools.cached_property
+    def face_order(self) -> np.ndarray:
+        """Cell at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
+        return order_faces(self.cells, None if self.world is None else self.world[self.cells[:, 0]])
+
+    def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
+        """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.
+
+        Those of two points are not used, and are the edges here.
+        """
         return self.device_faces if kind == PairKind.VERTEX_FACE else self.device_edges
 
     def device_positions(self, x: np.ndarray | wp.array, name: str) -> wp.array:
@@ -128,8 +173,39 @@ class CollisionMesh:
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
+    def _checked_indices(self, given: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
+        """Returns the vertex indices of elements, int32, shape [n, corners], or [n] for points."""
+        shape = (0,) if corners == 1 else (0, corners)
+        elements: np.ndarray = np.asarray(given.numpy() if isinstance(given, wp.array) else given)
+        if elements.shape == (0,):
+            elements = np.empty(shape, np.int32)
+        if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:
+            raise ValueError(
+                f"{name}s must have shape {f'(n, {corners})' if corners > 1 else '(n,)'}, not {elements.shape}"
+            )
+        if not np.issubdtype(elements.dtype, np.integer):
+            raise ValueError(f"{name}s must be integers, not {elements.dtype}")
+        bad = np.flatnonzero(
+            ((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), corners).any(axis=1)
+        )
+        if len(bad):
+            raise ValueError(
+                f"{name} {bad[0]} is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
+                + (f" ({len(bad)} such {name}s)" if len(bad) > 1 else "")
+            )
+        return np.ascontiguousarray(elements, dtype=np.int32)
+
+    def _checked_radius(self, radius: float | np.ndarray | wp.array) -> np.ndarray | None:
+        """Returns the radius of each vertex, float64, shape [vertex_count], or None if all are 0."""
+        values = np.asarray(radius.numpy() if isinstance(radius, wp.array) else radius, dtype=np.float64)
+        if values.shape not in ((), (self.vertex_count,)):
+            raise ValueError(f"radius must be one number or {self.vertex_count}, one a vertex, got {values.shape}")
+        if not (np.isfinite(values) & (values >= 0.0)).all():
+            raise ValueError("radii must be finite and at least 0")
+        return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
+
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
-        """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face."""
+        """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face or an edge."""
         world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
         if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):
             raise ValueError(
@@ -142,4 +218,8 @@ class CollisionMesh:
         mixed = np.flatnonzero((worlds != worlds[:, :1]).any(axis=1))
         if len(mixed):
             raise ValueError(f"face {mixed[0]} has vertices in worlds {worlds[mixed[0]].tolist()}")
+        mixed = np.flatnonzero(world[self.edges[:, 0]] != world[self.edges[:, 1]])
+        if len(mixed):
+            edge = self.edges[mixed[0]]
+            raise ValueError(f"edge {edge.tolist()} has vertices in worlds {world[edge].tolist()}")
         return world.astype(np.int32)

@@ -17,7 +17,7 @@ from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
 from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
 from .launch import launch_over, launch_over_queue, most_blocks
-from .settings import TOLERANCE, UNLIMITED, Count, PairCounts, PairKind, capacity_for
+from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
 __all__ = ["NarrowPhase", "decide_on_host", "run_narrow_phases"]
@@ -34,7 +34,9 @@ class NarrowPhase:
         contacts: The contacts in no order; ``counts[Count.CONTACTS]`` rows are filled. Some have turned out to be free.
     """
 
-    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, elements: tuple[int, int]):
+    def __init__(
+        self, kind: PairKind | DistanceKind, counts: wp.array, capacity: int, elements: Sequence[int] | np.ndarray
+    ):
         """Allocates the buffers.
 
         Args:

@@ -2,18 +2,24 @@
 
 import functools
 
+import numpy as np
 import warp as wp
 
 from .broad_phase import BroadPhase, make_broad_phase
+from .distance_phase import checked_distance, run_distance_phases
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
-from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, PairKind, check_method, check_tolerance
+from .rings import Rings, make_rings
+from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, check_method, check_tolerance
 from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
 
 LEAST_CAPACITY = 4096
 """Least capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
+
+_LARGEST_RADIUS = 2.0**1000
+"""The sum of two is finite."""
 
 _UNTIMED = StageTimer(None)
 
@@ -40,6 +46,25 @@ def _count_not_finite(dtype: type) -> wp.Kernel:
     return count_not_finite
 
 
+def _radius(mesh: CollisionMesh, min_distance: float) -> np.ndarray | None:
+    """Returns the radius of each vertex with half of the minimum distance, float64; None if all are 0."""
+    if min_distance > 0.0 and 2.0 * (0.5 * min_distance) != min_distance:
+        raise ValueError(f"min_distance must be 0 or at least 2^-1021, not {min_distance!r}")
+    if mesh.radius is None and min_distance == 0.0:
+        return None
+    radius = np.full(mesh.vertex_count, 0.5 * min_distance)
+    if mesh.radius is not None:
+        radius += mesh.radius
+    if radius.max(initial=0.0) > _LARGEST_RADIUS:
+        raise ValueError(f"radii and half of min_distance must be at most 2^1000 together, not {radius.max():g}")
+    return radius
+
+
+def _queues(*narrow_phases: NarrowPhase) -> list[wp.array]:
+    """Returns counts and queue of each narrow phase, as a broad phase takes them."""
+    return [queue for narrow_phase in narrow_phases for queue in (narrow_phase.counts, narrow_phase.queue)]
+
+
 class DetectionPipeline:
     """Finds the contacts of a moving mesh and leaves them on the device, unsorted, with buffers that it reuses.
 
@@ -61,6 +86,10 @@ class DetectionPipeline:
             Warp array of int64: where a count is larger, something is missing.
         vertex_face: The narrow phase of vertex-face pairs.
         edge_edge: The narrow phase of edge-edge pairs.
+        points: The narrow phases of pairs of a point and an edge, and of two points; none without a minimum distance
+            or without points.
+        radius: Radius of each vertex, half of the minimum distance included, float64, shape [vertex_count]; None if
+            pairs collide that touch.
         generation: How often buffers have been replaced. Graphs captured before still write to the old buffers.
     """
 
@@ -70,6 +99,8 @@ class DetectionPipeline:
         *,
         method: str = "conservative",
         tolerance: float = TOLERANCE,
+        min_distance: float = 0.0,
+        rings: int = 1,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
     ):
@@ -79,6 +110,8 @@ class DetectionPipeline:
             mesh: The mesh.
             method: What becomes of pairs that floating point cannot certify, see :class:`CollisionDetector`.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+            min_distance: Distance up to which pairs collide, see :class:`CollisionDetector`.
+            rings: Pairs that so few edges join are excluded, see :class:`CollisionDetector`.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together; a
@@ -86,7 +119,7 @@ class DetectionPipeline:
                 eight pairs of faces, one vertex-face and two edge-edge pairs.
 
         Raises:
-            ValueError: If there is no such method, or the tolerance is out of range.
+            ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
         """
         check_method(method)
         check_tolerance(tolerance)
@@ -100,26 +133,43 @@ class DetectionPipeline:
         self.counters = Counters(mesh.device)
         self.counts = self.counters.read()
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
-        face_pairs, vertex_face, edge_edge = 8 * faces, faces, 2 * faces
+        self.radius = _radius(mesh, float(checked_distance(min_distance)))
+        self._rings = Rings() if self.radius is None else make_rings(mesh, rings)
+        self._radius = padding = None
+        if self.radius is not None:
+            self._radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
+            # the minimum distance of a pair, a rounded sum, is at most the sum of these
+            padding = wp.array(np.nextafter(self.radius, np.inf), dtype=wp.float64, device=mesh.device)
+        elements = faces + len(mesh.free_edges) + len(mesh.points)
+        face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs_per_face is not None:
-            face_pairs = vertex_face = edge_edge = min(max(pairs_per_face * faces, LEAST_CAPACITY), 2**31 - 1)
+            face_pairs = vertex_face = edge_edge = min(max(pairs_per_face * elements, LEAST_CAPACITY), 2**31 - 1)
         self._broad_phase = make_broad_phase(
             mesh,
             self.counters.face_pairs,
             capacity=face_pairs,
             not_finite=self.counters.not_finite,
             checked_vertices=mesh.vertices if only_used_vertices else None,
+            padding=padding,
         )
         self.vertex_face = NarrowPhase(
             PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
         )
         self.edge_edge = NarrowPhase(PairKind.EDGE_EDGE, self.counters.edge_edge, edge_edge, elements=(edges, edges))
+        self.points: tuple[NarrowPhase, ...] = ()
+        if self.radius is not None and len(mesh.points):
+            self.points = (
+                NarrowPhase(DistanceKind.VERTEX_EDGE, self.counters.vertex_edge, edge_edge, elements=(vertices, edges)),
+                NarrowPhase(
+                    DistanceKind.VERTEX_VERTEX, self.counters.vertex_vertex, edge_edge, elements=(vertices, vertices)
+                ),
+            )
         self.capacities = self._device_capacities()
 
     @property
-    def narrow_phases(self) -> tuple[NarrowPhase, NarrowPhase]:
-        """The narrow phases of vertex-face and of edge-edge pairs."""
-        return self.vertex_face, self.edge_edge
+    def narrow_phases(self) -> tuple[NarrowPhase, ...]:
+        """The narrow phases of vertex-face and of edge-edge pairs, and those of points."""
+        return self.vertex_face, self.edge_edge, *self.points
 
     def find_contacts(
         self,
@@ -149,14 +199,23 @@ class DetectionPipeline:
         self._captured |= bool(self.mesh.device.is_capturing)
         self.counters.array.zero_()
         with timer.stage("broad phase"):
-            self._broad_phase.pair_elements(x0, x1, *self._queues(), refit=refit, changed=changed)
+            self._broad_phase.pair_elements(
+                x0, x1, *_queues(self.vertex_face, self.edge_edge), refit=refit, changed=changed
+            )
+            if self.points:
+                self._broad_phase.pair_points(x0, x1, *_queues(*self.points), refit=refit, changed=changed)
             if self.mesh.device.is_cpu:
                 self._launch_count_not_finite(x0, x1)
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
-        run_narrow_phases(narrow_phases, x0, x1, method=self.method, tolerance=self.tolerance, timer=timer)
+        options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
+        if self._radius is None:
+            run_narrow_phases(narrow_phases, x0, x1, **options)
+        else:
+            run_distance_phases(narrow_phases, x0, x1, self._radius, self._rings, **options)
         if not sort:
             return
-        for narrow_phase, stream in ((self.vertex_face, side_stream), (self.edge_edge, None)):
+        for narrow_phase in self.narrow_phases:
+            stream = side_stream if narrow_phase is self.vertex_face else None
             with wp.ScopedStream(stream), timer.stage("sort"):
                 narrow_phase.sort()
         if side_stream is not None:
@@ -173,7 +232,7 @@ class DetectionPipeline:
         The queue of that run's broad phase must have been large enough, see :meth:`grow`.
         """
         self.counters.pairs.zero_()
-        self._broad_phase.pair_overlapping_elements(*self._queues())
+        self._broad_phase.pair_overlapping_elements(*_queues(self.vertex_face, self.edge_edge))
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.
@@ -189,11 +248,12 @@ class DetectionPipeline:
             return False
         self.generation += 1
         if self._captured:
-            buffers = *self._broad_phase.buffers, *self.vertex_face.buffers, *self.edge_edge.buffers, self.capacities
-            self._retired += buffers
+            self._retired += [*self._broad_phase.buffers, self.capacities]
+            for narrow_phase in self.narrow_phases:
+                self._retired += narrow_phase.buffers
         self._broad_phase.grow(counts.face_pairs)
-        self.vertex_face.grow(counts.vertex_face)
-        self.edge_edge.grow(counts.edge_edge)
+        for narrow_phase in self.narrow_phases:
+            narrow_phase.grow(counts.pairs[DistanceKind(narrow_phase.kind)])
         self.capacities = self._device_capacities()
         return True
 
@@ -201,11 +261,9 @@ class DetectionPipeline:
         """Names each buffer that is too small for the counts, with count and capacity."""
         return counts.overflows(self._host_capacities())
 
-    def _queues(self) -> list[wp.array]:
-        return [queue for narrow_phase in self.narrow_phases for queue in (narrow_phase.counts, narrow_phase.queue)]
-
     def _host_capacities(self) -> Counts:
-        return Counts(0, self._broad_phase.capacity, self.vertex_face.capacities, self.edge_edge.capacities)
+        pairs = {phase.kind.label: phase.capacities for phase in self.narrow_phases}
+        return Counts(0, self._broad_phase.capacity, **pairs)
 
     def _device_capacities(self) -> wp.array:
         return wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)

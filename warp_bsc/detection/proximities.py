@@ -7,15 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .. import checker
 from .._arrays import check_finite
-from ..kernels.distance import closest_points
-from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.distance import DISTANCE_ERROR, closest_points
+from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import is_filled, take_slot
-from ..kernels.polynomials import VERTEX_FACE
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .broad_phase import make_broad_phase
+from .distance_phase import pair_distances
 from .launch import launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
-from .settings import NO_GRADIENTS, Count, Counters, PairKind, capacity_for
+from .rings import Rings, are_within_rings, make_rings
+from .settings import NO_GRADIENTS, Count, Counters, DistanceKind, capacity_for
 
 __all__ = ["Proximities", "ProximityFinder"]
 
@@ -23,18 +26,6 @@ _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST = 2.0**1000
 """Largest coordinate: differences and their sums stay finite."""
-
-
-@wp.func
-def _are_joined(corners: wp.vec4i, firsts: int, starts: wp.array[int], neighbours: wp.array[int]) -> bool:
-    """Whether an edge of the mesh joins one of the first corners, 1 or 2, to one of the others."""
-    for first in range(firsts):
-        vertex = corners[first]
-        for i in range(starts[vertex], starts[vertex + 1]):
-            for second in range(firsts, 4):
-                if neighbours[i] == corners[second]:
-                    return True
-    return False
 
 
 @functools.cache
@@ -52,8 +43,7 @@ def _keep_near(dtype: type) -> wp.Kernel:
         x: wp.array[dtype],
         kind: int,
         elements: wp.array2d[int],
-        starts: wp.array[int],
-        neighbours: wp.array[int],
+        rings: Rings,
         # in
         distance: wp.float64,
         pairs: wp.array[wp.vec2i],
@@ -67,31 +57,33 @@ def _keep_near(dtype: type) -> wp.Kernel:
         i = first + wp.tid()
         if not is_filled(i, pairs, counts, _QUEUED):
             return
-        corners = vertices_of_pair(kind, elements, pairs[i])
+        corners = points_of_pair(kind, elements, pairs[i])
         p = point(x, corners[0])
         q = point(x, corners[1])
         r = point(x, corners[2])
         s = point(x, corners[3])
-        # vertex p with face q r s, or edge p q with edge r s
+        # vertex p with face q r s, which may have collapsed, or edge p q with edge r s
         u = r - q
         v = s - q
         w = p - q
         firsts = int(1)
-        if kind != VERTEX_FACE:
+        points = int(VERTEX_FACE)
+        if kind == EDGE_EDGE:
+            points = int(EDGE_EDGE)
             u = q - p
             v = s - r
             w = r - p
             firsts = 2
-        coordinates, found, error = closest_points(kind, u, v, w)
+        coordinates, found, error = closest_points(points, u, v, w)
         if found > distance + error:
             return
-        if _are_joined(corners, firsts, starts, neighbours):
+        if are_within_rings(corners, firsts, rings):
             return
         slot = take_slot(counts, _FOUND)
         if slot < wp.int64(kept.shape[0]):
             one = p
             other = q + coordinates[0] * u + coordinates[1] * v
-            if kind != VERTEX_FACE:
+            if kind == EDGE_EDGE:
                 one = p + coordinates[0] * u
                 other = r + coordinates[1] * v
             k = wp.int32(slot)
@@ -109,13 +101,17 @@ class Proximities:
     Attributes:
         vertex_face: (vertex, face), sorted, int32, shape [n, 2].
         edge_edge: (edge, edge), the smaller first, edges as in ``mesh.edges``, sorted, int32, shape [m, 2].
-        distance: Least distances of the vertex-face pairs, then of the edge-edge pairs, in the unit of the positions,
-            float64, shape [n + m].
-        position: Points halfway between the closest points, float64, shape [n + m, 3].
+        vertex_edge: (point, edge), edges that no face has, sorted, int32, shape [k, 2].
+        vertex_vertex: (point, point), the smaller first, sorted, int32, shape [l, 2].
+        distance: Least distances of the pairs in the order of the attributes above, in the unit of the positions,
+            float64, shape [n + m + k + l].
+        position: Points halfway between the closest points, float64, shape [n + m + k + l, 3].
     """
 
     vertex_face: np.ndarray
     edge_edge: np.ndarray
+    vertex_edge: np.ndarray
+    vertex_vertex: np.ndarray
     distance: np.ndarray
     position: np.ndarray
 
@@ -123,7 +119,7 @@ class Proximities:
 class _NearPairs:
     """The queue of candidates of one kind, and those of them that are near."""
 
-    def __init__(self, kind: PairKind, counts: wp.array, capacity: int, device: wp.Device):
+    def __init__(self, kind: DistanceKind, counts: wp.array, capacity: int, device: wp.Device):
         self.kind, self.counts, self._device = kind, counts, device
         self.queue = wp.empty(capacity, dtype=wp.vec2i, device=device)
         self._allocate(capacity)
@@ -156,19 +152,21 @@ class _NearPairs:
 class ProximityFinder:
     """Finds the pairs of elements that are near each other in one configuration after another, with the same buffers.
 
-    A pair is a vertex and a face, or two edges. Pairs that share a vertex or that an edge of the mesh joins are
-    excluded: neighbours are always near.
+    A pair is a vertex and a face, two edges, a point and an edge that no face has, or two points. Radii of the mesh are
+    not counted. Pairs that share a vertex or that a few edges of the mesh join are excluded, since neighbours are
+    always near.
     """
 
-    def __init__(self, mesh: CollisionMesh, distance: float):
+    def __init__(self, mesh: CollisionMesh, distance: float, *, rings: int = 1):
         """Allocates the buffers on the mesh's device.
 
         Args:
             mesh: The mesh.
-            distance: Distance up to which pairs are near, in the unit of the positions, more than 0.
+            distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
+            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
 
         Raises:
-            ValueError: If the distance is no finite number more than 0.
+            ValueError: If the distance is no finite number more than 0, or the rings are less than 0.
         """
         if not (math.isfinite(distance) and distance > 0.0):
             raise ValueError(f"a distance must be a finite number more than 0, not {distance!r}")
@@ -176,26 +174,20 @@ class ProximityFinder:
         self._distance = float(distance)
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
         self._near = [
-            _NearPairs(kind, counts, 2 * len(mesh.faces), mesh.device)
-            for kind, counts in (
-                (PairKind.VERTEX_FACE, self._counters.vertex_face),
-                (PairKind.EDGE_EDGE, self._counters.edge_edge),
-            )
+            _NearPairs(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in DistanceKind
         ]
-        both = np.concatenate([mesh.edges, mesh.edges[:, ::-1]])
-        both = both[np.argsort(both[:, 0], kind="stable")]
-        starts = np.searchsorted(both[:, 0], np.arange(mesh.vertex_count + 1))
-        self._starts = wp.array(starts, dtype=int, device=mesh.device)
-        self._neighbours = wp.array(both[:, 1], dtype=int, device=mesh.device)
+        self._rings = make_rings(mesh, rings)
         self._has_run = False
 
     def find(self, x: np.ndarray | wp.array) -> Proximities:
         """Returns the proximities of one configuration.
 
-        Distances are computed in double precision and off by at most 2^-40 of the largest component of the vectors
-        along both edges of the face or along the two edges, and between the first corners. Every pair whose distance
-        is at most the given one is found; pairs that are farther by no more than this error may be found too.
+        The pairs are exactly those whose distance is at most the given one: the exact checker decides where the
+        computed distance is not certain. Distances are computed in double precision and off by at most 2^-40 of the
+        largest component of the vectors along both edges of the face or along the two edges, and between the first
+        corners.
 
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array, taken as
@@ -215,17 +207,34 @@ class ProximityFinder:
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True
-        (vertex_face, *_), (edge_edge, *_) = found = [near.read() for near in self._near]
-        distance, position = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[1:])
-        return Proximities(vertex_face, edge_edge, distance, position)
+        found = [self._exactly(near, positions, largest) for near in self._near]
+        vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
+        distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
+        return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position)
+
+    def _exactly(
+        self, near: _NearPairs, positions: np.ndarray, largest: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns pairs, distances and positions of a kind, without the pairs that are farther than the distance."""
+        pairs, distance, position = near.read()
+        # differences of positions are at most twice the largest coordinate
+        unsure = distance >= self._distance - 4.0 * float(DISTANCE_ERROR) * largest
+        if not unsure.any():
+            return pairs, distance, position
+        elements = self._mesh.device_elements(near.kind).numpy()
+        corners, _ = pair_distances(near.kind, elements, pairs[unsure], np.zeros(self._mesh.vertex_count))
+        points = positions[corners]
+        kept = np.ones(len(pairs), dtype=bool)
+        kept[unsure] = getattr(checker, near.kind.label)(np.concatenate([points, points], axis=1), self._distance)
+        return pairs[kept], distance[kept], position[kept]
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
         counts = self._counters.read()
         grown = counts.face_pairs > self._broad_phase.capacity
         self._broad_phase.grow(counts.face_pairs)
-        for near, of_kind in zip(self._near, (counts.vertex_face, counts.edge_edge), strict=True):
-            grown |= near.grow(of_kind.queued, of_kind.found)
+        for near in self._near:
+            grown |= near.grow(counts.pairs[near.kind].queued, counts.pairs[near.kind].found)
         return grown
 
     def _enlarge(self, positions: np.ndarray) -> tuple[wp.array, wp.array]:
@@ -249,7 +258,9 @@ class ProximityFinder:
         self._counters.array.zero_()
         queues = [array for near in self._near for array in (near.counts, near.queue)]
         # these move on the same way: axes that separate them at both ends do not keep enlarged boxes apart
-        self._broad_phase.pair_elements(lower, upper, *queues, refit=self._has_run, keep_separated=True)
+        options = {"refit": self._has_run, "keep_separated": True}
+        self._broad_phase.pair_elements(lower, upper, *queues[:4], **options)
+        self._broad_phase.pair_points(lower, upper, *queues[4:], **options)
         mesh = self._mesh
         for near in self._near:
             launch_over_queue(
@@ -261,8 +272,7 @@ class ProximityFinder:
                     x,
                     int(near.kind),
                     mesh.device_elements(near.kind),
-                    self._starts,
-                    self._neighbours,
+                    self._rings,
                     wp.float64(self._distance),
                     near.queue,
                 ],

@@ -1,4 +1,4 @@
-"""Elementary queries: many vertex-face or edge-edge pairs at once, each given by its eight points."""
+"""Elementary queries: many pairs of vertices, edges and faces at once, each given by its points."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,14 @@ import warp as wp
 from .._arrays import check_finite, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
 from .contact_buffer import HostContacts, read_contacts
+from .distance_phase import checked_distance, decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
-from .settings import TOLERANCE, Count, PairCounts, PairKind, check_method, check_tolerance
+from .rings import Rings
+from .settings import TOLERANCE, Count, DistanceKind, PairCounts, PairKind, check_method, check_tolerance
 from .stage_timer import StageTimer
 
-__all__ = ["QueryResult", "query_edge_edge", "query_vertex_face"]
+__all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,12 @@ class QueryResult:
         status: What floating point could certify, whatever the method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
         toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
             if not wanted.
-        coordinates: Where they touch, float64, shape [n, 3]: barycentric coordinates in the face, or (s, r, 0)
-            along the edges; NaN where there is no hit. None if no times were wanted.
+        coordinates: Where they touch or come within the minimum distance, float64, shape [n, 3]: barycentric
+            coordinates in the face, (s, r, 0) along the edges, (s, 0, 0) along the edge of a vertex-edge pair; NaN
+            where there is no hit. None if no times were wanted.
         normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other
-            feature, float64, shape [n, 3]; NaN where there is no hit. None if no times were wanted.
+            feature; with a minimum distance from the other feature to it. float64, shape [n, 3]; NaN where there is
+            no hit. None if no times were wanted.
     """
 
     hit: np.ndarray
@@ -41,6 +45,7 @@ class QueryResult:
 def query_vertex_face(
     points: np.ndarray | wp.array,
     *,
+    min_distance: float | np.ndarray = 0.0,
     method: str = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -51,6 +56,8 @@ def query_vertex_face(
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1:
             vertex p and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
+            one for all queries, or one each, shape [n].
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
@@ -60,15 +67,16 @@ def query_vertex_face(
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
-            method.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance is no
+            finite number of at least 0, or there is no such method.
     """
-    return _query(PairKind.VERTEX_FACE, points, method, toi, tolerance, device)
+    return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
 
 def query_edge_edge(
     points: np.ndarray | wp.array,
     *,
+    min_distance: float | np.ndarray = 0.0,
     method: str = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -79,6 +87,8 @@ def query_edge_edge(
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
             edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
+            one for all queries, or one each, shape [n].
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
@@ -88,15 +98,74 @@ def query_edge_edge(
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, or there is no such
-            method.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance is no
+            finite number of at least 0, or there is no such method.
     """
-    return _query(PairKind.EDGE_EDGE, points, method, toi, tolerance, device)
+    return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
+
+
+def query_vertex_edge(
+    points: np.ndarray | wp.array,
+    *,
+    min_distance: float | np.ndarray = 0.0,
+    method: str = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which moving vertices come within a distance of their moving edges.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 6, 3], rows p0 a0 b0 p1 a1 b1: vertex p
+            and edge a b at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: As of :func:`query_vertex_face`.
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+
+    Returns:
+        QueryResult: One row a query.
+
+    Raises:
+        ValueError: As :func:`query_vertex_face`.
+    """
+    return _query(DistanceKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
+
+
+def query_vertex_vertex(
+    points: np.ndarray | wp.array,
+    *,
+    min_distance: float | np.ndarray = 0.0,
+    method: str = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which pairs of moving vertices come within a distance of each other.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 4, 3], rows p0 q0 p1 q1: vertices p and
+            q at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: As of :func:`query_vertex_face`.
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+
+    Returns:
+        QueryResult: One row a query.
+
+    Raises:
+        ValueError: As :func:`query_vertex_face`.
+    """
+    return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
 
 
 def _query(
-    kind: PairKind,
+    kind: DistanceKind,
     points: np.ndarray | wp.array,
+    min_distance: float | np.ndarray,
     method: str,
     timed: bool,
     tolerance: float,
@@ -107,27 +176,39 @@ def _query(
     if isinstance(points, wp.array):
         device = points.device if device is None else device
         points = points.numpy()
-    points = checked_shape(points, (8, 3), "points")
+    points = checked_shape(points, (2 * kind.points, 3), "points")
     n = len(points)
     if n >= 2**29:  # their vertices are numbered by int32
         raise ValueError(f"at most 2^29 - 1 queries can be decided at once, not {n}")
     check_finite(points, "points")
+    distance = checked_distance(min_distance, (n,))
     device = wp.get_device(device)
-    # a mesh in which each query has four vertices of its own
+    # a mesh in which each query has vertices of its own
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
-    x0 = wp.array(np.ascontiguousarray(points[:, :4]).reshape(-1, 3), dtype=dtype, device=device)
-    x1 = wp.array(np.ascontiguousarray(points[:, 4:]).reshape(-1, 3), dtype=dtype, device=device)
-    vertices = np.arange(4 * n, dtype=np.int32).reshape(n, 4)
+    half = kind.points
+    x0 = wp.array(np.ascontiguousarray(points[:, :half]).reshape(-1, 3), dtype=dtype, device=device)
+    x1 = wp.array(np.ascontiguousarray(points[:, half:]).reshape(-1, 3), dtype=dtype, device=device)
+    vertices = np.arange(half * n, dtype=np.int32).reshape(n, half)
     rows = np.arange(n, dtype=np.int32)
-    if kind == PairKind.VERTEX_FACE:
-        elements, pairs = vertices[:, 1:], np.stack([4 * rows, rows], axis=1)
-    else:
+    if kind == DistanceKind.EDGE_EDGE:
         elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
+    else:
+        elements, pairs = vertices[:, 1:], np.stack([vertices[:, 0], rows], axis=1)
+        if kind == DistanceKind.VERTEX_VERTEX:
+            pairs = vertices
     elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)
     all_queued = PairCounts(queued=n).values()
+    # without a distance: the narrow phase of contacts
+    contact = kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any()
+    radius = np.zeros((n, half))
+    radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
+    if kind == DistanceKind.EDGE_EDGE:
+        radius[:, 1] = distance
+    radius = radius.ravel()
+    device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
     def solve(method: str) -> tuple[HostContacts, np.ndarray]:
         """The contacts by a method, and the query of each."""
@@ -137,7 +218,10 @@ def _query(
         def launch() -> None:
             counts.assign(all_queued)
             options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
-            narrow_phase.run(x0, x1, elements, **options)
+            if contact:
+                narrow_phase.run(x0, x1, elements, **options)
+            else:
+                run_distance_phases([(narrow_phase, elements)], x0, x1, device_radius, Rings(), **options)
 
         retry_until_fits(launch, narrow_phase, device)
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
@@ -148,9 +232,11 @@ def _query(
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":
                 left |= contacts.decided == UNSURE
-            decide_on_host(kind, x0, x1, elements, contacts, left, timed=timed)
-        rows = contacts.pairs[:, 1] if kind == PairKind.VERTEX_FACE else contacts.pairs[:, 0] // 2
-        return contacts, rows
+            if contact:
+                decide_on_host(PairKind(kind), x0, x1, elements, contacts, left, timed=timed)
+            else:
+                decide_distances_on_host(kind, x0, x1, elements, radius, contacts, left, timed=timed)
+        return contacts, contacts.pairs[:, 0] // (2 if kind == DistanceKind.EDGE_EDGE else half)
 
     certified, certified_rows = solve("conservative" if method == "float" else method)
     status = np.zeros(n, dtype=np.int8)

@@ -17,6 +17,7 @@ __all__ = [
     "Count",
     "Counters",
     "Counts",
+    "DistanceKind",
     "PairCounts",
     "PairKind",
     "capacity_for",
@@ -56,6 +57,37 @@ class PairKind(enum.IntEnum):
     def display_name(self) -> str:
         """The name in tables and messages: "vertex-face" or "edge-edge"."""
         return self.label.replace("_", "-")
+
+
+class DistanceKind(enum.IntEnum):
+    """The kinds of pairs that may have a minimum distance, with the values that kernels take."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
+    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
+
+    @property
+    def label(self) -> str:
+        """The name in attributes of results and in the checker: "vertex_face" and so on."""
+        return self.name.lower()
+
+    @property
+    def display_name(self) -> str:
+        """The name in messages: "vertex-face" and so on."""
+        return self.label.replace("_", "-")
+
+    @property
+    def point_order(self) -> list[int]:
+        """The point of the pair at each of the four places that kernels take: p a b a, p q q q."""
+        if self == DistanceKind.VERTEX_EDGE:
+            return [0, 1, 2, 1]
+        return [0, 1, 1, 1] if self == DistanceKind.VERTEX_VERTEX else [0, 1, 2, 3]
+
+    @property
+    def points(self) -> int:
+        """Number of points of a pair."""
+        return max(self.point_order) + 1
 
 
 def check_method(method: str) -> None:
@@ -143,7 +175,7 @@ class PairCounts:
         """Number of pairs that are reported."""
         return self.found - self.refuted
 
-    def overflows(self, capacities: "PairCounts", kind: PairKind) -> list[str]:
+    def overflows(self, capacities: "PairCounts", kind: PairKind | DistanceKind) -> list[str]:
         """Names each buffer of a kind that is too small for these counts, with count and capacity."""
         return [
             f"{kind.label} {count.name.lower()}: {needed} do not fit in the capacity {capacity}"
@@ -165,27 +197,33 @@ class Counts:
         face_pairs: Pairs of faces whose swept boxes overlap, of a broad phase that has a queue for them.
         vertex_face: Counts of vertex-face pairs.
         edge_edge: Counts of edge-edge pairs.
+        vertex_edge: Counts of pairs of a point and an edge that no face has.
+        vertex_vertex: Counts of pairs of points.
     """
 
     not_finite: int
     face_pairs: int
     vertex_face: PairCounts
     edge_edge: PairCounts
+    vertex_edge: PairCounts = PairCounts()
+    vertex_vertex: PairCounts = PairCounts()
+
+    @property
+    def pairs(self) -> dict[DistanceKind, PairCounts]:
+        """The counts of each kind of pair."""
+        return {kind: getattr(self, kind.label) for kind in DistanceKind}
 
     def values(self) -> list[int]:
         """Returns all counts in the order of :class:`Counters`."""
-        return [self.not_finite, self.face_pairs, *self.vertex_face.values(), *self.edge_edge.values()]
+        return [self.not_finite, self.face_pairs, *(v for counts in self.pairs.values() for v in counts.values())]
 
     def overflows(self, capacities: "Counts") -> list[str]:
         """Names each buffer that is too small for these counts, with count and capacity."""
         faces = []
         if self.face_pairs > capacities.face_pairs:
             faces = [f"face pairs: {self.face_pairs} do not fit in the capacity {capacities.face_pairs}"]
-        return [
-            *faces,
-            *self.vertex_face.overflows(capacities.vertex_face, PairKind.VERTEX_FACE),
-            *self.edge_edge.overflows(capacities.edge_edge, PairKind.EDGE_EDGE),
-        ]
+        others = capacities.pairs
+        return [*faces, *(line for kind, counts in self.pairs.items() for line in counts.overflows(others[kind], kind))]
 
 
 class Counters:
@@ -195,22 +233,26 @@ class Counters:
         array: All counts, zero before each detection, Warp array of int64.
         not_finite: Number of vertices with a position that is not finite, array of one int64.
         face_pairs: Number of pairs of faces, array of one int64.
-        pairs: Counts of both kinds of pair, array of int64.
+        pairs: Counts of all kinds of pair, array of int64.
         vertex_face: Counts of vertex-face pairs by :class:`Count`, array of int64.
         edge_edge: Counts of edge-edge pairs by :class:`Count`, array of int64.
+        vertex_edge: Counts of pairs of a point and an edge by :class:`Count`, array of int64.
+        vertex_vertex: Counts of pairs of points by :class:`Count`, array of int64.
     """
 
     def __init__(self, device: wp.Device):
         """Allocates the counters on a device, all zero."""
-        self.array = wp.zeros(_PAIRS + 2 * len(Count), dtype=wp.int64, device=device)
+        n = len(Count)
+        self.array = wp.zeros(_PAIRS + n * len(DistanceKind), dtype=wp.int64, device=device)
         self.not_finite = self.array[_NOT_FINITE:_FACE_PAIRS]
         self.face_pairs = self.array[_FACE_PAIRS:_PAIRS]
         self.pairs = self.array[_PAIRS:]
-        self.vertex_face = self.pairs[: len(Count)]
-        self.edge_edge = self.pairs[len(Count) :]
+        self.vertex_face, self.edge_edge, self.vertex_edge, self.vertex_vertex = (
+            self.pairs[n * kind : n * (kind + 1)] for kind in DistanceKind
+        )
 
     def read(self) -> Counts:
         """Returns the counts on the host; synchronizes with the device."""
         not_finite, face_pairs, *pairs = self.array.numpy().tolist()
         n = len(Count)
-        return Counts(not_finite, face_pairs, PairCounts(*pairs[:n]), PairCounts(*pairs[n:]))
+        return Counts(not_finite, face_pairs, *(PairCounts(*pairs[n * kind : n * (kind + 1)]) for kind in DistanceKind))

@@ -6,57 +6,77 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import orjson
 
+from .. import __version__
 from ..usd.scene import Scene
-from .intervals import IntersectionSummary, IntervalResult
 from .outputs import RecordFile
+from .results import IntersectionSummary, IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 
-__all__ = ["HitsCsv", "HitsJson"]
+__all__ = ["HitsCsv", "HitsJson", "replay_facts"]
+
+
+def replay_facts(
+    scene: Scene, *, method: str, device: str, min_distance: float | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Returns facts of a replay that hold from its start: what is checked, and how.
+
+    Args:
+        scene: The scene.
+        method: Method of detection.
+        device: Name of the Warp device.
+        min_distance: As of :class:`Summary`.
+        options: All other options that the results depend on.
+    """
+    return {
+        "version": __version__,
+        "scene": scene.path,
+        "files": [
+            {"path": path, "bytes": size, "modified_ns": changed}
+            for path, (size, changed) in sorted(scene.files.versions().items())
+        ],
+        "method": method,
+        "device": device,
+        "min_distance": min_distance,
+        "options": options,
+        "time_codes_per_second": scene.time_codes_per_second,
+        "meters_per_unit": scene.meters_per_unit,
+        "up_axis": scene.up_axis,
+        "vertices": scene.vertex_count,
+        "faces": scene.face_count,
+        "meshes": scene.names,
+    }
 
 
 class HitsJson(RecordFile):
-    """A JSON file: facts of the scene, every interval with its contacts and intersections, then the sums.
+    """A JSON file: facts of the replay, every interval with its contacts and intersections, then the sums.
 
-    An interval lists the intersections and proximities at its start; the last one lists those at its end as well.
+    An interval lists the intersections and proximities at its start, and where the next interval may start elsewhere,
+    or there is none, those at its end as well. Every interval is in a line of its own.
+
+    The file holds no measured times, so that it is the same whoever has found the results.
+    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it.
     """
 
-    def __init__(
-        self, path: str | os.PathLike, *, scene: Scene, method: str, device: str, min_distance: float | None = None
-    ):
+    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any]):
         """Opens the file.
 
         Args:
             path: The file's place.
-            scene: The scene.
-            method: Method of detection.
-            device: Name of the Warp device.
-            min_distance: As of :class:`Summary`.
+            facts: What :func:`replay_facts` returns.
 
         Raises:
             OSError: If it cannot be written.
         """
         super().__init__(path)
-        self._last_index = len(scene) - 1
-        self._facts = {
-            "scene": scene.path,
-            "method": method,
-            "device": device,
-            "min_distance": min_distance,
-            "time_codes_per_second": scene.time_codes_per_second,
-            "meters_per_unit": scene.meters_per_unit,
-            "up_axis": scene.up_axis,
-            "vertices": scene.vertex_count,
-            "faces": scene.face_count,
-            "meshes": scene.names,
-        }
+        self._facts = facts
 
     def head(self) -> str:
         """Returns the text before the first interval."""
@@ -65,6 +85,7 @@ class HitsJson(RecordFile):
     def record(self, result: IntervalResult) -> Iterator[str | bytes]:
         """Yields the text of an interval with all of its contacts."""
         interval, contacts = result.summary, result.contacts
+        is_joined = contacts.interval.is_joined
         fields = {
             "index": interval.index,
             "start": interval.start,
@@ -75,8 +96,9 @@ class HitsJson(RecordFile):
             "edge_edge_hits": interval.edge_edge_hits,
             "earliest": asdict(interval.earliest) if interval.earliest else None,
             "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
+            "ignored": _mesh_pairs_to_list(interval.ignored.items()),
             "certified": interval.certified,
-            "stages": asdict(interval.stats),
+            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in ("vertex_face", "edge_edge")},
             "validation": asdict(interval.validation) if interval.validation else None,
         }
         if interval.intersections:
@@ -91,12 +113,12 @@ class HitsJson(RecordFile):
         if result.intersections:
             start, end = result.intersections
             yield from _list("edges_through_faces", start, _intersection_rows)
-            if interval.index == self._last_index:
+            if not is_joined:
                 yield from _list("edges_through_faces_at_end", end, _intersection_rows)
         if result.proximities:
             start, end = result.proximities
             yield from _list("near_pairs", start, _proximity_rows)
-            if interval.index == self._last_index:
+            if not is_joined:
                 yield from _list("near_pairs_at_end", end, _proximity_rows)
         yield "}"
 
@@ -228,12 +250,16 @@ def _proximity_rows(proximities: SceneProximities, rows: slice) -> list[dict]:
 
 
 def _names(pairs: ScenePairs, rows: slice) -> dict[str, list]:
-    """Returns names of meshes, paths of prims, names of elements and their indices for some pairs."""
+    """Returns names of meshes, paths of prims, names of elements and their indices for some pairs.
+
+    ``triangle`` is which of the triangles of its polygon the face is, from 0; None for two edges.
+    """
     return {
         "meshes": pairs.mesh_names(rows),
         "prims": pairs.mesh_paths(rows),
         "elements": pairs.element_names(rows),
         "indices": pairs.element_indices(rows),
+        "triangle": pairs.triangles(rows),
     }
 
 

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from ..usd.scene import Scene
-from .intervals import IntervalResult
 from .outputs import RecordFile
 from .page_view import choose_faces
+from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ScenePairs
@@ -244,7 +244,6 @@ def _data(summary: Summary) -> dict:
         ],
         "rest": [(at.time, at.crossings, at.touches) for at in summary.intersections],
         "toi": summary.toi_counts,
-        "stages": list(summary.milliseconds.items()),
         "pairs": _pairs_of_meshes(summary),
         "up_axis": scene.up_axis,
         "facts": [

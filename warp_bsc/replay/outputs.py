@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Protocol, TypeVar
 
 from .._atomic_file import OutputFile
-from .intervals import IntervalResult
+from .results import IntervalResult
 from .summary import Summary
 
 __all__ = ["RecordFile", "ReplayOutput", "without_last_eighth"]

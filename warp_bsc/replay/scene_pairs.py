@@ -9,6 +9,7 @@ from ..usd.segment import Segment
 __all__ = [
     "DIAGONAL",
     "EDGE",
+    "ELEMENT_WORDS",
     "FACE",
     "KINDS",
     "NO_PAIRS",
@@ -25,6 +26,9 @@ KINDS = ("vertex-face", "edge-edge")
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
 
+ELEMENT_WORDS = ("vertex", "face", "edge", "diagonal")
+"""The words for them."""
+
 NO_PAIRS = {
     "elements": np.zeros((0, 2), dtype=np.int64),
     "meshes": np.zeros((0, 2), dtype=np.int64),
@@ -37,7 +41,6 @@ NO_PAIRS = {
 fixed time of an interval."""
 
 _CHUNK = 4096
-_WORDS = ("vertex", "face", "edge", "diagonal")
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ class ScenePairs:
         """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
         sides = [
             [
-                f"{_WORDS[kind]} {first}" if second < 0 else f"{_WORDS[kind]} {first}-{second}"
+                f"{ELEMENT_WORDS[kind]} {first}" if second < 0 else f"{ELEMENT_WORDS[kind]} {first}-{second}"
                 for kind, first, second in zip(
                     self.elements[rows, side].tolist(), *self.indices[rows, side].T.tolist(), strict=True
                 )
@@ -103,6 +106,12 @@ class ScenePairs:
             for side in range(2)
         ]
         return list(zip(*sides, strict=True))
+
+    def triangles(self, rows: slice) -> list[int | None]:
+        """Returns which triangle of its polygon the face of some pairs is, from 0; None where no element is a face."""
+        faces = self.faces[rows].max(axis=1)
+        places = self.segment.places_in_polygons(np.maximum(faces, 0))
+        return [place if face >= 0 else None for face, place in zip(faces.tolist(), places.tolist(), strict=True)]
 
     def _of_meshes(self, texts, rows) -> list[tuple[str, str]]:
         """Returns the texts of the two meshes of some pairs; pairs of the same meshes share them."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from ..usd.scene import Scene
-from .intervals import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 
 __all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "Summary", "ValidationSummary"]
 

@@ -14,8 +14,8 @@ from ..usd.layer import just_before, layer_metadata, unused_path
 from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
-from .intervals import IntervalResult
 from .outputs import without_last_eighth
+from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .summary import Summary

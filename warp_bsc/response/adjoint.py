@@ -27,7 +27,7 @@ from .angular_momentum import SUMS, turns
 from .buffers import PROJECTED, Constraints, Motion, Progress, SolveStatus, Vertices
 from .constraints import MAX_TRUNCATIONS
 from .planes import MovingPlanes
-from .projection import SWEEPS_PER_BATCH, add_delta, with_delta
+from .projection import SWEEPS_PER_BATCH, add_delta, count_active, with_delta
 from .step_record import (
     OFFSETS,
     PER_ENTRY,
@@ -169,8 +169,7 @@ def _restore_multipliers(
     add_delta(motion, constraints, i, old - multiplier[i], sums)
     multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
-    for j in range(4):
-        wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+    count_active(motion, vertices, constraints, i)
 
 
 @wp.func

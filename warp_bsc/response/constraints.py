@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.queues import take_place
 from .buffers import Constraints, Motion, Progress, Vertices
 from .exclusion import Connectivity, crossed_at_start, is_movable
 
@@ -23,6 +24,7 @@ __all__ = [
     "Contacts",
     "add_constraint",
     "approach_of",
+    "begins_dividing",
     "contact_vertices",
     "contact_weights",
     "count_contact",
@@ -117,6 +119,15 @@ def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
     if iteration >= progress.max_iterations:
         return True
     return iteration >= progress.max_slow_iterations and progress.fast[world] == 0
+
+
+@wp.func
+def begins_dividing(progress: Progress, world: int) -> bool:
+    """Returns whether this iteration is the first that divides vertices of a world."""
+    last = progress.status.iteration[0] - 1
+    if progress.contact_iteration[world] != last:
+        return False
+    return is_dividing(progress, world, last) and not is_dividing(progress, world, last - 1)
 
 
 @wp.func
@@ -298,7 +309,7 @@ def add_constraint(
     multiplier: wp.vec3d,
 ):
     """Adds a constraint with a position multiplier if it fits; counts it in any case."""
-    i = wp.atomic_add(constraints.count, 0, 1)
+    i = take_place(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = corners
         constraints.weights[i] = weights

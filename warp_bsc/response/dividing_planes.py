@@ -1,10 +1,10 @@
 """Dividing planes: what projection cannot keep apart, a plane between the two elements keeps apart for certain.
 
 If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
-at all times of a linear motion. After the last projection, each contact that is left gets a plane across the shortest
-vector between its elements at the start, and every vertex of the two is projected onto its side. Vertices that stand
-still are on their sides, so that there is a solution for the vertices of all contacts at once, each by itself. What
-slides along a plane goes on sliding, unlike what is truncated.
+at all times of a linear motion. After the last projection, each contact that is left, and each near pair that could
+become one, gets a plane across the shortest vector between its elements at the start, and every vertex of the two is
+projected onto its side. Vertices that stand still are on their sides, so that there is a solution for the vertices of
+all pairs at once, each by itself. What slides along a plane goes on sliding, unlike what is truncated.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -13,6 +13,7 @@ References:
 
 import warp as wp
 
+from ..kernels.pipeline.queues import take_place
 from .buffers import Motion, Vertices
 from .constraints import LEAST_DISTANCE, inverse_mass_of, to_double, to_single
 from .proximities import closest_direction
@@ -41,6 +42,7 @@ _NEAR_MARGIN = wp.constant(wp.float64(0.45))
 _ROOM = wp.constant(wp.float64(0.05))
 """How much farther than that both are from the plane at the start at least, as a share of their distance."""
 _ZERO = wp.constant(wp.float64(0.0))
+_HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _FAR = wp.constant(wp.float64(1.0e300))
 
@@ -96,7 +98,7 @@ def add_plane(
         offset: Its coordinate along the normal [m].
         margin: Least distance from it after projection [m].
     """
-    plane = wp.atomic_add(planes.count, 0, 1)
+    plane = take_place(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal
@@ -132,6 +134,7 @@ class _Side:
     start: wp.float64  # at the start
     end: wp.float64  # at the end
     fixed: wp.float64  # those of its vertices that cannot be moved, at the end
+    reach: wp.float64  # wherever planes may take it
     inverse_mass: wp.float64  # sum over its vertices
 
 
@@ -139,15 +142,24 @@ class _Side:
 def _side(
     motion: Motion, vertices: Vertices, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d, normal: wp.vec3d
 ) -> _Side:
-    """Returns how far the vertices from ``begin`` to ``end`` reach against a normal."""
+    """Returns how far the vertices from ``begin`` to ``end`` reach against a normal.
+
+    Planes take a vertex no farther than the ball around its path: this is what projection onto a convex set does to the
+    end of a path that starts in it.
+    """
     side = _Side()
+    side.reach = _FAR
     side.start = _FAR
     side.end = _FAR
     side.fixed = _FAR
     for j in range(begin, end):
         vertex = corners[j]
-        x1 = wp.dot(normal, to_double(vertices.x1[vertex]) - origin)
-        side.start = wp.min(side.start, wp.dot(normal, to_double(motion.x0[vertex]) - origin))
+        start = to_double(motion.x0[vertex])
+        path = to_double(vertices.x1[vertex]) - start
+        x0 = wp.dot(normal, start - origin)
+        x1 = x0 + wp.dot(normal, path)
+        side.start = wp.min(side.start, x0)
+        side.reach = wp.min(side.reach, _HALF * (x0 + x1 - wp.length(path)))
         side.end = wp.min(side.end, x1)
         inverse_mass = wp.float64(inverse_mass_of(motion, vertex))
         side.inverse_mass += inverse_mass
@@ -164,11 +176,16 @@ def add_dividing_plane(
     edges: int,
     separation: wp.float64,
     planes: DividingPlanes,
-):
+    is_contact: bool,
+) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
-    vertex that cannot be moved. Elements that touch at the start have none.
+    vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
+    cannot bring together.
+
+    Returns:
+        Whether the elements meet at the end, or nearly, without planes.
     """
     normal = closest_direction(motion, corners, edges)
     origin = to_double(motion.x0[corners[3]])
@@ -176,6 +193,8 @@ def add_dividing_plane(
     above = _side(motion, vertices, corners, 0, split, origin, normal)
     below = _side(motion, vertices, corners, split, 4, origin, -normal)
     distance = above.start + below.start
+    if not is_contact and (distance <= _ZERO or above.reach + below.reach > _ZERO):
+        return False
     movable = wp.vec4i()
     for j in range(4):
         movable[j] = wp.where(inverse_mass_of(motion, corners[j]) > 0.0, corners[j], -1)
@@ -183,7 +202,7 @@ def add_dividing_plane(
         for j in range(4):
             if movable[j] >= 0:
                 _add_node(planes, movable[j], _INCOMPLETE)
-        return
+        return False
     margin = wp.where(distance < LEAST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
     least = margin + _ROOM * distance
     share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
@@ -192,6 +211,7 @@ def add_dividing_plane(
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin)
+    return above.end + below.end < margin
 
 
 @wp.func

@@ -9,13 +9,16 @@ from .bodies import sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
+    EDGE_EDGE_PROXIMITY,
     NO_CONSTRAINT,
     PLANE_CONTACT,
     TIME_UNITS,
     TOUCH,
     VERTEX_FACE_CONTACT,
+    VERTEX_FACE_PROXIMITY,
     Contacts,
     add_constraint,
+    begins_dividing,
     contact_vertices,
     contact_weights,
     count_contact,
@@ -32,12 +35,14 @@ from .constraints import (
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
 from .exclusion import bodies_meet, crossed_at_start, is_movable
 from .hidden_edges import are_hidden
+from .projection import has_pushed
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
 
 __all__ = [
     "begin_step",
     "collect_contacts",
     "decide",
+    "divide_near_pairs",
     "drop_if_full",
     "freeze_undetected",
     "record_offsets",
@@ -147,7 +152,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing, True)
         multiplier = TOUCH * normal
     else:
         progress.status.projecting[0] = 1
@@ -202,6 +207,35 @@ def collect_contacts(
         return
     _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, progress, separation)
     _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, progress, separation)
+
+
+@wp.kernel(**_KERNEL)
+def divide_near_pairs(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    progress: Progress,
+    separation: wp.float64,
+):
+    """Adds dividing planes for the proximities of worlds in which division begins.
+
+    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    A constraint whose elements would meet changes velocities too.
+    """
+    i = wp.tid()
+    if i >= constraints.count[0]:
+        return
+    kind = constraints.kind[i]
+    if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
+        return
+    corners = constraints.vertices[i]
+    if not begins_dividing(progress, motion.world[corners[0]]):
+        return
+    edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
+    if meets and not has_pushed(constraints, i):
+        constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
 
 
 @wp.kernel(**_KERNEL)
@@ -288,6 +322,19 @@ def _record_truncation(
         record.normal[entry] = contacts.normal[i]
 
 
+@wp.func
+def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes, vertex: int):
+    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided."""
+    if motion.inverse_mass[vertex] == 0.0 or dividing.first[vertex] < 0:
+        return
+    x1 = vertices.x1[vertex]
+    end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
+    if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+
+
 @wp.kernel(**_KERNEL)
 def truncate_vertices(
     motion: Motion,
@@ -299,7 +346,7 @@ def truncate_vertices(
     edge_edge: Contacts,
     dt: wp.float64,
 ):
-    """Moves each vertex of a contact that is left onto its side, or truncates its path before its first contact.
+    """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
     Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
     ``max_truncations`` iterations vertices that still collide are frozen.
@@ -307,6 +354,8 @@ def truncate_vertices(
     vertex = wp.tid()
     key = vertices.first_contact[vertex]
     if key == NEVER:
+        if dividing.first:
+            _keep_on_sides(motion, vertices, dividing, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:

@@ -28,6 +28,8 @@ __all__ = ["Proximities", "closest_direction", "closest_vector", "collect_proxim
 _QUEUED = wp.constant(int(Count.QUEUED))
 _REACH = wp.constant(wp.float64(1.5))
 """Distance in separations up to which pairs are proximities even if they stand still: neighbours in a stack."""
+_PARALLEL = wp.constant(wp.float64(1.0e-12))
+"""Squared sine up to which edges, or two sides of a face, count as parallel."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
@@ -99,6 +101,45 @@ def closest_direction(motion: Motion, corners: wp.vec4i, edges: int) -> wp.vec3d
 
 
 @wp.func
+def _weights_across(motion: Motion, corners: wp.vec4i, edges: int):
+    """Returns where the line across both elements at the start meets them.
+
+    Returns:
+        The weights of the four vertices in the vector between the two points, the unit vector across both elements,
+        from the second to the first, and the distance along it [m], which is 0 unless both points are within the
+        elements: only then are they their closest points.
+    """
+    a = to_double(motion.x0[corners[0]])
+    b = to_double(motion.x0[corners[1]])
+    c = to_double(motion.x0[corners[2]])
+    d = to_double(motion.x0[corners[3]])
+    u = wp.where(edges == 1, b - a, c - b)
+    v = wp.where(edges == 1, d - c, d - b)
+    w = wp.where(edges == 1, c - a, a - b)
+    n = wp.cross(u, v)
+    nn = wp.length_sq(n)
+    s = wp.dot(wp.cross(w, v), n)
+    r = wp.dot(wp.cross(u, w), n)
+    weights = wp.vec4d()
+    if nn <= _PARALLEL * wp.length_sq(u) * wp.length_sq(v) or not (s > _ZERO and s < nn):
+        return weights, n, _ZERO
+    height = wp.dot(w, n)
+    s /= nn
+    r /= nn
+    if edges == 1:
+        height = -height
+        r = -r
+        weights = wp.vec4d(_ONE - s, s, r - _ONE, -r)
+    else:
+        weights = wp.vec4d(_ONE, s + r - _ONE, -s, -r)
+    size = wp.sqrt(nn)
+    n *= wp.sign(height) / size
+    if r > _ZERO and weights[1 + edges] < _ZERO:
+        return weights, n, wp.abs(height) / size
+    return weights, n, _ZERO
+
+
+@wp.func
 def _collect_proximity(
     motion: Motion,
     vertices: Vertices,
@@ -111,20 +152,18 @@ def _collect_proximity(
     if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
+    weights, normal, distance = _weights_across(motion, corners, near.edges)
+    if distance == _ZERO:
+        return
+    path = longest_path(motion, corners)
+    if distance > wp.max(path, _REACH * separation):
+        return
     if not is_movable(motion, corners) or not is_projecting(progress, motion.world[corners[0]]):
         return
     if is_slow(motion, corners, near.edges) == 0:
         return
-    weights, between = closest_vector(motion, corners, near.edges)
-    if not _is_within(weights, near.edges):
-        return
-    distance = wp.length(between)
-    path = longest_path(motion, corners)
-    if distance == _ZERO or distance > wp.max(path, _REACH * separation):
-        return
     if progress.status.crossings[0] > 0 and crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
         return
-    normal = between / distance
     if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])

@@ -86,7 +86,7 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
             arguments.vertices.changed[corners[j]] = 1
         return
     count_contact(arguments.progress, motion.world[corners[0]])
-    add_dividing_plane(motion, arguments.vertices, corners, edges, arguments.separation, arguments.dividing)
+    add_dividing_plane(motion, arguments.vertices, corners, edges, arguments.separation, arguments.dividing, True)
     for j in range(4):
         arguments.vertices.changed[corners[j]] = 1
         update_first_contact(arguments.vertices, corners[j], result.toi, NO_CONSTRAINT, 0)

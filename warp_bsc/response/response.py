@@ -40,6 +40,7 @@ from .kernels import (
     begin_step,
     collect_contacts,
     decide,
+    divide_near_pairs,
     drop_if_full,
     freeze_undetected,
     record_offsets,
@@ -81,8 +82,8 @@ _BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
 _DIVIDING_PLANES = 32
 """Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
-_ITERATIONS_RESERVED = 2
-"""Iterations for whose contacts constraints are reserved."""
+_ITERATIONS_RESERVED = 3
+"""Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities take the room of all but one."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class Response:
         self._differentiable = differentiable
         self.worlds = max(1, mesh.model.world_count)
         self._most_blocks = _BLOCKS * device.sm_count
-        self._summing_threads = 1 if device.is_cpu else 64 * device.sm_count
+        self._summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self.vertices = allocate_vertices(mesh.vertex_count, device)
         self._movable = mesh.model.particle_count
         self._bodies = mesh.model.body_count if moves_bodies else 0
@@ -433,7 +434,11 @@ class Response:
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
             self._record = self._recorder.reserve_truncations(self._movable)
-        inputs = [self._motion.vertices, self.vertices, self.progress, self._record, self._dividing]
+        motion, vertices, dividing = self._motion.vertices, self.vertices, self._dividing
+        if not self._differentiable:
+            inputs = [motion, vertices, self.constraints, dividing, self.progress, self.separation]
+            self.launch_over_constraints(divide_near_pairs, inputs)
+        inputs = [motion, vertices, self.progress, self._record, dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing)

@@ -38,6 +38,16 @@ class SceneFiles:
             if _stamp(path) != stamp:
                 raise ValueError(f"{path}: the file has changed since it was opened")
 
+    def versions(self) -> dict[str, tuple[int, int]]:
+        """Returns the size [bytes] and the time of the last change [ns] of each file, by its path."""
+        self._find()
+        return {path: (size, changed) for path, (_, size, changed) in self._stamps.items()}
+
+    def differing(self, versions: dict[str, tuple[int, int]]) -> str | None:
+        """Returns the path of a file that has another version than given, None if there is none."""
+        own = self.versions()
+        return next((path for path in own if versions.get(path, own[path]) != own[path]), None)
+
     def _find(self):
         from pxr import Ar  # noqa: PLC0415 (slow)
 

@@ -1,12 +1,43 @@
 """The motion of a scene from one of its times to the next."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from .segment import Segment
 
-__all__ = ["Interval"]
+__all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "jump_warning", "left_out_warning", "message_warning"]
+
+
+@dataclass(frozen=True)
+class LeftOutMesh:
+    """A mesh that is left out from some interval on, because it cannot be read.
+
+    Attributes:
+        name: Its name.
+        since: Number of the first interval without it.
+        reason: Why and since when, a sentence.
+    """
+
+    name: str
+    since: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class ReadingNotes:
+    """What reading an interval revealed.
+
+    Attributes:
+        left_out: The meshes left out from this interval or a later one on.
+        messages: Messages of OpenUSD that it had not given before.
+        jumps: Names of the meshes that do not start where the interval before ended.
+    """
+
+    left_out: tuple[LeftOutMesh, ...] = ()
+    messages: tuple[str, ...] = ()
+    jumps: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -21,9 +52,9 @@ class Interval:
         x0: Positions of their vertices at the start, in world space and the scene's unit of length, float32 or float64,
             shape [vertex_count, 3].
         x1: The same at the end; where a mesh jumps at that time, before the jump.
-        jumps: Names of the meshes that do not start where the interval before ended. Empty unless that interval was the
-            last one read.
-        warnings: What reading this interval revealed, a sentence each: parts left out, messages of OpenUSD, jumps.
+        is_joined: Whether the next interval surely starts where this one ends, with the same meshes. False for the last
+            interval, and where a mesh may jump at the end.
+        notes: What reading the interval revealed.
     """
 
     index: int
@@ -32,5 +63,43 @@ class Interval:
     segment: Segment
     x0: np.ndarray = field(repr=False)
     x1: np.ndarray = field(repr=False)
-    jumps: tuple[str, ...]
-    warnings: tuple[str, ...]
+    is_joined: bool
+    notes: ReadingNotes
+
+    @property
+    def jumps(self) -> tuple[str, ...]:
+        """Names of the meshes that do not start where the interval before ended.
+
+        Empty unless that interval was the last one read, or intervals are read in order.
+        """
+        return self.notes.jumps
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What reading this interval revealed, a sentence each: parts left out, messages of OpenUSD, jumps."""
+        return (
+            *(left_out_warning(part.reason) for part in self.notes.left_out),
+            *map(message_warning, self.notes.messages),
+            *(jump_warning(name, [self.start]) for name in self.jumps),
+        )
+
+
+def left_out_warning(reason: str) -> str:
+    """Returns the warning that a part is left out, for a reason."""
+    return f"left out: {reason}"
+
+
+def message_warning(message: str) -> str:
+    """Returns the warning that OpenUSD has said something."""
+    return f"OpenUSD says: {message}"
+
+
+def jump_warning(name: str, times: Iterable[float]) -> str:
+    """Returns the warning that a mesh jumps, given its name and the times."""
+    return f"{name} jumps {times_in_words(times)}: what it jumps through is not checked"
+
+
+def times_in_words(times: Iterable[float]) -> str:
+    """Returns when something happens, given the times, at least one, ascending."""
+    times = list(times)
+    return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"

@@ -48,13 +48,21 @@ unselected meshes) and the changes that it makes to the motion.
 import math
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
 from .files import SceneFiles
-from .interval import Interval
+from .interval import (
+    Interval,
+    LeftOutMesh,
+    ReadingNotes,
+    jump_warning,
+    left_out_warning,
+    message_warning,
+    times_in_words,
+)
 from .segment import Segment
 from .selection import Selection
 
@@ -125,6 +133,10 @@ class Scene:
 
     A scene holds one segment of the motion in memory and reads others when an interval needs them.
 
+    It can be pickled, for another process that reads other intervals of the same files: the pickle holds its path, its
+    options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if it is not
+    the same one.
+
     Attributes:
         path: The file.
         selection: Which of its meshes are checked.
@@ -175,15 +187,27 @@ class Scene:
             ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
                 ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
+        options = _Options(selection, frames, subdivide, sample_turns, strict)
+        self._open(path, options, _Revealed(), progress)
+
+    def _open(
+        self,
+        path: str | os.PathLike,
+        options: "_Options",
+        revealed: "_Revealed",
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Opens the file and finds its meshes, as of ``__init__``, given what reading it has revealed earlier."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
         from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
         from . import stage as usd_stage  # noqa: PLC0415
 
+        self._options = options
         self.path = str(path)
-        self.selection = selection or Selection()
+        self.selection = options.selection or Selection()
         self._unreadable = usd_stage.UnreadableError
-        self._left_out = usd_stage.LeftOut(path, strict)
+        self._left_out = usd_stage.LeftOut(path, options.strict)
         self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
         self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
@@ -196,9 +220,9 @@ class Scene:
             texts = {"Comment": "comment", "Documentation": "documentation"}
             self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
             self._usd_meshes, self._warnings = usd_meshes.find_meshes(self.stage, path, self.selection, self._left_out)
-            self._check_meshes(bool(selection))
+            self._check_meshes(bool(options.selection))
             self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
-            changes = self._find_times(frames or FrameRange(), subdivide, sample_turns)
+            changes = self._find_times(options.frames or FrameRange(), options.subdivide, options.sample_turns)
             self._note_changes()
             inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
@@ -207,7 +231,14 @@ class Scene:
             self._last = None  # index, segment and positions of the last interval that was read
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
-            segment = self._segment_at(0, progress)
+            self._parts: list[LeftOutMesh] = []  # left out after the file was opened
+            self._noted = 0, 0  # numbers of these and of messages that notes contain
+            self._welds = {}  # by span
+            for part in revealed.left_out:
+                self._left_out.reasons.append(part.reason)
+                self._apply(part)
+            self._welds.update(revealed.welds)
+            segment = self.segment(0, progress)
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
         self.names = [mesh.name for mesh in read]
@@ -222,12 +253,12 @@ class Scene:
     @property
     def warnings(self) -> list[str]:
         """Sentences on unread contents and on changes to the motion; on jumps in the intervals read so far."""
-        warnings = [*map(_left_out_warning, self.left_out[:_NAMED])]
+        warnings = [*map(left_out_warning, self.left_out[:_NAMED])]
         if len(self.left_out) > _NAMED:
             warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
-        warnings += map(_message_warning, self._messages[:_NAMED])
+        warnings += map(message_warning, self._messages[:_NAMED])
         warnings += self._warnings
-        warnings += (_jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
+        warnings += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
             warnings.append(f"vertices in one place at all times were welded: {self._welded}")
         return warnings
@@ -243,7 +274,31 @@ class Scene:
 
     def __iter__(self) -> Iterator[Interval]:
         """Reads all intervals in order, each when it is reached. Errors are those of :meth:`interval`."""
-        return (self.interval(index) for index in range(len(self)))
+        return self.intervals()
+
+    def __reduce__(self):
+        """Returns what opens the scene again."""
+        path = os.path.abspath(self.path) if os.path.exists(self.path) else self.path
+        revealed = _Revealed(tuple(self._parts), self._welds)
+        return _open_again, (path, self._options, revealed, self.files.versions(), self._contents())
+
+    def intervals(self, first: int = 0, stop: int | None = None) -> Iterator[Interval]:
+        """Reads intervals in order, each when it is reached, with the jumps from the one before the first, too.
+
+        Args:
+            first: Number of the first interval.
+            stop: Number of the interval after the last one; default: all.
+
+        Raises:
+            IndexError: If there is no such interval.
+            ValueError: As of :meth:`interval`.
+        """
+        self.take_notes()
+        stop = len(self) if stop is None else stop
+        if 0 < first < stop and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
+            self._read_positions(first - 1)
+        for index in range(first, stop):
+            yield self._read(index)
 
     def interval(self, index: int) -> Interval:
         """Reads the motion from one time to the next.
@@ -255,13 +310,70 @@ class Scene:
             IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
+        self.take_notes()
+        return self._read(index)
+
+    def segment(self, index: int, progress: Callable[[int, int], None] | None = None) -> Segment:
+        """Returns the segment that an interval is in: the one in memory if possible.
+
+        Args:
+            index: Number of the interval.
+            progress: As of the constructor.
+
+        Raises:
+            ValueError: As of :meth:`interval`.
+        """
+        while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
+            span = next(span for span in self._spans if span[0] <= index < span[1])
+            start, stop = span
+            present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
+            self._segment = self._span = self._last = None  # before the next is read, to free memory
+            try:
+                times, welds = self.times[start : stop + 1], self._welds.get(span)
+                self._segment = Segment(present, times, self.dtype, progress, welds)
+            except self._unreadable as error:
+                self._leave_out(error, start)
+            else:
+                self._span = span
+                self._welds[span] = self._segment.welds
+                self._welded = max(self._welded, self._segment.welded)
+        return self._segment
+
+    def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
+        """Returns what reading has revealed since this was called last, or since the scene was opened; and jumps."""
+        parts, messages = self._noted
+        self._noted = len(self._parts), len(self._messages)
+        return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
+
+    def note(self, index: int, notes: ReadingNotes) -> None:
+        """Records what reading an interval has revealed in another process, as if this scene had read it.
+
+        Args:
+            index: Number of the interval.
+            notes: What has been revealed. That of all intervals before must have been recorded.
+        """
+        for part in notes.left_out:
+            self._left_out.reasons.append(part.reason)
+            self._apply(part)
+        self._messages += [message for message in notes.messages if message not in self._messages]
+        for name in notes.jumps:
+            self._jump_times.setdefault(name, set()).add(self.times[index])
+
+    def _read(self, index) -> Interval:
+        """Reads an interval, with all that reading has revealed since notes were taken last."""
+        segment, x0, x1, jumps = self._read_positions(index)
+        start, end = self.times[index : index + 2]
+        is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
+
+    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
+        """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
-        left_out, messages = len(self.left_out), len(self._messages)
         with self._collecting(self._messages, self.path):
             while True:
-                segment = self._segment_at(index)
+                segment = self.segment(index)
                 try:
                     last = self._last
                     known = last[3] if last and last[:2] == (index - 1, segment) else None
@@ -273,12 +385,11 @@ class Scene:
         jumps = self._find_jumps(index, segment, x0, x1)
         for name in jumps:
             self._jump_times.setdefault(name, set()).add(start)
-        warnings = [
-            *map(_left_out_warning, self.left_out[left_out:]),
-            *map(_message_warning, self._messages[messages:]),
-            *(_jump_warning(name, [start]) for name in jumps),
-        ]
-        return Interval(index, start, end, segment, x0, x1, jumps, tuple(warnings))
+        return segment, x0, x1, jumps
+
+    def _contents(self) -> tuple:
+        """Returns facts of the scene that another process must find, too."""
+        return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
 
     def _check_meshes(self, is_selection):
         """Raises a ValueError if there are no meshes."""
@@ -316,31 +427,22 @@ class Scene:
             ] + self.times[-1:]
         return changes
 
-    def _segment_at(self, index, progress=None) -> Segment:
-        """Returns the segment that an interval is in: the one in memory if possible."""
-        while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
-            span = next(span for span in self._spans if span[0] <= index < span[1])
-            start, stop = span
-            present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
-            self._segment = self._span = self._last = None  # before the next is read, to free memory
-            try:
-                self._segment = Segment(present, self.times[start : stop + 1], self.dtype, progress)
-            except self._unreadable as error:
-                self._leave_out(error, start)
-            else:
-                self._span = span
-                self._welded = max(self._welded, self._segment.welded)
-        return self._segment
-
     def _leave_out(self, error, index):
         """Leaves out the mesh of an error from the interval on in which it breaks, or from ``index`` on if later."""
-        ends_at = self.times.index(error.time)
-        since = max(index, ends_at - 1)
+        since = max(index, self.times.index(error.time) - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
-        error.mesh.leave_out(self.times[since] if since else -math.inf)
+        self._apply(LeftOutMesh(error.mesh.name, since, self.left_out[-1]))
         if not any(mesh.times and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
             raise error
+
+    def _apply(self, part: LeftOutMesh) -> None:
+        """Removes a mesh from an interval on."""
+        self._parts.append(part)
+        since = part.since
+        mesh = next(mesh for mesh in self._usd_meshes if mesh.name == part.name)
+        mesh.leave_out(self.times[since] if since else -math.inf)
         first, last = next(span for span in self._spans if span[0] <= since < span[1])
+        self._welds.pop((first, last), None)
         if first < since:
             place = self._spans.index((first, last))
             self._spans[place : place + 1] = [(first, since), (since, last)]
@@ -372,24 +474,43 @@ class Scene:
                     what = "appears" if old is None else "vanishes" if new is None else "changes its topology"
                     times_of.setdefault(what, []).append(time)
             for what, times in times_of.items():
-                at = _times_in_words(times)
+                at = times_in_words(times)
                 self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
 
 
-def _left_out_warning(reason) -> str:
-    return f"left out: {reason}"
+@dataclass(frozen=True)
+class _Options:
+    """The options with which a scene is opened, see :class:`Scene`."""
+
+    selection: Selection | None
+    frames: FrameRange | None
+    subdivide: int
+    sample_turns: bool
+    strict: bool
 
 
-def _message_warning(message) -> str:
-    return f"OpenUSD says: {message}"
+@dataclass(frozen=True)
+class _Revealed:
+    """What reading a scene has revealed: the meshes left out, and the welds of segments, by the span of intervals."""
+
+    left_out: tuple[LeftOutMesh, ...] = ()
+    welds: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
-def _jump_warning(name, times) -> str:
-    return f"{name} jumps {_times_in_words(times)}: what it jumps through is not checked"
+def _open_again(path, options, revealed, versions, contents) -> Scene:
+    """Opens a scene that another process has opened.
 
-
-def _times_in_words(times) -> str:
-    return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"
+    Raises:
+        OSError: If there is no such file here.
+        ValueError: If it is not the same scene here.
+    """
+    scene = Scene.__new__(Scene)
+    scene._open(path, options, revealed)
+    if changed := scene.files.differing(versions):
+        raise ValueError(f"{changed}: not the version of the file that the replay was started with")
+    if scene._contents() != contents:
+        raise ValueError(f"{path}: this process does not read the same meshes as the one that started the replay")
+    return scene
 
 
 def _merge(times) -> dict[float, float]:

@@ -64,6 +64,7 @@ class Segment:
         times: list[float],
         dtype: np.dtype,
         progress: Callable[[int, int], None] | None = None,
+        welds: tuple[np.ndarray, np.ndarray] | None = None,
     ):
         """Reads the topology and welds vertices.
 
@@ -72,6 +73,7 @@ class Segment:
             times: The segment's times, its first and its last included.
             dtype: Type of the positions.
             progress: Called with the number of times at which vertices have been compared, and of all.
+            welds: :attr:`welds` of the same meshes and times, if they are known, which saves reading all times.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -115,7 +117,11 @@ class Segment:
         self._start = np.zeros((vertex_count, 3), dtype)
         everything = np.arange(vertex_count)
         self._reader(everything, range(len(self.meshes))).read(self._start, times[0], False)
-        self._welded_to = self._find_welds(times, progress)
+        if welds is None:
+            self._welded_to = self._find_welds(times, progress)
+        else:
+            self._welded_to = everything
+            self._welded_to[welds[0]] = welds[1]
         self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
         self.faces = corners.reshape(-1, 3).astype(np.int32)
         self.vertex_count = len(self._kept)
@@ -150,6 +156,17 @@ class Segment:
         return positions
 
     @property
+    def may_jump(self) -> bool:
+        """Whether a mesh may have other positions just before a time than at that time."""
+        return self._jumping is not None
+
+    @property
+    def welds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The vertices that are welded to others, before they were welded, and those that they are welded to."""
+        (welded,) = np.nonzero(self._welded_to != np.arange(len(self._welded_to)))
+        return welded, self._welded_to[welded]
+
+    @property
     def vertex_meshes(self) -> np.ndarray:
         """Mesh of each vertex, the first of those welded there, shape [vertex_count]."""
         return np.searchsorted(self._vertex_ends, self._kept, side="right")
@@ -180,6 +197,32 @@ class Segment:
             members = meshes == number
             polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
         return meshes, polygons
+
+    def places_in_polygons(self, faces: np.ndarray) -> np.ndarray:
+        """Returns which of the triangles of its polygon each face is, from 0, shape [n]."""
+        places = np.zeros(len(faces), dtype=np.int64)
+        meshes = np.searchsorted(self._face_ends, faces, side="right")
+        for number in np.unique(meshes):
+            mesh, members = self.meshes[number], meshes == number
+            own = faces[members] - mesh.faces.start
+            places[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
+        return places
+
+    def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Returns faces, given what :meth:`locate_faces` and :meth:`places_in_polygons` return for them, shape [n]."""
+        faces = np.zeros(len(meshes), dtype=np.int64)
+        for number in np.unique(meshes):
+            mesh, members = self.meshes[number], meshes == number
+            faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + places[members]
+        return faces
+
+    def find_vertices(self, meshes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Returns vertices, given meshes and the indices of points of their prims, shape [n]."""
+        vertices = np.zeros(len(meshes), dtype=np.int64)
+        for number in np.unique(meshes):
+            mesh, members = self.meshes[number], meshes == number
+            vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
+        return np.searchsorted(self._kept, self._welded_to[vertices])
 
     def locate_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mesh of each edge, the indices of its ends among the prim's points, and which are diagonals.

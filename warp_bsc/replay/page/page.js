@@ -300,18 +300,6 @@ function fillImpacts() {
   addBars(byId("impacts"), bars, ["bar"], 520, "share of the interval");
 }
 
-function fillStages() {
-  const total = data.stages.reduce((sum, [, milliseconds]) => sum + milliseconds, 0) || 1;
-  const digits = (milliseconds) => (milliseconds < 100 ? milliseconds.toFixed(1) : count(Math.round(milliseconds)));
-  const rows = data.stages.map(([name, milliseconds]) => [name, "", `${digits(milliseconds)} ms`]);
-  const table = addTable(byId("stages"), [["Stage"], [""], ["All intervals", true]], rows, "Nothing was measured.");
-  table.querySelectorAll("tbody tr").forEach((line, index) => {
-    const share = Math.max(0.5, (100 * data.stages[index][1]) / total);
-    const svg = add(line.children[1], "svg", { viewBox: "0 0 100 10", width: "100%", height: 12, preserveAspectRatio: "none" });
-    add(svg, "rect", { class: "bar", width: share, height: 10, rx: 1 });
-  });
-}
-
 function fillText() {
   byId("title").textContent = data.title;
   byId("subtitle").textContent = data.subtitle;
@@ -370,7 +358,6 @@ async function start() {
   fillText();
   fillIntervals();
   fillImpacts();
-  fillStages();
   fillPairs();
   viewer = makeViewer();
   listen();

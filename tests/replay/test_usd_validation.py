@@ -1,0 +1,68 @@
+"""The rule of OpenUSD's validation framework, as other programs find and run it."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from pxr import Gf, Usd
+from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+
+UsdValidation = pytest.importorskip("pxr.UsdValidation")
+if not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"):
+    pytest.skip("this version of OpenUSD registers no rules from Python", allow_module_level=True)
+
+from warp_bsc.replay import usd_validation as rules  # noqa: E402
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """A triangle falls through a floor in the first second; another one crosses it all the time."""
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_falling(stage)
+    add_mesh(stage, "/World/Crossing", moved(FALLING, (0.5, 1.0, -0.25)))
+    return Usd.Stage.Open(save(stage))
+
+
+def found(stage, *time_range):
+    validator = UsdValidation.ValidationRegistry().GetOrLoadValidatorByName(rules.NAME)
+    return [
+        (error.GetName(), error.GetMessage(), [str(site.GetPrim().GetPath()) for site in error.GetSites()])
+        for error in validator.Validate(stage, *time_range)
+    ]
+
+
+def test_errors(stage):
+    collision, *intersections = found(stage)
+    assert collision[0] == "Collision" and sorted(collision[2]) == ["/World/Falling", "/World/Floor"]
+    assert "/World/Falling" in collision[1] and "collide from time 0 to 1: " in collision[1]
+    assert [(name, sorted(prims)) for name, _, prims in intersections] == [
+        ("Intersection", ["/World/Crossing", "/World/Floor"]),
+        ("Intersection", ["/World/Falling", "/World/Floor"]),
+    ]
+    assert "cross from time 0 to 1: at most " in intersections[0][1]
+    assert "cross from time 1 to 1: at most " in intersections[1][1]
+
+
+def test_times(stage):
+    until = UsdValidation.ValidationTimeRange(Gf.Interval(0.0, 0.25))
+    assert [name for name, _, _ in found(stage, until)] == ["Intersection"]
+    default = UsdValidation.ValidationTimeRange(Usd.TimeCode.Default())
+    assert found(stage, default) == []
+
+
+def test_a_stage_that_is_not_checked():
+    (error,) = found(Usd.Stage.CreateInMemory())
+    assert error[0] == "Unreadable" and "no such file" in error[1]
+
+
+def test_a_program_that_knows_only_the_plugin(stage):
+    program = f"""
+from pxr import Usd, UsdValidation
+validator = UsdValidation.ValidationRegistry().GetOrLoadValidatorByName({rules.NAME!r})
+print(*(error.GetName() for error in validator.Validate(Usd.Stage.Open({stage.GetRootLayer().realPath!r}))))
+"""
+    environment = os.environ | {"PXR_PLUGINPATH_NAME": rules.PLUGIN_FOLDER}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-3:] == ["Collision", "Intersection", "Intersection"]

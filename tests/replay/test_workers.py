@@ -1,0 +1,390 @@
+"""Replays by several processes, on this machine and in a cluster, and replays that go on: always the same files."""
+
+import importlib.util
+import json
+import os
+import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Ts, UsdGeom, Vt
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, moved, new_stage, save
+
+import warp_bsc as bsc
+from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli.main import main
+from warp_bsc.replay import workers
+
+FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
+FRAMES, SIDE = 24, 8
+
+
+def add_sheet(stage, name, lag, broken=None):
+    """A sheet of quadrilaterals that waves; at one time a point of it may be nowhere."""
+    x, y = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(-1, 1, SIDE), indexing="ij")
+    corner = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).reshape(-1, 1)
+    quads = corner + np.array([0, SIDE, SIDE + 1, 1])
+    mesh = UsdGeom.Mesh.Define(stage, name)
+    mesh.CreateFaceVertexCountsAttr([4] * len(quads))
+    mesh.CreateFaceVertexIndicesAttr(quads.reshape(-1).tolist())
+    for frame in range(FRAMES):
+        points = np.stack([x, y, 0.2 * np.sin(3 * x + 0.4 * frame + lag)], axis=2).reshape(-1, 3)
+        if frame == broken:
+            points[3] = np.nan
+        mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)), frame)
+    return mesh
+
+
+@pytest.fixture(scope="module")
+def waves(tmp_path_factory):
+    """Two sheets that wave through each other."""
+    stage = new_stage(tmp_path_factory.mktemp("waves") / "waves.usdc")
+    add_sheet(stage, "/World/A", 0.0)
+    add_sheet(stage, "/World/B", 2.0)
+    return save(stage)
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory):
+    """The same with all that makes an interval depend on those before it.
+
+    Two meshes break at different times, one jumps, one appears, two share a seam, and an instancer places some.
+    """
+    stage = new_stage(tmp_path_factory.mktemp("troubled") / "troubled.usda")
+    add_sheet(stage, "/World/A", 0.0)
+    add_sheet(stage, "/World/B", 2.0)
+    add_sheet(stage, "/World/Breaks", 1.0, broken=9)
+    add_sheet(stage, "/World/BreaksLater", 1.5, broken=17)
+    later = add_sheet(stage, "/World/Appears", 0.5)
+    UsdGeom.Imageable(later).CreateVisibilityAttr().Set("invisible", 0)
+    later.GetVisibilityAttr().Set("inherited", 13)
+    spline = Ts.Spline("float")
+    for frame, angle in ((0, 0), (5, 180), (12, 90), (FRAMES - 1, 90)):
+        knot = Ts.Knot("float")
+        knot.SetTime(frame)
+        knot.SetValue(angle)
+        knot.SetNextInterpolation(Ts.InterpHeld)
+        spline.SetKnot(knot)
+    turned = add_mesh(stage, "/World/Jumps", moved(FALLING, (-0.5, 0.5, -0.2)))
+    assert turned.AddRotateXOp().GetAttr().SetSpline(spline)
+    for name, shift in (("SeamA", 0), ("SeamB", 4)):
+        floor = moved(FLOOR, (shift - 2, 0, 0))
+        add_mesh(stage, f"/World/{name}", {0: floor, FRAMES - 1: moved(floor, (0, 0, 0.3))})
+    add_mesh(stage, "/World/Instances/Prototype", FALLING)
+    positions = {0: [(0, 0, 0.5), (0.2, 0.2, 0.3)], FRAMES - 1: [(0, 0, -0.5), (0.2, 0.2, -0.6)]}
+    add_instancer(stage, "/World/Instances", positions, ["/World/Instances/Prototype"])
+    return save(stage)
+
+
+def run(scene, folder, *options, status=0):
+    """Replays a scene with all files, and returns their content."""
+    folder.mkdir(exist_ok=True)
+    words = [word for option, name in FILES.items() for word in (option, str(folder / name))]
+    assert main(["replay", scene, "--device", "cpu", *words, *options]) == status
+    return contents(folder)
+
+
+def contents(folder):
+    return {name: (folder / name).read_bytes() for name in FILES.values()}
+
+
+def say_where(found, wanted):
+    """Which files differ, as a page of bytes would not help."""
+    return [name for name in wanted if found[name] != wanted[name]]
+
+
+OPTIONS = {
+    "plain": (),
+    "all": ("--ignore-initial", "--min-distance", "0.02", "--validate", "2"),
+}
+"""``--ignore-initial`` needs the first time in every worker, ``--min-distance`` the end of a chunk."""
+
+CASES = [("waves", "plain"), ("troubled", "all")]
+"""What one worker finds is not the same as what another does only where a scene is troubled."""
+
+
+@pytest.mark.parametrize(("scene", "options"), CASES)
+def test_two_workers_write_the_same_files(request, tmp_path, capsys, scene, options):
+    path, status = request.getfixturevalue(scene), 4 if scene == "troubled" else 0
+    alone = run(path, tmp_path / "1", *OPTIONS[options], status=status)
+    found = json.loads(alone["hits.json"])
+    assert found["complete"] and found["hits"] + len(found["ignored"]) > 0
+    if scene == "troubled":
+        assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
+            "from time 8 on: /World/Breaks: vertex 3",
+            "from time 16 on: /World/BreaksLater: vertex 3",
+        ]
+        assert any("/World/Jumps jumps 2 times" in warning for warning in found["warnings"])
+    capsys.readouterr()
+    together = run(path, tmp_path / "2", "--workers", "2", *OPTIONS[options], status=status)
+    assert not say_where(together, alone)
+    printed = capsys.readouterr().out
+    assert len(re.findall(r"^  \S+:\d+: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
+
+
+def test_workers_compare_with_a_baseline(tmp_path, waves):
+    run(waves, tmp_path / "1", "--frames", "0:12")
+    baseline = str(tmp_path / "1" / "hits.json")
+    options = ("--baseline", baseline, "--fail-on", "new", "--workers", "2")
+    run(waves, tmp_path / "2", "--frames", "0:12", *options)
+    run(waves, tmp_path / "2", "--fail-on", "collisions", status=1)
+    run(waves, tmp_path / "3", *options, status=1)
+
+
+def test_results_of_workers_in_python(waves):
+    scene = bsc.Scene(waves)
+    alone = list(bsc.replay(bsc.Scene(waves), device="cpu"))
+    together = list(bsc.replay(scene, device="cpu", workers=2, earlier=alone[:3]))[3:]
+    assert [result.summary.index for result in together] == list(range(3, FRAMES - 1))
+    for one, other in zip(alone[3:], together, strict=True):
+        np.testing.assert_array_equal(one.contacts.position, other.contacts.position)
+        np.testing.assert_array_equal(one.contacts.interval.x1, other.contacts.interval.x1)
+        assert one.summary.mesh_pairs == other.summary.mesh_pairs
+        assert one.contacts.element_names(slice(None)) == other.contacts.element_names(slice(None))
+        assert other.contacts.segment is scene.segment(other.summary.index)
+        assert one.work.worker == "" and re.fullmatch(r".+:\d+", other.work.worker)
+
+
+def test_a_worker_that_is_killed(waves):
+    """What it was checking is checked by another one: nothing is lost, nothing comes twice."""
+    alone = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
+    found, killed = [], set()
+    for result in bsc.replay(bsc.Scene(waves), device="cpu", workers=2):
+        found.append((result.summary.index, result.summary.mesh_pairs))
+        pid = int(result.work.worker.rpartition(":")[2])
+        if len(killed) < 2 and pid not in killed:
+            killed.add(pid)
+            os.kill(pid, signal.SIGKILL)
+    assert len(killed) == 2
+    assert found == list(enumerate(alone))
+
+
+def test_a_call_that_kills_every_worker(tmp_path):
+    """The error names it, and the calls before it are answered."""
+    calls = deque(
+        workers._Call(f"checked interval {number}", function, arguments)
+        for number, (function, arguments) in enumerate([(abs, (-1,)), (abs, (-2,)), (os._exit, (1,)), (abs, (-3,))])
+    )
+    with closing(workers.LocalWorkers(2)) as processes:
+        answers = workers._in_order(processes, calls)
+        assert [next(answers), next(answers)] == [1, 2]
+        with pytest.raises(ChildProcessError, match=r"^worker after worker died while it checked interval 2"):
+            next(answers)
+
+
+def children_of(pid):
+    """Processes that check intervals for a process."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            stat, command = (folder / "stat").read_text(), (folder / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if int(stat.rpartition(")")[2].split()[1]) == pid and b"spawn_main" in command:
+            found.append(int(folder.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_process_that_started_them(tmp_path, waves, number):
+    """They say nothing, even if a Ctrl-C, which the terminal sends to all of them, comes while they start."""
+    words = [word for option, name in FILES.items() for word in (option, str(tmp_path / name))]
+    command = [sys.executable, "-m", "warp_bsc", "replay", waves, "--device", "cpu", "--workers", "2", *words]
+    command += ["--subdivide", "100"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        deadline = time.monotonic() + 60
+        while len(started := children_of(process.pid)) < 2 and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert len(started) == 2
+        os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+    while any(Path(f"/proc/{pid}").exists() for pid in started) and time.monotonic() < deadline + 10:
+        time.sleep(0.05)
+    assert not [pid for pid in started if Path(f"/proc/{pid}").exists()]
+    assert not list(tmp_path.iterdir())
+    interrupted = number == signal.SIGINT
+    assert process.returncode == (130 if interrupted else -number)
+    assert said == "warp-bsc: interrupted\n" * interrupted
+
+
+def test_an_error_in_a_worker(tmp_path, capsys):
+    """The intervals before it are there, and the error reads as without workers."""
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_sheet(stage, "/World/A", 0.0, broken=11)
+    path, said, found = save(stage), [], []
+    for count in ("1", "2"):
+        found.append(run(path, tmp_path / count, "--workers", count, status=2))
+        said.append(capsys.readouterr().err.splitlines()[-1])
+    assert said[0] == said[1] and "/World/A: vertex 3 is not finite at time 11" in said[0]
+    assert not say_where(found[1], found[0])
+    assert len(json.loads(found[0]["hits.json"])["intervals"]) == 10
+
+
+def stop(monkeypatch, scene, folder, at, *options):
+    """Replays a scene until an interval is found, then sends this process SIGINT."""
+    whole = replay_command.replay
+
+    def interrupted(*arguments, **named):
+        for result in whole(*arguments, **named):
+            if result.summary.index == at:
+                os.kill(os.getpid(), signal.SIGINT)
+            yield result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(replay_command, "replay", interrupted)
+        run(scene, folder, *options, status=130)
+    assert len(json.loads((folder / "hits.json").read_bytes())["intervals"]) == at
+
+
+@pytest.mark.parametrize(("scene", "options"), CASES)
+def test_resumed(request, tmp_path, monkeypatch, capsys, scene, options):
+    path, status = request.getfixturevalue(scene), 4 if scene == "troubled" else 0
+    whole = run(path, tmp_path / "whole", *OPTIONS[options], status=status)
+    in_workers = ("--workers", "2") if scene == "troubled" else ()
+    for at, more in ((10, ()), (18, in_workers)):
+        folder = tmp_path / str(at)
+        stop(monkeypatch, path, folder, at, *more, *OPTIONS[options])
+        assert say_where(contents(folder), whole) == list(FILES.values())
+        capsys.readouterr()
+        resumed = run(path, folder, "--resume", *more, *OPTIONS[options], status=status)
+        assert not say_where(resumed, whole)
+        taken = re.search(r"Taken from an earlier run: (\d+) intervals?\.", capsys.readouterr().out)
+        assert (int(taken.group(1)) if taken else 0) >= at - 1
+    resumed = run(path, folder, "--resume", *OPTIONS[options], status=status)  # nothing is left to do
+    assert not say_where(resumed, whole)
+
+
+def test_resumed_twice_without_a_file_at_first(tmp_path, monkeypatch, waves):
+    whole = run(waves, tmp_path / "whole")
+    folder = tmp_path / "stopped"
+    for at in (1, 9):
+        stop(monkeypatch, waves, folder, at, "--resume")
+    assert not say_where(run(waves, folder, "--resume"), whole)
+
+
+def test_what_cannot_be_resumed(tmp_path, monkeypatch, capsys, waves):
+    folder = tmp_path / "stopped"
+    scene = str(tmp_path / "scene.usdc")
+    shutil.copy(waves, scene)
+    stop(monkeypatch, scene, folder, 5, "--min-distance", "0.1")
+
+    def refused(*options):
+        before = contents(folder)
+        run(scene, folder, "--resume", *options, status=2)
+        assert contents(folder) == before
+        return capsys.readouterr().err.splitlines()[-1]
+
+    place = f"warp-bsc: error: {folder / 'hits.json'}: its replay was another one, and cannot go on: "
+    assert refused() == place + "min_distance was 0.1, and is None"
+    same = ("--min-distance", "0.1")
+    assert refused(*same, "--method", "float") == place + "method was exact, and is float"
+    assert refused(*same, "--no-self") == place + "self_collisions was True, and is False"
+    assert refused(*same, "--frames", "0:9").startswith(place + "frames was None, and is {'start': 0.0")
+    os.utime(scene, ns=(1, 1))
+    assert refused(*same) == place + "the scene's files have changed"
+    (folder / "hits.json").write_text('{"intervals": []}')
+    assert "not a JSON file of this version's replay" in refused()
+    assert main(["replay", scene, "--resume"]) == 2
+    assert "--resume needs --json FILE" in capsys.readouterr().err
+
+
+def test_a_pickled_scene_is_the_same_file(tmp_path, waves):
+    path = tmp_path / "scene.usdc"
+    shutil.copy(waves, path)
+    pickled = pickle.dumps(bsc.Scene(path))
+    assert pickle.loads(pickled).times == bsc.Scene(waves).times
+    os.utime(path, ns=(1, 1))
+    with pytest.raises(ValueError, match=r"scene\.usdc: not the version of the file that the replay was started with"):
+        pickle.loads(pickled)
+
+
+def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
+    """A worker does not read the whole shot again to find vertices that always coincide."""
+    scene = bsc.Scene(troubled)
+    other = pickle.dumps(scene)
+    monkeypatch.setattr("warp_bsc.usd.segment.Segment._find_welds", None)
+    other = pickle.loads(other)
+    assert scene.segment(0).welded > 0
+    np.testing.assert_array_equal(other.segment(0).faces, scene.segment(0).faces)
+    np.testing.assert_array_equal(other.interval(5).x1, scene.interval(5).x1)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "gpus", "device"),
+    [
+        (None, 3, 2, "cuda:1"),
+        ("cuda", 4, 4, "cuda:0"),
+        ("cuda:1", 0, 4, "cuda:1"),
+        ("cpu", 1, 4, "cpu"),
+        (None, 1, 0, None),
+    ],
+)
+def test_each_local_worker_has_a_gpu(name, number, gpus, device):
+    assert workers.device_of_worker(name, number, gpus) == device
+
+
+def test_no_cluster(capsys, monkeypatch, waves):
+    assert main(["replay", waves, "--scheduler", "tcp://127.0.0.1:1", "--workers", "2"]) == 2
+    assert "either processes on this machine, or those of a cluster" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["replay", waves, "--scheduler", "tcp://127.0.0.1:1"]) == 2
+    said = "warp-bsc: error: --scheduler: a cluster needs Dask: pip install 'warp-bsc[cluster]'\n"
+    assert capsys.readouterr().err == said
+
+
+needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs Dask")
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """The address of a cluster of two workers, each a process, and these processes."""
+    folder = tmp_path / "dask"
+    folder.mkdir()
+    place = folder / "scheduler.json"
+    start = [sys.executable, "-m", "dask"]
+    options = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    commands = [["scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)]]
+    worker = ["worker", "--scheduler-file", str(place), "--nthreads", "2", "--no-nanny", "--no-dashboard"]
+    processes = [subprocess.Popen([*start, *words], **options) for words in [*commands, worker, worker]]
+    try:
+        deadline = time.monotonic() + 60
+        while not place.exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        yield json.loads(place.read_text())["address"], processes
+    finally:
+        for process in reversed(processes):
+            process.kill()
+            process.wait()
+
+
+@needs_dask
+@pytest.mark.slow
+def test_a_cluster_writes_the_same_files(tmp_path, cluster, troubled, waves, capsys):
+    address, processes = cluster
+    options = OPTIONS["all"]
+    alone = run(troubled, tmp_path / "1", *options, status=4)
+    assert not say_where(run(troubled, tmp_path / "2", "--scheduler", address, *options, status=4), alone)
+
+    alone = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
+    found = []
+    for result in bsc.replay(bsc.Scene(waves), device="cpu", scheduler=address):
+        found.append((result.summary.index, result.summary.mesh_pairs))
+        if len(found) == 4:
+            processes[1].kill()
+    assert found == list(enumerate(alone))
+
+    capsys.readouterr()
+    os.kill(processes[0].pid, signal.SIGKILL)
+    assert main(["replay", waves, "--scheduler", address]) == 2
+    assert f"{address}: no scheduler of a Dask cluster answers" in capsys.readouterr().err

@@ -1,0 +1,274 @@
+"""The narrow phase of pairs with a minimum distance: culls -> certified search -> order; the host decides the rest.
+
+The stages write to the buffers of a :class:`.narrow_phase.NarrowPhase`, which sorts the contacts. The minimum distance
+of a pair is the sum of two radii, rounded to double precision: the radius of a vertex is its own, that of an edge or a
+face the largest one of its vertices.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from .. import checker
+from ..kernels.ccd import impact_at_distance
+from ..kernels.min_distance import clears_at_once, closest_at
+from ..kernels.motion import motion_and_distance, relative_motion
+from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
+from .contact_buffer import HostContacts
+from .kernels import PairStages
+from .launch import launch_over_queue
+from .narrow_phase import NarrowPhase
+from .rings import Rings, are_within_rings
+from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
+from .stage_timer import StageTimer
+
+__all__ = ["checked_distance", "decide_distances_on_host", "pair_distances", "run_distance_phases"]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+_UNSURE = wp.constant(int(Count.UNSURE))
+_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
+_TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
+
+
+def checked_distance(min_distance: float | np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
+    """Returns a minimum distance, or one each, in double precision.
+
+    Raises:
+        ValueError: If the distances are neither one number nor of the shape, or not finite and at least 0.
+    """
+    distance = np.asarray(min_distance, dtype=np.float64)
+    if distance.shape not in ((), shape):
+        shapes = "must be one number" + (f" or have shape {shape}" if shape else "")
+        raise ValueError(f"min_distance {shapes}, not {distance.shape}")
+    if not (np.isfinite(distance) & (distance >= 0.0)).all():
+        raise ValueError("min_distance must be finite and at least 0")
+    return distance
+
+
+@wp.func
+def _firsts(kind: int) -> int:
+    """Returns how many of the four places of a pair the first element has."""
+    return wp.where(kind == EDGE_EDGE, 2, 1)
+
+
+@wp.func
+def _distance(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) -> wp.float64:
+    """Returns the minimum distance of a pair."""
+    a = radius[v[0]]
+    b = radius[v[1]]
+    other = wp.max(radius[v[2]], radius[v[3]])
+    if kind == EDGE_EDGE:
+        return wp.max(a, b) + other
+    return a + wp.max(b, other)
+
+
+@functools.cache
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
+    """Returns the kernels that cull, decide and find closest points, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def cull_distances(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        radius: wp.array[wp.float64],
+        rings: Rings,
+        kind: int,
+        roundoff: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = first + wp.tid()
+        if not is_filled(i, stages.queue, stages.counts, _QUEUED):
+            return
+        pair = stages.queue[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = _distance(kind, v, radius)
+        motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
+        if clears_at_once(motion, scaled) or are_within_rings(v, _firsts(kind), rings):
+            return
+        append(pair, stages.survivors, stages.counts, _SURVIVORS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_distances(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        radius: wp.array[wp.float64],
+        kind: int,
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = first + wp.tid()
+        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
+            return
+        pair = stages.survivors[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        distance = _distance(kind, v, radius)
+        result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff, timed, tolerance)
+        if result.status == FREE:
+            return
+        slot = take_slot(stages.counts, _CONTACTS)
+        take_slot(stages.counts, _FOUND)
+        if result.status == UNSURE:
+            take_slot(stages.counts, _UNSURE)
+        if result.status == UNSURE or (timed and result.within_tolerance == 0):
+            take_slot(stages.counts, _FOR_EXACT)
+            take_slot(stages.counts, _TOO_WIDE)
+        contacts = stages.contacts
+        if slot < wp.int64(contacts.pairs.shape[0]):
+            k = wp.int32(slot)
+            contacts.pairs[k] = pair
+            contacts.status[k] = wp.int8(result.status)
+            contacts.decided[k] = wp.int8(result.status)
+            contacts.within_tolerance[k] = result.within_tolerance == 1
+            contacts.toi[k] = result.toi
+            contacts.coordinates[k] = result.coordinates
+            contacts.normal[k] = result.normal
+            stages.order[k] = k
+            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_closest(
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        kind: int,
+        # in
+        pairs: wp.array[wp.vec2i],
+        time: wp.array[wp.float64],
+        # out
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+    ):
+        i = wp.tid()
+        v = points_of_pair(kind, elements, pairs[i])
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        motion = relative_motion(points, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+        at, direction = closest_at(kind, motion, time[i])
+        coordinates[i] = at
+        normal[i] = direction
+
+    return cull_distances, decide_distances, find_closest
+
+
+def run_distance_phases(
+    phases: Sequence[tuple[NarrowPhase, wp.array]],
+    x0: wp.array,
+    x1: wp.array,
+    radius: wp.array,
+    rings: Rings,
+    *,
+    method: str,
+    timed: bool = True,
+    tolerance: float = TOLERANCE,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages but the sorting over the queued pairs, without synchronizing with a GPU.
+
+    Args:
+        phases: The buffers of each kind, a :class:`DistanceKind`, with the vertex indices of its second elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        radius: Radius of each vertex, array of float64.
+        rings: Vertices whose elements are excluded.
+        method: One of :data:`METHODS`; with "exact" what is left goes to :func:`decide_distances_on_host`.
+        timed: Whether to find times of impact within the tolerance.
+        tolerance: Of the times of impact, as a share of the step.
+        timer: Measures the stages.
+    """
+    cull, decide, _ = _kernels(x0.dtype)
+    roundoff = 0.0 if method == "float" else ROUNDOFF
+    with timer.stage("cull"):
+        for phase, elements in phases:
+            inputs = [x0, x1, radius, rings, int(phase.kind), roundoff]
+            stages = phase.stages(elements)
+            launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+    with timer.stage("classify"):
+        for phase, elements in phases:
+            inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance]
+            stages = phase.stages(elements)
+            queue, places = stages.survivors, Count.SURVIVORS
+            launch_over_queue(decide, queue, phase.counts, places, inputs=inputs, outputs=[stages], block_dim=64)
+
+
+def pair_distances(
+    kind: DistanceKind, elements: np.ndarray, pairs: np.ndarray, radius: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the vertices of pairs of a kind, int, shape [n, kind.points], and their minimum distances, shape [n].
+
+    Args:
+        kind: The kind of pair.
+        elements: Vertex indices of faces or edges; not used for (vertex, vertex).
+        pairs: (vertex, face) and so on, shape [n, 2].
+        radius: Radius of each vertex, float64.
+    """
+    first = elements[pairs[:, 0]] if kind == DistanceKind.EDGE_EDGE else pairs[:, :1]
+    second = pairs[:, 1:] if kind == DistanceKind.VERTEX_VERTEX else elements[pairs[:, 1]]
+    distance = radius[first].max(axis=1, initial=0.0) + radius[second].max(axis=1, initial=0.0)
+    return np.concatenate([first, second], axis=1), distance
+
+
+def decide_distances_on_host(
+    kind: DistanceKind,
+    x0: wp.array,
+    x1: wp.array,
+    elements: wp.array,
+    radius: np.ndarray,
+    contacts: HostContacts,
+    which: np.ndarray,
+    *,
+    timed: bool = True,
+) -> None:
+    """Decides some contacts with the exact checker, on the host, and changes their rows.
+
+    Args:
+        kind: The kind of pair.
+        x0: Positions at the start of the step, Warp array.
+        x1: Positions at its end.
+        elements: Vertex indices of faces or edges, Warp array.
+        radius: Radius of each vertex, float64.
+        contacts: The contacts.
+        which: Which of them to decide, bool, shape [n].
+        timed: Whether to find times of impact, coordinates and normals.
+    """
+    if not which.any():
+        return
+    corners, distance = pair_distances(kind, elements.numpy(), contacts.pairs[which], radius)
+    points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
+    if not timed:
+        contacts.decided[which] = np.where(getattr(checker, kind.label)(points, distance), HIT, FREE)
+        return
+    toi = contacts.toi
+    toi[which] = getattr(checker, f"{kind.label}_toi")(points, distance)[:, 0]
+    contacts.decided[which] = np.where(np.isnan(toi[which]), FREE, HIT)
+    toi[~contacts.hit] = 2.0
+    contacts.within_tolerance[which] = contacts.hit[which]
+    again = np.flatnonzero(which & contacts.hit)
+    outputs = [wp.empty(len(again), dtype=wp.vec3d, device=x0.device) for _ in range(2)]
+    timed_pairs = wp.array(contacts.pairs[again], dtype=wp.vec2i, device=x0.device)
+    inputs = [x0, x1, elements, int(kind), timed_pairs, wp.array(toi[again], dtype=wp.float64, device=x0.device)]
+    kernel = _kernels(x0.dtype)[2]
+    wp.launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
+    contacts.coordinates[again], contacts.normal[again] = (output.numpy() for output in outputs)

@@ -1,0 +1,174 @@
+"""Checks the intervals of a scene one after another, in one process, holding one at a time."""
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..detection.collisions import Collisions
+from ..detection.detector import CollisionDetector
+from ..detection.mesh import CollisionMesh
+from ..detection.proximities import ProximityFinder
+from ..usd.interval import Interval
+from ..usd.scene import Scene
+from ..usd.segment import Segment
+from ..usd.selection import Selection
+from .results import IntervalResult, Work, summarize, summarize_intersections
+from .scene_contacts import find_contacts
+from .scene_intersections import SceneIntersections, name_intersections
+from .scene_proximities import SceneProximities, name_proximities
+from .threads import read_ahead
+from .validation import validate
+
+__all__ = ["Checks", "IntervalChecker"]
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What is looked for in every interval, and how.
+
+    Attributes:
+        selection: Which pairs of meshes count.
+        method: Method of detection.
+        device: Name of the Warp device; None for Warp's default.
+        intersections: Whether to find the intersections at each time.
+        min_distance: Distance up to which elements are near each other, None to look for none.
+        validate_most: Number of hits, and of other pairs, that the exact checker decides again; None for all.
+    """
+
+    selection: Selection
+    method: str
+    device: str | None
+    intersections: bool
+    min_distance: float | None
+    validate_most: int | None
+
+
+class IntervalChecker:
+    """Checks intervals of a scene. Buffers and trees stay from one to the next."""
+
+    def __init__(self, scene: Scene, checks: Checks, worker: str = ""):
+        """Takes the scene, what to look for, and the name of this process for :class:`Work`."""
+        self.scene = scene
+        self._checks = checks
+        self._worker = worker
+        self._of_segment: _SegmentChecker | None = None
+
+    def check(self, first: int, stop: int) -> Iterator[IntervalResult]:
+        """Finds the collisions in some intervals, in order. A thread reads the next one meanwhile.
+
+        Args:
+            first: Number of the first interval.
+            stop: Number of the interval after the last one.
+
+        Raises:
+            ValueError: If the positions at some time are broken, or there is no such method.
+        """
+        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
+            started = time.perf_counter()
+            result = self._at(interval).check(interval)
+            yield replace(result, work=Work(self._worker, reading, time.perf_counter() - started))
+
+    def initial_crossings(self) -> frozenset[tuple[str, str]]:
+        """Returns the names of the meshes that cross at the first time, each pair sorted."""
+        interval = self.scene.interval(0)
+        found = summarize_intersections(self._at(interval).find(interval.x0, interval.start))
+        return frozenset((min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings)
+
+    def _at(self, interval: Interval) -> "_SegmentChecker":
+        if self._of_segment is None or interval.segment is not self._of_segment.segment:
+            self._of_segment = None  # before the next is made, to free its memory
+            self._of_segment = _SegmentChecker(interval.segment, self.scene.is_still, self._checks)
+        return self._of_segment
+
+
+class _SegmentChecker:
+    """Checks the intervals of one segment."""
+
+    def __init__(self, segment: Segment, is_still: bool, checks: Checks):
+        self.segment = segment
+        self._is_still = is_still
+        self._checks = checks
+        self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
+        self._detector = CollisionDetector(self._mesh, method=checks.method)
+        self._finder = self._detector.intersection_finder() if checks.intersections else None
+        self._last: SceneIntersections | None = None  # those found last
+        distance = checks.min_distance
+        self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
+        self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
+
+    def check(self, interval: Interval) -> IntervalResult:
+        """Returns the collisions of an interval."""
+        detector, most = self._detector, self._checks.validate_most
+        start = self.find(interval.x0, interval.start) if self._finder else None
+        if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
+            nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self._mesh.device)
+            detector = CollisionDetector(nothing, method=detector.method)
+            collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
+        else:
+            collisions = detector.detect(interval.x0, interval.x1)
+        assert isinstance(collisions, Collisions)  # nothing is captured here
+        intersections = None
+        if start is not None:
+            intersections = start, self.find(interval.x1, interval.end, is_end=not self._is_still)
+        proximities = None
+        if self._proximity_finder:
+            near = self._find_near(interval.x0, interval.start)
+            proximities = near, self._find_near(interval.x1, interval.end)
+        contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection, intersections)
+        validation = None
+        if most != 0:
+            validation = validate(
+                detector,
+                collisions,
+                interval.x0,
+                interval.x1,
+                most=most,
+                seed=interval.index,
+                counted=contacts.counted,
+            )
+        summary = summarize(
+            contacts,
+            intersections,
+            proximities,
+            certified=collisions.certified,
+            stats=collisions.stats,
+            validation=validation,
+        )
+        return IntervalResult(summary, contacts, intersections, proximities, None)
+
+    def find(self, x: np.ndarray, time: float, *, is_end: bool = False) -> SceneIntersections:
+        """Returns the intersections at a time, those found last if these are the ones.
+
+        Args:
+            x: Positions at that time, shape [vertex_count, 3].
+            time: Time code.
+            is_end: Whether a motion that ends there has just been detected.
+        """
+        last = self._last
+        if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
+            assert self._finder
+            found = self._finder.find(x, is_end=is_end)
+            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, self._checks.selection)
+        return last
+
+    def _find_near(self, x: np.ndarray, time: float) -> SceneProximities:
+        """Returns the proximities at a time, those found last if these are the ones."""
+        if self._last_near:
+            last_x, last = self._last_near
+            if last.time == time and (last_x is x or np.array_equal(last_x, x)):
+                return last
+        assert self._proximity_finder
+        found = self._proximity_finder.find(x)
+        found = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
+        self._last_near = x, found
+        return found
+
+
+def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:
+    """Yields intervals with the time to read each [s]."""
+    started = time.perf_counter()
+    for interval in intervals:
+        yield time.perf_counter() - started, interval
+        started = time.perf_counter()

@@ -1,0 +1,273 @@
+"""What a replay finds in one interval, and the numbers of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..detection.collisions import DetectionStats
+from .scene_contacts import PHASES, SceneContacts
+from .scene_intersections import SceneIntersections
+from .scene_pairs import count_by_meshes
+from .scene_proximities import SceneProximities
+from .validation import Validation
+
+__all__ = [
+    "TOI_BINS",
+    "Contact",
+    "IntersectionSummary",
+    "IntervalResult",
+    "IntervalSummary",
+    "Nearest",
+    "ProximitySummary",
+    "Work",
+    "summarize",
+    "summarize_intersections",
+]
+
+TOI_BINS = 20
+"""Number of equal parts of an interval in which times of impact are counted."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A collision of two meshes, or of a mesh with itself, in words.
+
+    Attributes:
+        meshes: Names of the two.
+        elements: The two elements, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
+        toi: Time of impact, 0 at the start of the interval and 1 at its end.
+        time: The same as a time code.
+    """
+
+    meshes: tuple[str, str]
+    elements: tuple[str, str]
+    toi: float
+    time: float
+
+
+@dataclass(frozen=True)
+class IntersectionSummary:
+    """The edges that meet faces at one time of a scene, in numbers.
+
+    Attributes:
+        time: Time code.
+        crossings: Number of edges that pass through faces: pairs of an edge and a face.
+        touches: Number of edges that only touch faces.
+        mesh_pairs: Both numbers for each two meshes that intersect, by their names, in order; a mesh that intersects
+            itself is there twice.
+    """
+
+    time: float
+    crossings: int
+    touches: int
+    mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """The nearest two elements of two meshes at one time, or of a mesh and itself, in words.
+
+    Attributes:
+        meshes: Names of the two meshes.
+        elements: The two elements, as of :class:`Contact`.
+        time: Time code.
+        distance: Distance of the elements, in the scene's unit of length.
+        position: Point halfway between their closest points, in world space.
+        pairs: Number of pairs of elements of the two meshes that are near at that time.
+    """
+
+    meshes: tuple[str, str]
+    elements: tuple[str, str]
+    time: float
+    distance: float
+    position: tuple[float, float, float]
+    pairs: int
+
+
+@dataclass(frozen=True)
+class ProximitySummary:
+    """The pairs of elements that are near each other at one time of a scene, in numbers.
+
+    Attributes:
+        time: Time code.
+        pairs: Number of pairs.
+        nearest: The nearest elements of each two meshes that are near each other, the nearest first.
+    """
+
+    time: float
+    pairs: int
+    nearest: tuple[Nearest, ...]
+
+
+@dataclass(frozen=True)
+class IntervalSummary:
+    """The collisions between two consecutive times of a scene, in numbers.
+
+    Attributes:
+        index: Number of the interval, from 0.
+        start: Time code at which it starts.
+        end: Time code at which it ends.
+        vertex_face_hits: Number of vertex-face pairs that collide.
+        edge_edge_hits: Number of edge-edge pairs that collide.
+        toi_counts: Number of pairs by their time of impact, in equal parts of the interval.
+        mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
+            with itself is there twice.
+        earliest: The earliest contact, None if there is none.
+        certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
+            move straight from the start to the end.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        validation: The comparison with the exact checker, None if none was asked for.
+        intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
+            moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
+        separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
+        ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
+        phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
+        proximities: The proximities at the start and at the end, as ``intersections``; None if they were not looked
+            for.
+    """
+
+    index: int
+    start: float
+    end: float
+    vertex_face_hits: int
+    edge_edge_hits: int
+    toi_counts: tuple[int, ...]
+    mesh_pairs: dict[tuple[str, str], int]
+    earliest: Contact | None
+    certified: bool
+    stats: DetectionStats
+    validation: Validation | None
+    intersections: tuple[IntersectionSummary, IntersectionSummary] | None
+    ignored: dict[tuple[str, str], int]
+    separate_hits: int | None
+    phases: tuple[int, ...] | None
+    proximities: tuple[ProximitySummary, ProximitySummary] | None
+
+    @property
+    def hits(self) -> int:
+        """Number of pairs that collide."""
+        return self.vertex_face_hits + self.edge_edge_hits
+
+    @property
+    def pairs_tested(self) -> int:
+        """Number of candidate pairs."""
+        return self.stats.vertex_face.candidates + self.stats.edge_edge.candidates
+
+    @property
+    def milliseconds(self) -> float:
+        """Time of the detector's stages together [ms]."""
+        return sum(self.stats.milliseconds.values())
+
+
+@dataclass(frozen=True)
+class Work:
+    """A measurement of the work for one interval.
+
+    Attributes:
+        worker: The process that did it; empty for the one that writes the results.
+        reading: Time to read the scene's samples [s]; another interval may be checked meanwhile.
+        checking: Time to find everything in them [s].
+    """
+
+    worker: str
+    reading: float
+    checking: float
+
+
+@dataclass(frozen=True)
+class IntervalResult:
+    """The collisions between two consecutive times of a scene.
+
+    Attributes:
+        summary: The numbers, which are small and can be kept for all intervals.
+        contacts: Every pair that collides, and the positions of all vertices.
+        intersections: Every edge that meets a face, at the start of the interval and at its end; None if they were not
+            looked for. Where nothing jumps, those at the end are the next interval's at its start, the same object.
+        proximities: The pairs of elements that are near each other, at both times, as ``intersections``.
+        work: Who has found this in which time; None if it was found earlier.
+    """
+
+    summary: IntervalSummary
+    contacts: SceneContacts
+    intersections: tuple[SceneIntersections, SceneIntersections] | None
+    proximities: tuple[SceneProximities, SceneProximities] | None
+    work: Work | None
+
+
+def summarize(
+    contacts: SceneContacts,
+    intersections: tuple[SceneIntersections, SceneIntersections] | None,
+    proximities: tuple[SceneProximities, SceneProximities] | None,
+    *,
+    certified: bool,
+    stats: DetectionStats,
+    validation: Validation | None,
+) -> IntervalSummary:
+    """Returns the numbers of an interval, given what was found in it; arguments are those of the results."""
+    interval, earliest = contacts.interval, None
+    if len(contacts):
+        first = int(np.argmin(contacts.toi))
+        row = slice(first, first + 1)
+        earliest = Contact(
+            contacts.mesh_names(row)[0],
+            contacts.element_names(row)[0],
+            float(contacts.toi[first]),
+            float(contacts.time[first]),
+        )
+    at_rest = None
+    if intersections:
+        start, end = map(summarize_intersections, intersections)
+        at_rest = start, end
+    near = None
+    if proximities:
+        start, end = map(_summarize_proximities, proximities)
+        near = start, end
+    hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
+    edge_edge = int(contacts.kind.sum())
+    return IntervalSummary(
+        index=interval.index,
+        start=interval.start,
+        end=interval.end,
+        vertex_face_hits=len(contacts) - edge_edge,
+        edge_edge_hits=edge_edge,
+        toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
+        mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
+        earliest=earliest,
+        certified=certified,
+        stats=stats,
+        validation=validation,
+        intersections=at_rest,
+        ignored=contacts.ignored,
+        separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
+        phases=None if contacts.phase is None else tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()),
+        proximities=near,
+    )
+
+
+def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
+    """Returns the numbers of the intersections at one time."""
+    by_meshes = count_by_meshes(found.segment, found.meshes, np.stack([found.crosses, ~found.crosses], axis=1))
+    return IntersectionSummary(
+        found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
+    )
+
+
+def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
+    order = np.argsort(found.distance, kind="stable")
+    _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
+    nearest = []
+    for place in np.argsort(firsts).tolist():
+        row = int(order[firsts[place]])
+        rows = slice(row, row + 1)
+        x, y, z = found.position[row].tolist()
+        nearest.append(
+            Nearest(
+                found.mesh_names(rows)[0],
+                found.element_names(rows)[0],
+                found.time,
+                float(found.distance[row]),
+                (x, y, z),
+                int(numbers[place]),
+            )
+        )
+    return ProximitySummary(found.time, len(found), tuple(nearest))

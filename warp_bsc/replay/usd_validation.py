@@ -1,0 +1,83 @@
+"""A rule of OpenUSD's validation framework: meshes neither collide between time samples nor cross at them.
+
+Programs that run the framework find the rule by the plugin in the folder ``plugin`` beside this module, which OpenUSD
+loads if the environment variable ``PXR_PLUGINPATH_NAME`` names it. In Python, importing this module is enough::
+
+    from pxr import Usd, UsdValidation
+    import warp_bsc.replay.usd_validation as rules
+
+    validator = UsdValidation.ValidationRegistry().GetOrLoadValidatorByName(rules.NAME)
+    for error in validator.Validate(Usd.Stage.Open("scene.usd")):
+        print(error.GetName(), error.GetMessage())
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import math
+import os
+
+from pxr import Plug, Usd, UsdValidation
+
+from ..usd.scene import FrameRange, Scene
+from .intervals import replay
+from .summary import Summary
+
+__all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
+
+NAME = f"{__name__}:Collisions"
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked."""
+
+PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
+"""Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
+
+
+def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
+    """Returns an error for each time in which two meshes collide or cross, or a mesh collides with or crosses itself.
+
+    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the
+    session layer are not seen.
+
+    Args:
+        stage: The stage.
+        time_range: Which times to check.
+    """
+    times = time_range.GetInterval()
+    if times.IsEmpty():  # the default time alone, at which nothing moves
+        return []
+    bounds = (None if math.isinf(time) else time for time in (times.GetMin(), times.GetMax()))
+    paths: dict[str, str] = {}  # by name
+    intervals = []
+    try:
+        scene = Scene(stage.GetRootLayer().realPath or stage.GetRootLayer().identifier, frames=FrameRange(*bounds))
+        for result in replay(scene):
+            paths |= {mesh.name: mesh.path for mesh in result.contacts.segment.meshes}
+            intervals.append(result.summary)
+    except (OSError, ValueError) as error:
+        return [_error("Unreadable", str(error), stage, [])]
+    summary = Summary(scene, method="exact", device="", intervals=intervals)
+    errors = [_error("Unreadable", reason, stage, []) for reason in scene.left_out]
+    for span in summary.collision_spans:
+        prims = [paths[name] for name in span.meshes]
+        text = f"{_pair(span.meshes)} collide from time {span.since:g} to {span.until:g}: {span.hits:,} pairs"
+        errors.append(_error("Collision", text, stage, prims))
+    for span in summary.intersection_spans:
+        if span.crossings:
+            prims = [paths[name] for name in span.meshes]
+            text = f"{_pair(span.meshes)} cross from time {span.since:g} to {span.until:g}: at most {span.most:,} edges"
+            errors.append(_error("Intersection", text, stage, prims))
+    return errors
+
+
+def _pair(meshes: tuple[str, str]) -> str:
+    first, second = meshes
+    return f"{first} and {'itself' if first == second else second}"
+
+
+def _error(name: str, text: str, stage: Usd.Stage, paths: list[str]) -> UsdValidation.ValidationError:
+    sites = [UsdValidation.ValidationErrorSite(stage, path) for path in dict.fromkeys(paths)]
+    return UsdValidation.ValidationError(name, UsdValidation.ValidationErrorType.Error, sites, text)
+
+
+Plug.Registry().RegisterPlugins(PLUGIN_FOLDER)
+UsdValidation.ValidationRegistry().RegisterPluginStageValidator(NAME, find_errors)

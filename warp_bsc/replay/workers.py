@@ -1,0 +1,469 @@
+"""Checks the intervals of a scene in several processes, on this machine or on a Dask cluster.
+
+The intervals are cut into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
+results pickled, with numbers in the place of segments, which the receiving process has as well. Results are yielded in
+order, whichever worker is the first. The chunks of a worker that dies are checked again by another.
+
+A mesh that turns out to be broken is left out from then on. Workers that check later intervals meanwhile do not know
+that yet: their results are dropped, and the chunks are checked again.
+"""
+
+import contextlib
+import io
+import itertools
+import multiprocessing
+import os
+import pickle
+import signal
+import socket
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import islice
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any, Protocol
+
+from .. import __version__
+from ..detection.launch import cores
+from ..detection.start import find_device, gpu_count
+from ..usd.interval import ReadingNotes
+from ..usd.scene import Scene
+from ..usd.segment import Segment
+from .checking import Checks, IntervalChecker
+from .results import IntervalResult
+
+__all__ = [
+    "Cluster",
+    "LocalWorkers",
+    "Workers",
+    "check_in_workers",
+    "device_of_cluster",
+    "device_of_worker",
+    "initial_crossings_in_workers",
+]
+
+_CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
+_MOST_INTERVALS = 16  # in a chunk; the first of a chunk costs reading and checking a time more
+_CHUNKS_EACH = 4  # the fewest for each worker, so that all end at about the same time
+_CONNECT_SECONDS = 10.0
+
+
+class Workers(Protocol):
+    """Processes to which functions can be submitted.
+
+    Attributes:
+        died: The error that a future of :meth:`submit` has if the process that called the function has died.
+        attempts: How often a function is to be submitted if its process dies.
+    """
+
+    died: type[Exception]
+    attempts: int
+
+    @property
+    def count(self) -> int:
+        """Number of processes at the moment, at least 1."""
+        ...
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Returns a future of the function's result in one of the processes."""
+        ...
+
+    def close(self) -> None:
+        """Ends the work at once, finished or not."""
+        ...
+
+
+class LocalWorkers:
+    """Processes on this machine, which end when this one ends, however it does.
+
+    Each has a pipe of its own and a thread here that waits for it. (The pool of Python's ``concurrent.futures`` has one
+    pipe for all results: it waits for ever if a process is killed while it writes there.)
+    """
+
+    died: type[Exception] = ChildProcessError
+    attempts = 3
+
+    def __init__(self, count: int):
+        """Starts no process yet: they start when they get work.
+
+        Args:
+            count: Number of processes, at least 1.
+        """
+        self.count = count
+        self._numbers = itertools.count()
+        self._of_thread = threading.local()
+        self._processes: dict[int, SpawnProcess] = {}  # by number
+        self._is_closed = False
+        self._threads = ThreadPoolExecutor(count, "worker", self._begin_thread)
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
+        """Returns a future of the function's result in one of the processes."""
+        return self._threads.submit(self._call, function, arguments)
+
+    def close(self) -> None:
+        """Ends all processes at once."""
+        self._is_closed = True
+        for process in list(self._processes.values()):
+            process.kill()
+        self._threads.shutdown(cancel_futures=True)
+
+    def _begin_thread(self) -> None:
+        self._of_thread.number, self._of_thread.connection = next(self._numbers), None
+        if hasattr(signal, "pthread_sigmask"):  # inherited by the processes that it starts
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+
+    def _call(self, function: Callable[..., Any], arguments: tuple) -> Any:
+        """Returns the function's result in the process of this thread.
+
+        Raises:
+            ChildProcessError: If the process dies. The next call starts another one.
+        """
+        own = self._of_thread
+        own.connection = own.connection or self._start(own.number)
+        try:
+            own.connection.send((function, arguments))
+            result, error = own.connection.recv()
+        except (EOFError, OSError) as error:
+            own.connection.close()
+            own.connection = None
+            raise ChildProcessError("a worker died") from error
+        if error:
+            raise error
+        return result
+
+    def _start(self, number: int) -> Connection:
+        """Starts a process and returns the connection to it."""
+        context = multiprocessing.get_context("spawn")  # Warp's threads do not survive a fork
+        connection, other = context.Pipe()
+        process = context.Process(target=_serve, args=(other, number, self.count), daemon=True)
+        process.start()
+        other.close()  # so that the connection ends when the process does
+        self._processes[number] = process
+        if self._is_closed:
+            process.kill()
+        return connection
+
+
+class Cluster:
+    """The workers of a running Dask cluster."""
+
+    attempts = 1  # Dask makes several itself
+
+    def __init__(self, address: str):
+        """Connects to the cluster.
+
+        Args:
+            address: Address of its scheduler, such as ``"tcp://head:8786"``.
+
+        Raises:
+            ModuleNotFoundError: If Dask is not installed.
+            OSError: If there is no scheduler.
+        """
+        try:
+            from distributed import Client, KilledWorker  # noqa: PLC0415 (optional)
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
+        self.died: type[Exception] = KilledWorker
+        try:
+            self._client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise OSError(f"{address}: no scheduler of a Dask cluster answers: {error}") from error
+
+    @property
+    def count(self) -> int:
+        """Number of workers at the moment, at least 1."""
+        return max(1, len(self._client.nthreads()))
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Returns a future of the function's result in one of the workers."""
+        return self._client.submit(function, *arguments, pure=False)
+
+    def close(self) -> None:
+        """Disconnects from the cluster, which drops the work that is waiting."""
+        self._client.close()
+
+
+def initial_crossings_in_workers(scene: Scene, checks: Checks, workers: Workers) -> frozenset[tuple[str, str]]:
+    """Returns the names of the meshes that cross at the first time, each pair sorted.
+
+    Arguments and errors are those of :func:`check_in_workers`.
+    """
+    call = _Call("checked the first time", _find_initial_crossings, (_pack(scene, checks),))
+    (crossing,) = _in_order(workers, deque([call]))
+    return crossing
+
+
+def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int = 0) -> Iterator[IntervalResult]:
+    """Checks intervals in other processes and yields the results in order.
+
+    Args:
+        scene: The scene. All intervals before the first have been read.
+        checks: What to look for.
+        workers: The processes.
+        first: Number of the first interval.
+
+    Raises:
+        ChildProcessError: If worker after worker dies while it checks the same intervals.
+        Exception: What checking raises, after all results before.
+    """
+    job = _pack(scene, checks)
+    calls = deque(
+        _Call(f"checked time {scene.times[start]:g} to {scene.times[stop]:g}", _check_chunk, (job, start, stop))
+        for start, stop in _cut(scene, first, workers.count)
+    )
+    for found in _in_order(workers, calls):
+        left_out = len(scene.left_out)
+        yield from _unpack(scene, found)
+        if len(scene.left_out) > left_out:
+            job = _pack(scene, checks)
+            for call in calls:
+                call.withdraw()
+                call.arguments = (job, *call.arguments[1:])
+
+
+def device_of_cluster(address: str, name: str | None) -> str:
+    """Returns the name of the Warp device that a worker of a cluster uses.
+
+    Args:
+        address: As of :class:`Cluster`.
+        name: The device that is wanted, None for Warp's default.
+
+    Raises:
+        ModuleNotFoundError: As of :class:`Cluster`.
+        OSError: As of :class:`Cluster`.
+        ValueError: If a worker has no such device.
+    """
+    cluster = Cluster(address)
+    try:
+        return cluster.submit(_name_device, name).result()
+    finally:
+        cluster.close()
+
+
+def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
+    """Returns the device that a worker on this machine uses: one GPU each, in turns, where no certain one is named.
+
+    Args:
+        name: The device that is wanted, None for Warp's default.
+        number: Number of the worker, from 0.
+        gpu_count: Number of GPUs of the machine.
+    """
+    return f"cuda:{number % gpu_count}" if gpu_count and name in (None, "cuda") else name
+
+
+@dataclass
+class _Call:
+    """A call that is to be made in a worker, and its future once it is submitted.
+
+    Attributes:
+        what: What is done meanwhile, in words.
+        function: The function.
+        arguments: Its arguments.
+        future: Future of its result.
+        deaths: How many workers have died that made it.
+    """
+
+    what: str
+    function: Callable[..., Any]
+    arguments: tuple
+    future: Any = None
+    deaths: int = 0
+
+    def withdraw(self) -> None:
+        """Forgets the future."""
+        if self.future:
+            self.future.cancel()
+            self.future = None
+
+
+def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
+    """Makes calls in workers and yields their results in order; again where a worker dies.
+
+    Args:
+        workers: The workers.
+        calls: The calls, which are removed when their result is there. Between two results, those that remain may be
+            withdrawn and changed.
+    """
+    while calls:
+        for call in islice(calls, 2 * workers.count):
+            call.future = call.future or workers.submit(call.function, *call.arguments)
+        call = calls[0]
+        try:
+            result = call.future.result()
+        except workers.died as error:
+            call.future = None
+            call.deaths += 1
+            if call.deaths == workers.attempts:
+                raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
+            continue
+        except CancelledError as error:  # not by this module, which forgets the futures that it cancels
+            raise ConnectionError("the connection to the scheduler of the cluster was lost") from error
+        calls.popleft()
+        yield result
+
+
+def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
+    """Yields the chunks: the first interval and the one after the last of each."""
+    position_bytes = max(1, 3 * scene.vertex_count * scene.dtype.itemsize)
+    for_all = -(-(len(scene) - first) // (_CHUNKS_EACH * worker_count))
+    size = max(1, min(for_all, _MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
+    for start in range(first, len(scene), size):
+        yield start, min(start + size, len(scene))
+
+
+# In the worker ---------------------------------------------------------------------------------------------------
+
+_ONE_CHUNK = threading.Lock()
+"""Held while a chunk is checked: a worker of Dask has several threads."""
+
+_local: tuple[int, int] | None = None
+"""Number of this worker and number of all workers on this machine, None in a worker of Dask."""
+
+_opened: tuple[bytes, IntervalChecker] | None = None
+"""What this worker has checked last, and the checker."""
+
+
+def _serve(connection: Connection, number: int, count: int) -> None:
+    """Calls the functions that come through a connection until it is closed: the program of a local worker."""
+    global _local  # noqa: PLW0603 (one for the process)
+    _local = number, count
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the first one ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            function, arguments = connection.recv()
+            try:
+                answer = function(*arguments), None
+            except Exception as error:
+                answer = None, _portable(error)
+            connection.send(answer)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent
+    parent.join()
+    os._exit(1)
+
+
+def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
+    """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them."""
+    global _opened  # noqa: PLW0603
+    stream = io.BytesIO()
+    pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
+    with _ONE_CHUNK:
+        checker = None
+        try:
+            checker = _open(job)
+            with cores(_core_count()):
+                for result in checker.check(first, stop):
+                    checker.scene.files.check()
+                    pickler.index = result.summary.index
+                    pickler.dump((pickler.index, result.contacts.interval.notes))
+                    pickler.dump(result)
+        except Exception as raised:
+            _opened = None
+            pickler.dump((first, checker.scene.take_notes() if checker else ReadingNotes()))
+            pickler.dump(_portable(raised))
+        pickler.dump(None)
+    return stream.getvalue()
+
+
+def _find_initial_crossings(job: bytes) -> frozenset[tuple[str, str]]:
+    """Returns the names of the meshes that cross at the first time."""
+    try:
+        with _ONE_CHUNK, cores(_core_count()):
+            return _open(job).initial_crossings()
+    except Exception as error:
+        raise _portable(error) from None
+
+
+def _name_device(name: str | None) -> str:
+    """Returns the name of the device that this worker uses."""
+    return find_device(name).alias
+
+
+def _open(job: bytes) -> IntervalChecker:
+    """Returns the checker of a job, the last one if it is the same."""
+    global _opened  # noqa: PLW0603
+    if _opened is None or _opened[0] != job:
+        _opened = None  # before the next scene is opened, to free memory
+        stream = io.BytesIO(job)
+        version = pickle.load(stream)
+        if version != __version__:
+            raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
+        scene, checks = pickle.load(stream)
+        device = checks.device
+        if _local:
+            device = device_of_worker(device, _local[0], gpu_count())
+        checks = replace(checks, device=find_device(device).alias)
+        _opened = job, IntervalChecker(scene, checks, _worker_name())
+    return _opened[1]
+
+
+def _core_count() -> int:
+    """Returns the number of cores for this worker: its share of the machine, or the threads that Dask gives it."""
+    if _local:
+        return max(1, (os.cpu_count() or 1) // _local[1])
+    from distributed import get_worker  # noqa: PLC0415 (optional)
+
+    return get_worker().state.nthreads
+
+
+def _worker_name() -> str:
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+def _portable(error: Exception) -> Exception:
+    """Returns an error with the same message that can be sent to another process."""
+    if isinstance(error, OSError):
+        return OSError(error.errno, error.strerror, error.filename) if error.strerror else OSError(str(error))
+    if isinstance(error, ValueError):
+        return ValueError(str(error))
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{Path(frame.filename).name}:{frame.lineno}"
+    return RuntimeError(f"{type(error).__name__}: {error} (in worker {_worker_name()}, {place})")
+
+
+# What they exchange ----------------------------------------------------------------------------------------------
+
+
+def _pack(scene: Scene, checks: Checks) -> bytes:
+    """Returns what a worker opens, as bytes that are the same for the same content."""
+    return pickle.dumps(__version__) + pickle.dumps((scene, checks))
+
+
+class _Pickler(pickle.Pickler):
+    """Writes the number of an interval in the place of its segment."""
+
+    index = 0
+
+    def persistent_id(self, obj: Any) -> int | None:
+        return self.index if isinstance(obj, Segment) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads the segments of a scene in the place of numbers of intervals."""
+
+    def __init__(self, stream: io.BytesIO, scene: Scene):
+        super().__init__(stream)
+        self._scene = scene
+
+    def persistent_load(self, pid: int) -> Segment:
+        return self._scene.segment(pid)
+
+
+def _unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
+    """Yields the results of a chunk, raises what stopped it, and notes in the scene what reading it has revealed."""
+    unpickler = _Unpickler(io.BytesIO(found), scene)  # it remembers what consecutive intervals share
+    while notes := unpickler.load():
+        scene.note(*notes)
+        result = unpickler.load()
+        if isinstance(result, Exception):
+            raise result
+        yield result
