@@ -170,9 +170,9 @@ class Example(ExampleBase):
         lowest, highest, fingers = self.heights()
         assert abs(fingers - HEIGHT - LIFT) < 0.01, f"the fingers are {fingers:.3f} m high"
         if 2.0 * FORCE * self.friction > WEIGHT:
-            assert lowest > 0.5 * LIFT and highest > fingers - FINGER[2], f"the cloth hangs from {highest:.3f} m"
+            assert lowest > 0.02 and highest > fingers - FINGER[2], f"the cloth is from {lowest:.3f} to {highest:.3f} m"
         else:
-            assert lowest < 0.01 and highest < fingers - FINGER[2], f"the cloth hangs from {highest:.3f} m"
+            assert lowest < 0.01 and highest < fingers - FINGER[2], f"the cloth is from {lowest:.3f} to {highest:.3f} m"
 
     def print_report(self):
         """Prints what the stage did, and where the cloth is."""

@@ -114,8 +114,8 @@ class DetectionPipeline:
             rings: Pairs that so few edges join are excluded, see :class:`CollisionDetector`.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
-            pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together; a
-                half of it for survivors, an eighth for contacts. A large capacity costs memory, but no time. Default:
+            pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together;
+                twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs memory, but no time. Default:
                 eight pairs of faces, one vertex-face and two edge-edge pairs.
 
         Raises:
@@ -143,7 +143,8 @@ class DetectionPipeline:
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs_per_face is not None:
-            face_pairs = vertex_face = edge_edge = min(max(pairs_per_face * elements, LEAST_CAPACITY), 2**31 - 1)
+            vertex_face = edge_edge = min(max(pairs_per_face * elements, LEAST_CAPACITY), 2**31 - 1)
+            face_pairs = min(2 * vertex_face, 2**31 - 1)  # of layers that lie on each other, most have none of elements
         self._broad_phase = make_broad_phase(
             mesh,
             self.counters.face_pairs,

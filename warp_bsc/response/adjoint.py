@@ -169,7 +169,7 @@ def _restore_multipliers(
     add_delta(motion, constraints, i, old - multiplier[i], sums)
     multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
-    count_active(vertices, constraints, i)
+    count_active(motion, vertices, constraints, i)
 
 
 @wp.func

@@ -96,7 +96,6 @@ class Vertices:
     x1: wp.array[wp.vec3]  # positions at the end of the step [m]
     velocity: wp.array[wp.vec3]  # velocities at its end [m/s]
     active: wp.array[int]  # active constraints that move the vertex
-    first_active: wp.array[int]  # the first node of their list, -1 for none; node 4 place + corner
     particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see projection.add_delta
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
     first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
@@ -129,8 +128,6 @@ class Constraints:
     last_sweep: wp.array[int]  # in which it was active last
     active_set: wp.array[int]  # indices of the active constraints
     active_count: wp.array[wp.int64]
-    change: wp.array[wp.vec3d]  # of the multiplier in the last sweep, at the place in the active set
-    next_active: wp.array[int]  # after each node, the next in the list of the same vertex, -1 at its end
 
 
 @wp.struct
@@ -199,7 +196,6 @@ def allocate_vertices(count, device) -> Vertices:
         setattr(vertices, name, wp.zeros(count, dtype=int, device=device))
     for name in ("particle_delta_x", "particle_delta_v"):
         setattr(vertices, name, wp.zeros((count, 3), dtype=wp.int64, device=device))
-    vertices.first_active = wp.full(count, -1, dtype=int, device=device)
     vertices.first_contact = wp.full(count, int(NEVER), dtype=wp.int64, device=device)
     return vertices
 
@@ -219,6 +215,5 @@ def allocate_constraints(capacity, device) -> Constraints:
     for name, var in Constraints.vars.items():
         setattr(constraints, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
     constraints.count = wp.zeros(1, dtype=int, device=device)
-    constraints.next_active = wp.empty(4 * capacity, dtype=int, device=device)
     constraints.active_count = wp.zeros(1, dtype=wp.int64, device=device)
     return constraints

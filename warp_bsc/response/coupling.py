@@ -127,7 +127,6 @@ def _start_substep(
     vertices.velocity[i] = velocity
     vertices.outcome[i] = 0
     vertices.active[i] = 0
-    vertices.first_active[i] = -1
     for axis in range(3):
         vertices.particle_delta_x[i, axis] = wp.int64(0)
         vertices.particle_delta_v[i, axis] = wp.int64(0)

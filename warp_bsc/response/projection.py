@@ -122,8 +122,9 @@ def _multiplier_after(
 
 
 @wp.func
-def _units(x: wp.float64) -> wp.int64:
-    return wp.int64(wp.rint(_UNITS * x))
+def _add(sums: wp.array2d[wp.int64], vertex: int, x: wp.vec3d):
+    for axis in range(3):
+        wp.atomic_add(sums, vertex, axis, wp.int64(wp.rint(_UNITS * x[axis])))
 
 
 @wp.func
@@ -133,35 +134,7 @@ def add_delta(motion: Motion, constraints: Constraints, i: int, change: wp.vec3d
         vertex = constraints.vertices[i][j]
         share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
         if share != _ZERO:
-            for axis in range(3):
-                wp.atomic_add(sums, vertex, axis, _units(share * change[axis]))
-
-
-@wp.func
-def _gather_changes(
-    motion: Motion, vertices: Vertices, constraints: Constraints, vertex: int, sums: wp.array2d[wp.int64]
-):
-    """Adds what a sweep did to a vertex, constraint by constraint, to its sums, as :func:`add_delta` does.
-
-    Each vertex gathers, because atomics on integers of 64 bits, twelve of them for a constraint, cost several times as
-    much.
-    """
-    inverse_mass = wp.float64(motion.inverse_mass[vertex])
-    x = wp.int64(0)
-    y = wp.int64(0)
-    z = wp.int64(0)
-    node = vertices.first_active[vertex]
-    while node >= 0:
-        place = node / 4
-        share = constraints.weights[constraints.active_set[place]][node % 4] * inverse_mass
-        change = constraints.change[place]
-        x += _units(share * change[0])
-        y += _units(share * change[1])
-        z += _units(share * change[2])
-        node = constraints.next_active[node]
-    sums[vertex, 0] = sums[vertex, 0] + x
-    sums[vertex, 1] = sums[vertex, 1] + y
-    sums[vertex, 2] = sums[vertex, 2] + z
+            _add(sums, vertex, share * change)
 
 
 @wp.func
@@ -194,25 +167,20 @@ def _is_held(
 
 
 @wp.func
-def count_active(vertices: Vertices, constraints: Constraints, i: int):
-    """Counts an active constraint for the vertices that it moves."""
+def count_active(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
+    """Counts an active constraint for the vertices and bodies that it moves."""
     for j in range(4):
         if constraints.weights[i][j] != _ZERO:
             wp.atomic_add(vertices.active, constraints.vertices[i][j], 1)
+    if motion.bodies.of_vertex:
+        activate_bodies(motion, vertices, constraints, i)
 
 
 @wp.func
 def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
-    """Adds a constraint to the active set, to the lists of the vertices that it moves, and to its bodies."""
-    place = int(take_slot(constraints.active_count, 0))
-    constraints.active_set[place] = i
-    count_active(vertices, constraints, i)
-    for j in range(4):
-        if constraints.weights[i][j] != _ZERO:
-            node = 4 * place + j
-            constraints.next_active[node] = wp.atomic_exch(vertices.first_active, constraints.vertices[i][j], node)
-    if motion.bodies.of_vertex:
-        activate_bodies(motion, vertices, constraints, i)
+    """Adds a constraint to the active set, and counts it for the vertices and bodies that it moves."""
+    constraints.active_set[int(take_slot(constraints.active_count, 0))] = i
+    count_active(motion, vertices, constraints, i)
 
 
 @wp.func
@@ -375,7 +343,7 @@ def project_positions(
     new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
     constraints.previous_multiplier[i] = multiplier
     constraints.position_multiplier[i] = new
-    constraints.change[place] = new - old
+    add_delta(motion, constraints, i, new - old, vertices.particle_delta_x)
     if motion.bodies.of_vertex:
         add_body_delta(motion, vertices, constraints, i, new - old, motion.x1, vertices.bodies.delta_x)
 
@@ -390,14 +358,12 @@ def update_positions(
         _finish_sweep(constraints, progress, record, last)
     if vertices.active[vertex] == 0:
         return
+    if last:
+        vertices.active[vertex] = 0
     if motion.inverse_mass[vertex] > 0.0:
-        _gather_changes(motion, vertices, constraints, vertex, vertices.particle_delta_x)
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
-    if last:
-        vertices.active[vertex] = 0
-        vertices.first_active[vertex] = -1
 
 
 @wp.func
@@ -491,7 +457,7 @@ def project_velocities(
     new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
     constraints.previous_multiplier[i] = multiplier
     constraints.velocity_multiplier[i] = new
-    constraints.change[place] = new - old
+    add_delta(motion, constraints, i, new - old, vertices.particle_delta_v)
     if motion.bodies.of_vertex:
         add_body_delta(motion, vertices, constraints, i, new - old, vertices.x1, vertices.bodies.delta_v)
 
@@ -506,10 +472,7 @@ def update_velocities(
         _finish_sweep(constraints, progress, record, last)
     if vertices.active[vertex] == 0:
         return
-    if motion.inverse_mass[vertex] > 0.0:
-        _gather_changes(motion, vertices, constraints, vertex, vertices.particle_delta_v)
-        if not has_final_velocity(vertices.outcome[vertex]):
-            vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
     if last:
         vertices.active[vertex] = 0
-        vertices.first_active[vertex] = -1
+    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
