@@ -115,8 +115,8 @@ class DetectionPipeline:
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together;
-                twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs memory, but no time. Default:
-                eight pairs of faces, one vertex-face and two edge-edge pairs.
+                twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs
+                memory, but no time. Default: eight pairs of faces, one vertex-face and two edge-edge pairs.
 
         Raises:
             ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
