@@ -24,10 +24,10 @@ __all__ = [
     "Contacts",
     "add_constraint",
     "approach_of",
-    "begins_dividing",
     "contact_vertices",
     "contact_weights",
     "count_contact",
+    "divides_near_pairs",
     "feasible",
     "feasible_in_contact",
     "gap",
@@ -68,6 +68,8 @@ TOUCH = wp.constant(wp.float64(1e-100))
 """Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities."""
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
+_DIVISIONS_OF_CONTACTS = wp.constant(2)
+"""Iterations that divide contacts alone: mostly they are enough, and planes between all near pairs cost more."""
 _SHARE = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes."""
 _WIDENING = wp.constant(wp.float64(1.25))
@@ -123,12 +125,12 @@ def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
 
 
 @wp.func
-def begins_dividing(progress: Progress, world: int) -> bool:
-    """Returns whether this iteration is the first that divides vertices of a world without fast contacts."""
+def divides_near_pairs(progress: Progress, world: int) -> bool:
+    """Returns whether near pairs of a world without fast contacts are divided in this iteration, as contacts are."""
     last = progress.status.iteration[0] - 1
     if progress.contact_iteration[world] != last or progress.fast[world] == 1:
         return False
-    return last == progress.max_slow_iterations
+    return last == progress.max_slow_iterations + _DIVISIONS_OF_CONTACTS
 
 
 @wp.func

@@ -1,10 +1,11 @@
 """Dividing planes: what projection cannot keep apart, a plane between the two elements keeps apart for certain.
 
 If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
-at all times of a linear motion. After the last projection, each contact that is left, and each near pair that could
-become one, gets a plane across the shortest vector between its elements at the start, and every vertex of the two is
-projected onto its side. Vertices that stand still are on their sides, so that there is a solution for the vertices of
-all pairs at once, each by itself. What slides along a plane goes on sliding, unlike what is truncated.
+at all times of a linear motion. After the last projection, each contact that is left gets a plane across the shortest
+vector between its elements at the start, and every vertex of the two is projected onto its side. If contacts are left
+even so, near pairs that could become contacts get planes too. Vertices that stand still are on their sides, so that
+there is a solution for the vertices of all pairs at once, each by itself. What slides along a plane goes on sliding,
+unlike what is truncated.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,

@@ -18,10 +18,10 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     Contacts,
     add_constraint,
-    begins_dividing,
     contact_vertices,
     contact_weights,
     count_contact,
+    divides_near_pairs,
     feasible_in_contact,
     has_overflowed,
     is_dividing,
@@ -219,7 +219,7 @@ def divide_near_pairs(
     progress: Progress,
     separation: wp.float64,
 ):
-    """Adds dividing planes for the proximities of worlds in which division begins.
+    """Adds dividing planes for the proximities of worlds where planes between contacts have not been enough.
 
     In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
     A constraint whose elements would meet changes velocities too.
@@ -231,7 +231,7 @@ def divide_near_pairs(
     if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
         return
     corners = constraints.vertices[i]
-    if not begins_dividing(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
+    if not divides_near_pairs(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
     meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
