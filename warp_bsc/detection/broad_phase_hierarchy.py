@@ -56,7 +56,7 @@ _WIDTH = wp.constant(WIDTH)
 
 _PAIRS_OF_THREAD = wp.constant(4)
 """Most pairs of faces whose elements a thread pairs."""
-_PAIRS_AT_ONCE = wp.constant(wp.int64(1 << 17))
+_PAIRS_AT_ONCE = wp.constant(1 << 17)
 """Pairs of faces that a GPU works on at once, each by a thread of its own."""
 _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
@@ -79,6 +79,7 @@ class FaceHierarchy:
     are not set.
 
     Attributes:
+        all_faces: Whether all cells are faces.
         face_count: Number of faces; greater cells are edges.
         point_start: First cell that is a point.
         order: Cell at each place, -1 for none.
@@ -96,6 +97,7 @@ class FaceHierarchy:
         groups: Highest level; without arrays in a small mesh, where all groups are traversed.
     """
 
+    all_faces: wp.bool
     face_count: int
     point_start: int
     order: wp.array[int]
@@ -348,6 +350,14 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
+def _is_face(mesh: FaceHierarchy, place: int) -> bool:
+    """Whether the cell at a place is a face; where all are, nothing is read."""
+    if mesh.all_faces:
+        return True
+    return mesh.order[place] < mesh.face_count
+
+
+@wp.func
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
@@ -355,7 +365,7 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
     """
     owned = mesh.owned[face]
     found = int(0)
-    if owned & 7 == 0 or mesh.order[other] >= mesh.face_count:
+    if owned & 7 == 0 or not _is_face(mesh, other):
         return found
     other_box = read_box(mesh.face_boxes, other)
     corners = int(3)  # not a constant, as the body would be repeated
@@ -418,10 +428,11 @@ def _pair_elements(
     Atomics on one address take turns, so that few of them are better.
     """
     i = wp.tid()
-    count = face_pair_count[0]
-    turns = int(wp.max((count - wp.int64(1)) / wp.int64(threads) + wp.int64(1), count / _PAIRS_AT_ONCE))
-    turns = wp.min(turns, _PAIRS_OF_THREAD)
+    count = int(wp.min(face_pair_count[0], wp.int64(face_pairs.shape[0])))
+    turns = wp.min(wp.max((count - 1) / threads + 1, count / _PAIRS_AT_ONCE), _PAIRS_OF_THREAD)
     first = (i / _WIDTH) * turns * _WIDTH + i % _WIDTH
+    if first >= count:
+        return
     found = wp.uint64(0)
     candidates = wp.vec2i()  # vertex-face, edge-edge
     queued = wp.vec2i()
@@ -471,7 +482,7 @@ def _pair_edges_with_face(
 ):
     """Enqueues the edges that a face owns with another face."""
     owned = mesh.owned[face]
-    sides = wp.where(owned >> 3 == 0 or mesh.order[other] >= mesh.face_count, 0, 3)
+    sides = wp.where(owned >> 3 == 0 or not _is_face(mesh, other), 0, 3)
     for side in range(sides):
         if owns_edge(owned, side):
             row = 3 * face + side
@@ -584,6 +595,7 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
         return wp.array(values[order] if len(order) else values, dtype=int, device=device)
 
     hierarchy.order = wp.array(order, dtype=int, device=device)
+    hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
     hierarchy.faces = by_place(mesh.cells)
     hierarchy.face_edges = by_place(mesh.cell_edges)
