@@ -175,8 +175,8 @@ def test_help(path, capsys):
 
 @pytest.mark.slow
 def test_bullet_is_stopped(capsys):
-    example = run(BULLET, 60, "--speed", "10")
-    assert example.solver.report.steps >= 240
+    example = run(BULLET, 30, "--speed", "20")
+    assert example.solver.report.steps >= 120
     example.test_final()
     example.print_report()
     assert "0 particles of the patch are behind the sheet" in capsys.readouterr().out

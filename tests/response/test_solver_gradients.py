@@ -266,7 +266,7 @@ def test_grazing_contacts_are_flagged_and_gradients_finite(device):
         assert np.abs(array.grad.numpy()).max() < 1e6
 
 
-def test_a_thousand_tape_iterations_take_no_more_memory(device):
+def test_hundreds_of_tape_iterations_take_no_more_memory(device):
     scene = Throw(device, friction=0.3, steps=1)
     down = np.array((0.0, 0.0, -9.0), dtype=np.float32)
 
@@ -275,11 +275,11 @@ def test_a_thousand_tape_iterations_take_no_more_memory(device):
             return wp.get_mempool_used_mem_current(device)
         return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    for i in range(1000):
+    for i in range(400):
         scene.gradient(down)
         if i == 100:
             before = used()
-    assert scene.hits > 1000
+    assert scene.hits > 400
     assert used() - before < 2**20
 
 

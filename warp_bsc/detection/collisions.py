@@ -29,13 +29,13 @@ class StageCounts:
             them, but not in a CUDA graph, where they stay unsure.
     """
 
-    candidates: int
-    survivors: int
-    free: int
-    hits: int
-    unsure: int
-    exact: int
-    host: int
+    candidates: int = 0
+    survivors: int = 0
+    free: int = 0
+    hits: int = 0
+    unsure: int = 0
+    exact: int = 0
+    host: int = 0
 
     @classmethod
     def of(cls, counts: PairCounts, *, exact: bool) -> "StageCounts":

@@ -9,6 +9,7 @@ import numpy as np
 import orjson
 
 from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.settings import DistanceKind
 from ..usd.interval import Interval
 from ..usd.scene import Scene
 from .results import IntervalResult, summarize
@@ -113,7 +114,8 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
             _rebuild_proximities(interval, at_end("near_pairs"), interval.end),
         )
     contacts = _rebuild_contacts(interval, record, bool(intersections))
-    counts = {kind: StageCounts(**numbers) for kind, numbers in record["stages"].items()}
+    # a scene has no points, so that their pairs have no record
+    counts = {kind.label: StageCounts(**record["stages"].get(kind.label, {})) for kind in DistanceKind}
     validation = record["validation"]
     if validation:
         validation = Validation(**validation | {"disagreements": tuple(validation["disagreements"])})

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
@@ -114,8 +115,9 @@ class LocalWorkers:
 
     def _begin_thread(self) -> None:
         self._of_thread.number, self._of_thread.connection = next(self._numbers), None
-        if hasattr(signal, "pthread_sigmask"):  # inherited by the processes that it starts
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        if hasattr(signal, "pthread_sigmask"):
+            resource_tracker.ensure_running()  # the first process would start it, which unblocks the signal
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the processes that it starts
 
     def _call(self, function: Callable[..., Any], arguments: tuple) -> Any:
         """Returns the function's result in the process of this thread.
@@ -177,7 +179,8 @@ class Cluster:
     @property
     def count(self) -> int:
         """Number of workers at the moment, at least 1."""
-        return max(1, len(self._client.nthreads()))
+        threads: Any = self._client.nthreads()  # by worker; a coroutine for asynchronous clients only
+        return max(1, len(threads))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Returns a future of the function's result in one of the workers."""
