@@ -225,8 +225,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
                 ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
-                velocity; separation, friction, restitution, coupling and bodies
-                then have no meaning, and must not be given.
+                velocity; separation, friction, restitution, coupling and bodies then have no meaning, and must not be
+                given.
 
         Raises:
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
