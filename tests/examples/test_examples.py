@@ -94,7 +94,7 @@ def test_printed_commands_run_without_a_window_and_without_a_browser(tmp_path, n
 
 
 def test_commands_are_printed():
-    assert len(PRINTED) >= 5
+    assert len(PRINTED) >= 4
 
 
 @pytest.mark.parametrize("path", [*EXAMPLES, *FIGURES], ids=lambda path: path.stem)

@@ -102,30 +102,24 @@ def say_where(found, wanted):
     return [name for name in wanted if found[name] != wanted[name]]
 
 
-OPTIONS = {
-    "plain": (),
-    "all": ("--ignore-initial", "--min-distance", "0.02", "--validate", "1"),
-}
+OPTIONS = "--ignore-initial", "--min-distance", "0.02", "--validate", "1"
 """``--ignore-initial`` needs the first time in every worker, ``--min-distance`` the end of a chunk."""
 
-CASES = [("waves", "plain"), ("troubled", "all")]
-"""What one worker finds is not the same as what another does only where a scene is troubled."""
+LEFT_OUT = 4
+"""The exit status of a scene of which a part is left out."""
 
 
-@pytest.mark.parametrize(("scene", "options"), CASES)
-def test_two_workers_write_the_same_files(request, tmp_path, capsys, scene, options):
-    path, status = request.getfixturevalue(scene), 4 if scene == "troubled" else 0
-    alone = run(path, tmp_path / "1", *OPTIONS[options], status=status)
+def test_two_workers_write_the_same_files(troubled, tmp_path, capsys):
+    alone = run(troubled, tmp_path / "1", *OPTIONS, status=LEFT_OUT)
     found = json.loads(alone["hits.json"])
     assert found["complete"] and found["hits"] + len(found["ignored"]) > 0
-    if scene == "troubled":
-        assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
-            "from time 8 on: /World/Breaks: vertex 3",
-            "from time 16 on: /World/BreaksLater: vertex 3",
-        ]
-        assert any("/World/Jumps jumps 2 times" in warning for warning in found["warnings"])
+    assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
+        "from time 8 on: /World/Breaks: vertex 3",
+        "from time 16 on: /World/BreaksLater: vertex 3",
+    ]
+    assert any("/World/Jumps jumps 2 times" in warning for warning in found["warnings"])
     capsys.readouterr()
-    together = run(path, tmp_path / "2", "--workers", "2", *OPTIONS[options], status=status)
+    together = run(troubled, tmp_path / "2", "--workers", "2", *OPTIONS, status=LEFT_OUT)
     assert not say_where(together, alone)
     printed = capsys.readouterr().out
     assert len(re.findall(r"^  \S+:\d+: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
@@ -247,20 +241,18 @@ def stop(monkeypatch, scene, folder, at, *options):
     assert len(json.loads((folder / "hits.json").read_bytes())["intervals"]) == at
 
 
-@pytest.mark.parametrize(("scene", "options"), CASES)
-def test_resumed(request, tmp_path, monkeypatch, capsys, scene, options):
-    path, status = request.getfixturevalue(scene), 4 if scene == "troubled" else 0
-    whole = run(path, tmp_path / "whole", *OPTIONS[options], status=status)
-    at, more = (18, ("--workers", "2")) if scene == "troubled" else (10, ())
+def test_resumed(troubled, tmp_path, monkeypatch, capsys):
+    whole = run(troubled, tmp_path / "whole", *OPTIONS, status=LEFT_OUT)
+    at, in_workers = 18, ("--workers", "2")
     folder = tmp_path / "stopped"
-    stop(monkeypatch, path, folder, at, *more, *OPTIONS[options])
+    stop(monkeypatch, troubled, folder, at, *in_workers, *OPTIONS)
     assert say_where(contents(folder), whole) == list(FILES.values())
     capsys.readouterr()
-    resumed = run(path, folder, "--resume", *more, *OPTIONS[options], status=status)
+    resumed = run(troubled, folder, "--resume", *in_workers, *OPTIONS, status=LEFT_OUT)
     assert not say_where(resumed, whole)
     taken = re.search(r"Taken from an earlier run: (\d+) intervals?\.", capsys.readouterr().out)
     assert (int(taken.group(1)) if taken else 0) >= at - 1
-    resumed = run(path, folder, "--resume", *OPTIONS[options], status=status)  # nothing is left to do
+    resumed = run(troubled, folder, "--resume", *OPTIONS, status=LEFT_OUT)  # nothing is left to do
     assert not say_where(resumed, whole)
 
 
@@ -371,9 +363,8 @@ def cluster(tmp_path):
 @pytest.mark.slow
 def test_a_cluster_writes_the_same_files(tmp_path, cluster, troubled, waves, capsys):
     address, processes = cluster
-    options = OPTIONS["all"]
-    alone = run(troubled, tmp_path / "1", *options, status=4)
-    assert not say_where(run(troubled, tmp_path / "2", "--scheduler", address, *options, status=4), alone)
+    alone = run(troubled, tmp_path / "1", *OPTIONS, status=LEFT_OUT)
+    assert not say_where(run(troubled, tmp_path / "2", "--scheduler", address, *OPTIONS, status=LEFT_OUT), alone)
 
     alone = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
     found = []
