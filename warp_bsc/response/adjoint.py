@@ -7,8 +7,6 @@ of each small change, see :mod:`.adjoint_kernels`; this module restores the valu
 Multipliers are in the record, and positions follow exactly from the changes of multipliers, as sums are integers.
 """
 
-from types import SimpleNamespace
-
 import warp as wp
 
 from .adjoint_kernels import (
@@ -24,7 +22,9 @@ from .adjoint_kernels import (
     turn_velocities,
 )
 from .angular_momentum import SUMS, turns
-from .buffers import PROJECTED, Constraints, Motion, Progress, SolveStatus, Vertices
+from .bodies import add_body_delta
+from .body_adjoint import BodyAdjoint, copied, give_gradients, launch_adjoint
+from .buffers import PROJECTED, Bodies, Constraints, Motion, MovedBodies, Progress, SolveStatus, Vertices
 from .constraints import MAX_TRUNCATIONS
 from .planes import MovingPlanes
 from .projection import SWEEPS_PER_BATCH, add_delta, count_active, with_delta
@@ -46,6 +46,7 @@ _CONSTRAINT_ARRAYS = (
     "separation",
     "friction",
     "kind",
+    "plane",
     "within_tolerance",
     "toi",
     "approach",
@@ -55,8 +56,10 @@ _CONSTRAINT_ARRAYS = (
     "previous_multiplier",
 )
 _RESTORED_CONSTRAINT_ARRAYS = "position_multiplier", "velocity_multiplier", "previous_multiplier"
-_DIFFERENTIABLE = "weights", "normal", "separation", "approach", *_RESTORED_CONSTRAINT_ARRAYS
+_DIFFERENTIABLE = "weights", "normal", "separation", "friction", "approach", *_RESTORED_CONSTRAINT_ARRAYS
 _MOTION_ARRAYS = "x0", "x1", "velocity"
+_BODY_MOTION_ARRAYS = "start", "end", "velocity", "inverse_mass"
+_MOVED_BODY_ARRAYS = "pose", "velocity", "delta_x", "delta_v", "outcome"
 _VERTEX_ARRAYS = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
 _RESTORED_VERTEX_ARRAYS = "x1", "velocity", "particle_delta_x", "particle_delta_v"
 _KERNEL = {"enable_backward": False}
@@ -159,14 +162,18 @@ def _restore_multipliers(
     cursor: Cursor,
     multiplier: wp.array[wp.vec3d],
     sums: wp.array2d[wp.int64],
+    x: wp.array[wp.vec3],
+    body_sums: wp.array2d[wp.int64],
 ):
-    """Restores multipliers as they were before a sweep, and the sums of what they changed."""
+    """Restores multipliers as they were before a sweep, and the sums of what they changed, at positions ``x``."""
     entry = entry_of(record, cursor.next_sweep[0], wp.tid())
     if cursor.next_sweep[0] < cursor.first_sweep[0] or entry < 0:
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
     add_delta(motion, constraints, i, old - multiplier[i], sums)
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, old - multiplier[i], x, body_sums)
     multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     count_active(motion, vertices, constraints, i)
@@ -236,6 +243,8 @@ def _restore_paths(
     if entry >= record.truncation_offsets[iteration + 1]:
         return
     vertex = record.vertex[entry]
+    if vertex < 0:
+        return
     end[entry] = gradients.x1[vertex]
     velocity[entry] = gradients.velocity[vertex]
     gradients.x1[vertex] = wp.vec3()
@@ -246,23 +255,35 @@ def _restore_paths(
 @wp.kernel(**_KERNEL)
 def _finish(
     # in
+    motion: Motion,
     gradients: _Gradients,
     x0: wp.array[wp.vec3],
     wanted_x1: wp.array[wp.vec3],
     wanted_velocity: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
     complete: wp.array[int],
     # out
     start_q: wp.array[wp.vec3],
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
+    particle_inv_mass: wp.array[float],
 ):
-    """Writes the gradients of the inputs of the step; NaN if its record is incomplete."""
+    """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
+
+    Those of vertices of shapes remain gradients with respect to what was wanted of them.
+    """
     particle = wp.tid()
     missing = float(0.0)
     if complete[0] == 0:
         missing = wp.nan
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + wanted_x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + wanted_velocity[particle]
+    if particle >= particle_q.shape[0]:
+        wanted_x1[particle] = x1
+        wanted_velocity[particle] = velocity
+        return
+    if particle_inv_mass and motion.inverse_mass[particle] > 0.0:
+        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle] + missing
     particle_q[particle] = x1 + wp.vec3(missing)
     particle_qd[particle] = velocity + wp.vec3(missing)
     start_q[particle] = start_q[particle] + x0[particle] + wp.vec3(missing)
@@ -284,6 +305,9 @@ class RecordedStep:
 
     Attributes:
         dt: Length of the step [s].
+        mesh: The mesh, :class:`.model_mesh.ModelMesh`.
+        friction: The coefficients of its vertices and planes, :class:`.friction.Friction`.
+        moves_bodies: Whether the response can move bodies.
         motion: The motion that the inner solver wanted, :class:`.buffers.Motion`.
         planes: The planes, :class:`.planes.MovingPlanes`.
         vertices: The vertices at the end, :class:`.buffers.Vertices`.
@@ -302,7 +326,7 @@ class RecordedStep:
             recorder: The :class:`.step_record.StepRecorder` that recorded it.
             dt: Length of the step [s].
         """
-        self.dt = dt
+        self.dt, self.mesh, self.friction, self.moves_bodies = dt, motion.mesh, motion.friction, motion.moves_bodies
         constraints, record, device = resolution.constraints, recorder.record, recorder.counts.device
         if device.is_capturing:
             count, sweeps = len(constraints.vertices), len(record.sweep_ends)
@@ -313,45 +337,29 @@ class RecordedStep:
                 int(getattr(record.counts, name).numpy()[0]) for name in ("sweeps", "entries", "truncations")
             )
         self.status = name_elements(SolveStatus, wp.clone(resolution.status_values))
-        self.planes = _copied(motion.planes, MovingPlanes(), dict.fromkeys(("start", "end")))
-        self.motion = _copied(motion.vertices, Motion(), dict.fromkeys(_MOTION_ARRAYS))
-        for name in ("inverse_mass", "friction", "world"):
+        self.planes = copied(motion.planes, MovingPlanes(), dict.fromkeys(("start", "end", "friction")))
+        self.motion = copied(motion.vertices, Motion(), dict.fromkeys((*_MOTION_ARRAYS, "is_lost", "friction")))
+        for name in ("inverse_mass", "world"):
             setattr(self.motion, name, getattr(motion.vertices, name))
-        self.vertices = _copied(resolution.vertices, Vertices(), dict.fromkeys(_VERTEX_ARRAYS))
+        self.vertices = copied(resolution.vertices, Vertices(), dict.fromkeys(_VERTEX_ARRAYS))
+        if motion.keeps_poses:
+            bodies = Bodies()
+            for name in Bodies.vars:
+                setattr(bodies, name, getattr(motion.vertices.bodies, name))
+            names = _BODY_MOTION_ARRAYS if motion.moves_bodies else ("start", "end")
+            self.motion.bodies = copied(bodies, bodies, dict.fromkeys(names))
+        if motion.moves_bodies:
+            moved = copied(resolution.vertices.bodies, MovedBodies(), dict.fromkeys(_MOVED_BODY_ARRAYS))
+            self.vertices.bodies = moved
         lengths = {**dict.fromkeys(_CONSTRAINT_ARRAYS, count), "count": 1}
-        self.constraints = _copied(constraints, Constraints(), lengths)
+        self.constraints = copied(constraints, Constraints(), lengths)
         lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}
         lengths |= {**dict.fromkeys(PER_ENTRY, entries), **dict.fromkeys(PER_TRUNCATION, truncations)}
-        self.record = _copied(record, StepRecord(), lengths)
+        self.record = copied(record, StepRecord(), lengths)
         self.record.counts = name_elements(RecordCounts, wp.clone(recorder.counts))
         self.complete = wp.empty(1, dtype=int, device=device)
         inputs = [constraints.count, record, count]
         wp.launch(_check_complete, 1, inputs=inputs, outputs=[self.complete], device=device)
-
-
-def _copied(struct, into, lengths):
-    """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
-    for name, length in lengths.items():
-        array = getattr(struct, name)
-        if length == 0:  # Warp makes no empty slices
-            setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))
-        else:
-            setattr(into, name, wp.clone(array if length is None else array[:length]))
-    return into
-
-
-def _give_gradients(struct, names, gradients=None):
-    """Replaces arrays of a struct by aliases with gradients, given or new ones; returns the gradients by name."""
-    into = SimpleNamespace(**(gradients or {}))
-    for name in names:
-        array = getattr(struct, name)
-        if not hasattr(into, name):
-            setattr(into, name, wp.zeros_like(array))
-        if len(array):
-            alias = array[:]
-            alias.grad = getattr(into, name)
-            setattr(struct, name, alias)
-    return into
 
 
 class StepAdjoint:
@@ -371,38 +379,55 @@ class StepAdjoint:
         for name in _Gradients.vars:
             setattr(gradients, name, wp.zeros(n, dtype=wp.vec3, device=device))
         self._motion = motion = Motion()
-        for name in (*_MOTION_ARRAYS, "inverse_mass", "friction", "world"):
+        differentiable = *_MOTION_ARRAYS, "inverse_mass", "friction"
+        for name in (*differentiable, "world", "is_lost"):
             setattr(motion, name, getattr(step.motion, name))
-        self._of_motion = _give_gradients(motion, _MOTION_ARRAYS)
-        self._vertices = vertices = _copied(step.vertices, Vertices(), dict.fromkeys(_RESTORED_VERTEX_ARRAYS))
+        self._of_motion = give_gradients(motion, differentiable)
+        self._planes = planes = MovingPlanes()
+        for name in ("start", "end", "friction"):
+            setattr(planes, name, getattr(step.planes, name))
+        self._of_planes = give_gradients(planes, ("start", "end", "friction"))
+        self._vertices = vertices = copied(step.vertices, Vertices(), dict.fromkeys(_RESTORED_VERTEX_ARRAYS))
         vertices.outcome = step.vertices.outcome
         vertices.active = wp.zeros(n, dtype=int, device=device)
         of_vertices = {"x1": gradients.more_x1, "velocity": gradients.more_velocity}
-        _give_gradients(vertices, of_vertices, of_vertices)
-        self._constraints = constraints = _copied(
+        give_gradients(vertices, of_vertices, of_vertices)
+        self._constraints = constraints = copied(
             step.constraints, Constraints(), dict.fromkeys(_RESTORED_CONSTRAINT_ARRAYS)
         )
         for name in set(_CONSTRAINT_ARRAYS) - set(_RESTORED_CONSTRAINT_ARRAYS) | {"count"}:
             setattr(constraints, name, getattr(step.constraints, name))
-        self._of_constraints = _give_gradients(constraints, _DIFFERENTIABLE)
+        self._of_constraints = give_gradients(constraints, _DIFFERENTIABLE)
         truncations = len(step.record.vertex)
         self._of_truncations = [wp.zeros(truncations, dtype=wp.vec3, device=device) for _ in range(2)]
         self._vertex_changes = wp.empty(n, dtype=wp.vec3, device=device)
+        self._bodies = BodyAdjoint(step, gradients, motion, self._of_motion, vertices)
         self._progress = Progress()
         self._progress.status = name_elements(SolveStatus, wp.zeros(len(SolveStatus.vars), dtype=int, device=device))
         self._cursor = name_elements(Cursor, wp.zeros(len(Cursor.vars), dtype=int, device=device))
         self._more_sweeps, self._more_iterations = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
 
     def backward(
-        self, start_q: wp.array[wp.vec3], particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3]
+        self,
+        start_q: wp.array[wp.vec3],
+        particle_q: wp.array[wp.vec3],
+        particle_qd: wp.array[wp.vec3],
+        start_body_q: wp.array[wp.transform] | None = None,
+        body_q: wp.array[wp.transform] | None = None,
+        body_qd: wp.array[wp.spatial_vector] | None = None,
     ) -> None:
         """Turns gradients with respect to the results of the step into those with respect to its inputs, in place.
+
+        Adds to the gradients of the model with respect to masses, inertias and coefficients, where it has such arrays.
 
         Args:
             start_q: Gradient with respect to positions at the start, shape [particle_count]; is added to.
             particle_q: Gradient with respect to the positions at the end, shape [particle_count]; becomes that with
                 respect to the positions that the inner solver wanted.
             particle_qd: The same for the velocities.
+            start_body_q: As ``start_q`` for poses of bodies, shape [body_count]; None if the model has none.
+            body_q: As ``particle_q`` for poses of bodies.
+            body_qd: As ``particle_q`` for velocities of bodies.
         """
         step, motion, gradients, of_motion = self._step, self._motion, self._gradients, self._of_motion
         iteration = self._progress.status.iteration
@@ -411,23 +436,33 @@ class StepAdjoint:
         inputs = [step.record, step.status, self._response.max_iterations, step.complete]
         outputs = [self._cursor, self._more_sweeps, self._more_iterations, iteration]
         self._launch(_begin_adjoint, 1, inputs, outputs)
+        self._bodies.begin(body_q, body_qd)
         self._through_turn()
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_velocity_sweep)
         self._through_initialization()
+        self._bodies.leave_velocities()
         wp.capture_while(self._more_iterations, self._through_iteration)
-        inputs = [gradients, of_motion.x0, of_motion.x1, of_motion.velocity, step.complete]
-        self._launch(_finish, len(particle_q), inputs, [start_q, particle_q, particle_qd])
+        self._bodies.take_positions()
+        inputs = [motion, gradients, of_motion.x0, of_motion.x1, of_motion.velocity, of_motion.inverse_mass]
+        outputs = [start_q, particle_q, particle_qd, step.mesh.model.particle_inv_mass.grad]
+        self._launch(_finish, len(motion.x0), [*inputs, step.complete], outputs)
+        self._bodies.finish(self._of_planes, start_body_q, body_q, body_qd)
+        step.friction.adjoin(of_motion.friction, self._of_planes.friction)
 
     def _through_turn(self):
         """Goes back through the turn that conserves angular momentum."""
         motion, vertices, constraints = self._motion, self._vertices, self._constraints
         n = len(motion.x0)
         self._launch(_restore_unturned, n, [motion, vertices])
+        self._bodies.restore_unturned()
         totals = wp.zeros((self._response.worlds, int(SUMS)), dtype=wp.float64, device=self._device, requires_grad=True)
         self._launch(add_torques, self._constraint_count, [motion, vertices, constraints], [totals])
         self._launch(add_moments, n, [motion, vertices], [totals])
+        self._bodies.add_moments(totals)
         self._adjoin(turn_velocities, n, [motion, vertices, totals], [self._gradients.velocity])
+        self._bodies.through_turn(totals)
         self._adjoin(add_moments, n, [motion, vertices], [totals.grad])
+        self._bodies.through_moments(totals)
         self._adjoin(add_torques, self._constraint_count, [motion, vertices, constraints], [totals.grad])
 
     def _batch(self, through):
@@ -436,96 +471,112 @@ class StepAdjoint:
 
     def _through_velocity_sweep(self):
         """Goes back through a sweep on velocities."""
-        constraints, of_constraints = self._constraints, self._of_constraints
-        self._restore_multipliers(constraints.velocity_multiplier, self._vertices.particle_delta_v)
+        constraints, of_constraints, vertices = self._constraints, self._of_constraints, self._vertices
+        multiplier, sums = constraints.velocity_multiplier, vertices.particle_delta_v
+        self._restore_multipliers(multiplier, sums, vertices.x1, vertices.bodies.delta_v)
         self._restore(_restore_velocities)
+        self._bodies.restore_velocities()
         self._adjoin(
             change_velocity_multipliers,
             self._constraint_count,
-            [self._motion, self._vertices, constraints, self._step.record, self._cursor, self._response.restitution],
-            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier, self._gradients.velocity_change],
+            [self._motion, vertices, constraints, self._step.record, self._cursor, self._response.restitution],
+            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier],
+            [self._gradients.velocity_change, self._bodies.velocity_change],
         )
-        self._vertices.active.zero_()
+        vertices.active.zero_()
+        self._bodies.take_velocities()
 
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         of_constraints = self._of_constraints
         self._restore(_restore_velocities)
+        self._bodies.restore_velocities()
         self._adjoin(
             initialize_multipliers,
             self._constraint_count,
-            [self._motion, self._constraints, self._step.dt],
-            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier, self._gradients.velocity_change],
+            [self._motion, self._vertices, self._constraints, self._step.dt],
+            [of_constraints.velocity_multiplier, of_constraints.previous_multiplier],
+            [self._gradients.velocity_change, self._bodies.velocity_change],
         )
         of_constraints.previous_multiplier.zero_()
 
     def _through_iteration(self):
         """Goes back through an iteration: truncation, sweeps, and the constraints that its detection added."""
         self._restore(_restore_positions)
+        self._bodies.take_positions()
         self._through_truncation()
         self._launch(_begin_iteration, 1, [self._step.record, self._cursor], [self._more_sweeps])
+        wp.capture_if(self._more_sweeps, self._bodies.project)
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_position_sweep)
         self._launch(_to_detection, 1, [self._cursor], [self._progress.status.iteration])
         step, of_constraints, separation = self._step, self._of_constraints, self._response.separation
         self._adjoin(
             make_constraints,
             self._constraint_count,
-            [self._motion, self._vertices, step.constraints, self._progress, step.record, self._cursor, separation],
-            [of_constraints.weights, of_constraints.normal, of_constraints.separation, of_constraints.approach],
+            [
+                self._motion,
+                self._vertices,
+                self._planes,
+                step.constraints,
+                self._progress,
+                step.record,
+                self._cursor,
+                separation,
+            ],
+            [
+                of_constraints.weights,
+                of_constraints.normal,
+                of_constraints.separation,
+                of_constraints.friction,
+                of_constraints.approach,
+            ],
         )
         self._launch(_end_iteration, 1, [self._cursor], [self._more_iterations])
 
     def _through_position_sweep(self):
         """Goes back through a sweep on positions."""
-        constraints, of_constraints = self._constraints, self._of_constraints
-        self._restore_multipliers(constraints.position_multiplier, self._vertices.particle_delta_x)
+        constraints, of_constraints, vertices = self._constraints, self._of_constraints, self._vertices
+        multiplier, sums = constraints.position_multiplier, vertices.particle_delta_x
+        self._restore_multipliers(multiplier, sums, self._motion.x1, vertices.bodies.delta_x)
         self._restore(_restore_positions)
+        self._bodies.restore_positions()
         self._adjoin(
             change_position_multipliers,
             self._constraint_count,
-            [self._motion, self._vertices, constraints, self._progress, self._step.record, self._cursor],
-            [of_constraints.position_multiplier, of_constraints.previous_multiplier, self._gradients.x1],
+            [self._motion, vertices, constraints, self._progress, self._step.record, self._cursor],
+            [of_constraints.position_multiplier, of_constraints.previous_multiplier],
+            [self._gradients.x1, self._bodies.shift],
         )
-        self._vertices.active.zero_()
+        vertices.active.zero_()
+        self._bodies.take_projected_positions()
 
     def _through_truncation(self):
         """Goes back through the truncation of paths."""
-        motion, vertices, step = self._motion, self._vertices, self._step
+        motion, vertices, step, planes = self._motion, self._vertices, self._step, self._planes
         truncations = len(step.record.vertex)
         inputs = [vertices, self._gradients, step.record, self._cursor]
         self._launch(_restore_paths, truncations, inputs, self._of_truncations)
-        inputs = [motion, vertices, step.planes, step.record, self._cursor, step.dt]
+        self._bodies.restore_paths(self._cursor)
+        inputs = [motion, vertices, planes, step.record, self._cursor, step.dt]
         self._adjoin(truncate_paths, truncations, inputs, self._of_truncations)
+        self._bodies.through_truncation(self._cursor, planes)
 
     def _restore(self, kernel):
         """Restores positions or velocities as they were before a sweep."""
         inputs = [self._motion, self._vertices, self._gradients, self._cursor, self._more_sweeps]
         self._launch(kernel, len(self._motion.x0), inputs)
 
-    def _restore_multipliers(self, multiplier, sums):
+    def _restore_multipliers(self, multiplier, sums, x, body_sums):
         inputs = [self._motion, self._vertices, self._constraints, self._step.record, self._cursor, multiplier]
-        self._launch(_restore_multipliers, self._constraint_count, inputs, [sums])
+        self._launch(_restore_multipliers, self._constraint_count, [*inputs, sums, x, body_sums])
 
     def _launch(self, kernel, dim, inputs, outputs=()):
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
 
-    def _adjoin(self, kernel, dim, inputs, of_outputs):
+    def _adjoin(self, kernel, dim, inputs, of_outputs, of_changes=()):
         """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
-        The adjoint does not read or write outputs, so their gradients stand in for them, except for the changes of
-        vertices, which functions add to.
+        ``of_changes`` are those with respect to changes of vertices and of bodies, which functions add to.
         """
-        gradients = self._gradients
-        added_to = gradients.x1, gradients.velocity_change
-        outputs = [self._vertex_changes if any(of is x for x in added_to) else of for of in of_outputs]
-        of_inputs = [value._cls() if hasattr(value, "_cls") else None for value in inputs]
-        wp.launch(
-            kernel,
-            dim,
-            inputs=inputs,
-            outputs=outputs,
-            adj_inputs=of_inputs,
-            adj_outputs=of_outputs,
-            adjoint=True,
-            device=self._device,
-        )
+        outputs = [*of_outputs, *((self._vertex_changes, self._bodies.changes) if of_changes else ())]
+        launch_adjoint(kernel, dim, inputs, outputs, [*of_outputs, *of_changes], self._device)

@@ -11,6 +11,7 @@ from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import Impact
+from .bodies import body_change, sagitta
 from .angular_momentum import HELD, MASS, MOMENTS, Moments, acts, change_by_turn, is_held, moments, torque_of, turns
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import (
@@ -20,6 +21,8 @@ from .constraints import (
     VERTEX_FACE_CONTACT,
     Contacts,
     approach_of,
+    MOST_SAGITTA,
+    contact_friction,
     contact_vertices,
     contact_weights,
     feasible,
@@ -53,7 +56,9 @@ __all__ = [
     "entry_of",
     "initialize_multipliers",
     "make_constraints",
+    "torque_and_moments",
     "truncate_paths",
+    "truncation_time",
     "turn_velocities",
 ]
 
@@ -75,12 +80,29 @@ _ONE = wp.constant(wp.float64(1.0))
 
 
 @wp.func
-def _add_change(motion: Motion, constraints: Constraints, i: int, change: wp.vec3d, vertex_changes: wp.array[wp.vec3]):
-    """Adds what the change of a multiplier does to its vertices, as :func:`.projection.add_delta` does in integers."""
+def _add_change(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    change: wp.vec3d,
+    x: wp.array[wp.vec3],
+    vertex_changes: wp.array[wp.vec3],
+    body_changes: wp.array[wp.spatial_vectord],
+):
+    """Adds what the change of a multiplier does to its vertices and bodies, at positions ``x`` of vertices.
+
+    :func:`.projection.add_delta` and :func:`.bodies.add_body_delta` do it in integers.
+    """
     for j in range(4):
         vertex = constraints.vertices[i][j]
         share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
         wp.atomic_add(vertex_changes, vertex, to_single(share * change))
+    if motion.bodies.of_vertex:
+        for side in range(2):
+            body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
+            if body >= 0:
+                wp.atomic_add(body_changes, body, wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]))
 
 
 @wp.func
@@ -112,6 +134,7 @@ def change_position_multipliers(
     multiplier_changes: wp.array[wp.vec3d],
     previous_changes: wp.array[wp.vec3d],
     vertex_changes: wp.array[wp.vec3],
+    body_changes: wp.array[wp.spatial_vectord],
 ):
     """Computes what a sweep on positions changes, see :func:`.projection.project_positions`."""
     entry = entry_of(record, cursor.current_sweep[0], wp.tid())
@@ -126,7 +149,7 @@ def change_position_multipliers(
     change = new - constraints.position_multiplier[i]
     multiplier_changes[i] = change
     previous_changes[i] = multiplier - previous
-    _add_change(motion, constraints, i, change, vertex_changes)
+    _add_change(motion, vertices, constraints, i, change, motion.x1, vertex_changes, body_changes)
 
 
 @wp.kernel
@@ -137,11 +160,12 @@ def change_velocity_multipliers(
     constraints: Constraints,
     record: StepRecord,
     cursor: Cursor,
-    restitution: wp.float64,
+    restitution: wp.array[float],
     # out
     multiplier_changes: wp.array[wp.vec3d],
     previous_changes: wp.array[wp.vec3d],
     vertex_changes: wp.array[wp.vec3],
+    body_changes: wp.array[wp.spatial_vectord],
 ):
     """Computes what a sweep on velocities changes, see :func:`.projection.project_velocities`."""
     entry = entry_of(record, cursor.current_sweep[0], wp.tid())
@@ -154,19 +178,21 @@ def change_velocity_multipliers(
     change = new - constraints.velocity_multiplier[i]
     multiplier_changes[i] = change
     previous_changes[i] = multiplier - previous
-    _add_change(motion, constraints, i, change, vertex_changes)
+    _add_change(motion, vertices, constraints, i, change, vertices.x1, vertex_changes, body_changes)
 
 
 @wp.kernel
 def initialize_multipliers(
     # in
     motion: Motion,
+    vertices: Vertices,
     constraints: Constraints,
     dt: wp.float64,
     # out
     velocity_multipliers: wp.array[wp.vec3d],
     previous_multipliers: wp.array[wp.vec3d],
     vertex_changes: wp.array[wp.vec3],
+    body_changes: wp.array[wp.spatial_vectord],
 ):
     """Computes the initial velocity multipliers, see :func:`.projection.initialize_velocity_multipliers`."""
     i = wp.tid()
@@ -174,7 +200,7 @@ def initialize_multipliers(
         first = initial_velocity_multiplier(constraints, i, dt)
         velocity_multipliers[i] = first
         previous_multipliers[i] = first
-        _add_change(motion, constraints, i, first, vertex_changes)
+        _add_change(motion, vertices, constraints, i, first, vertices.x1, vertex_changes, body_changes)
 
 
 @wp.kernel
@@ -202,20 +228,9 @@ def add_moments(motion: Motion, vertices: Vertices, totals: wp.array2d[wp.float6
             wp.atomic_add(totals, motion.world[vertex], MASS + i, added[i])
 
 
-@wp.kernel
-def turn_velocities(
-    # in
-    motion: Motion,
-    vertices: Vertices,
-    totals: wp.array2d[wp.float64],
-    # out
-    changes: wp.array[wp.vec3],
-):
-    """Computes what the turn of each world changes, see :func:`.angular_momentum.turn_vertices`."""
-    vertex = wp.tid()
-    world = motion.world[vertex]
-    if not turns(motion, vertices, vertex) or totals[world, HELD] != _ZERO:
-        return
+@wp.func
+def torque_and_moments(totals: wp.array2d[wp.float64], world: int):
+    """Returns the torque on a world and its moments."""
     torque = wp.vec3d(totals[world, 0], totals[world, 1], totals[world, 2])
     total = Moments(
         totals[world, MASS],
@@ -230,11 +245,29 @@ def turn_velocities(
         totals[world, MASS + 9],
         totals[world, MASS + 10],
     )
+    return torque, total
+
+
+@wp.kernel
+def turn_velocities(
+    # in
+    motion: Motion,
+    vertices: Vertices,
+    totals: wp.array2d[wp.float64],
+    # out
+    changes: wp.array[wp.vec3],
+):
+    """Computes what the turn of each world changes, see :func:`.angular_momentum.turn_vertices`."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if not turns(motion, vertices, vertex) or totals[world, HELD] != _ZERO:
+        return
+    torque, total = torque_and_moments(totals, world)
     changes[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
 
 
 @wp.func
-def _impact(
+def impact_of(
     motion: Motion,
     vertices: Vertices,
     corners: wp.vec4i,
@@ -271,6 +304,7 @@ def make_constraints(
     # in
     motion: Motion,
     vertices: Vertices,
+    planes: MovingPlanes,
     constraints: Constraints,
     progress: Progress,
     record: StepRecord,
@@ -280,6 +314,7 @@ def make_constraints(
     weights: wp.array[wp.vec4d],
     normals: wp.array[wp.vec3d],
     separations: wp.array[wp.float64],
+    frictions: wp.array[float],
     approaches: wp.array[wp.float64],
 ):
     """Computes the constraints that an iteration added, from contacts and proximities.
@@ -297,18 +332,27 @@ def make_constraints(
     weight = constraints.weights[i]
     normal = constraints.normal[i]
     separation = constraints.separation[i]
+    friction = float(0.0)
+    if kind == PLANE_CONTACT:
+        plane = planes.end[constraints.plane[i]]
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        separation = plane[3] + widened(least, progress)
+        friction = contact_friction(motion.friction[corners[0]], planes.friction[constraints.plane[i]])
+    else:
+        friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     if kind < PLANE_CONTACT:
         edges = wp.where(kind == EDGE_EDGE_CONTACT, 1, 0)
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
         if edges == 1:
             coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
         within_tolerance = constraints.within_tolerance[i]
-        impact = _impact(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
+        impact = impact_of(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
         weight = contact_weights(edges, impact.coordinates)
         normal = impact.normal
+        separation = widened(least, progress)
         if constraints.slow[i] == 1:
-            target = widened(least, progress)
-            separation = feasible_in_contact(motion, corners, weight, normal, target, least)
+            separation = feasible_in_contact(motion, corners, weight, normal, separation, least)
+        separation += sagitta(motion, vertices, corners, MOST_SAGITTA * least)
     elif kind > PLANE_CONTACT:
         weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
         distance = wp.length(between)
@@ -317,7 +361,37 @@ def make_constraints(
     weights[i] = weight
     normals[i] = normal
     separations[i] = separation
+    frictions[i] = friction
     approaches[i] = approach_of(motion, vertices, corners, weight, normal, separation)
+
+
+@wp.func
+def truncation_time(
+    motion: Motion, vertices: Vertices, planes: MovingPlanes, record: StepRecord, entry: int
+) -> wp.float64:
+    """Returns the time of the contact that a path was truncated before; 0 if it was frozen."""
+    kind = record.kind[entry]
+    corners = record.contact[entry]
+    toi = _ZERO
+    if kind == PLANE_CONTACT:
+        vertex = corners[0]
+        plane = corners[1]
+        before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
+        after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
+        toi = time_of_entry(before, after)
+    elif kind != NO_CONTACT:
+        impact = impact_of(
+            motion,
+            vertices,
+            corners,
+            kind,
+            record.within_tolerance[entry],
+            record.toi[entry],
+            record.coordinates[entry],
+            record.normal[entry],
+        )
+        toi = impact.toi
+    return toi
 
 
 @wp.kernel
@@ -339,25 +413,9 @@ def truncate_paths(
     if entry >= record.truncation_offsets[iteration + 1]:
         return
     vertex = record.vertex[entry]
-    kind = record.kind[entry]
-    toi = _ZERO
-    if kind == PLANE_CONTACT:
-        plane = record.contact[entry][1]
-        before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
-        after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
-        toi = time_of_entry(before, after)
-    elif kind != NO_CONTACT:
-        corners = record.contact[entry]
-        toi = _impact(
-            motion,
-            vertices,
-            corners,
-            kind,
-            record.within_tolerance[entry],
-            record.toi[entry],
-            record.coordinates[entry],
-            record.normal[entry],
-        ).toi
+    if vertex < 0:
+        return
+    toi = truncation_time(motion, vertices, planes, record, entry)
     x0 = to_double(motion.x0[vertex])
     path = truncated_path(x0, to_double(vertices.x1[vertex]), toi)
     end[entry] = to_single(x0 + path)
@@ -373,7 +431,7 @@ def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: in
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]
-    impact = _impact(
+    impact = impact_of(
         motion, vertices, corners, kind, contacts.within_tolerance[i], contacts.toi[i], at, contacts.normal[i]
     )
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)

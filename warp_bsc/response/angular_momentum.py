@@ -19,6 +19,9 @@ __all__ = [
     "SUMS",
     "Moments",
     "acts",
+    "body_change_by_turn",
+    "body_moments",
+    "body_turns",
     "change_by_turn",
     "is_held",
     "moments",
@@ -70,7 +73,7 @@ def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
 
 
 @wp.func
-def _body_turns(motion: Motion, vertices: Vertices, body: int) -> bool:
+def body_turns(motion: Motion, vertices: Vertices, body: int) -> bool:
     """Returns whether a body collided, and is free to turn."""
     outcome = vertices.bodies.outcome[body]
     return motion.bodies.inverse_mass[body] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
@@ -111,7 +114,7 @@ def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int
         if motion.bodies.of_vertex:
             body = motion.bodies.of_vertex[corners[j]]
             if body >= 0:
-                free = _body_turns(motion, vertices, body)
+                free = body_turns(motion, vertices, body)
         held = held or (constraints.weights[i][j] != _ZERO and not free)
     return held
 
@@ -189,13 +192,9 @@ def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int
     _add(sums, world, added)
 
 
-@wp.kernel(**_KERNEL)
-def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
-    """Sums the moments of the bodies that collided, and the torques by changes of their poses."""
-    body = wp.tid()
-    world = wp.max(motion.bodies.world[body], 0)
-    if not _body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
-        return
+@wp.func
+def body_moments(motion: Motion, vertices: Vertices, body: int):
+    """Returns the torque by the change of the pose of a body, and what the body adds to the moments of its world."""
     mass = wp.float64(motion.bodies.mass[body])
     x = vertices.bodies.centre[body]
     inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
@@ -208,16 +207,35 @@ def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int
     moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
     torque = mass * wp.cross(moved, linear)
     torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
+    total = Moments(
+        mass,
+        mass * x[0],
+        mass * x[1],
+        mass * x[2],
+        mass * x[0] * x[0] + half - inertia[0, 0],
+        mass * x[1] * x[1] + half - inertia[1, 1],
+        mass * x[2] * x[2] + half - inertia[2, 2],
+        mass * x[1] * x[2] - inertia[1, 2],
+        mass * x[2] * x[0] - inertia[2, 0],
+        mass * x[0] * x[1] - inertia[0, 1],
+        mass * wp.length_sq(change) + wp.dot(turn, inertia * turn),
+    )
+    return torque, total
+
+
+@wp.kernel(**_KERNEL)
+def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the bodies that collided, and the torques by changes of their poses."""
+    body = wp.tid()
+    world = wp.max(motion.bodies.world[body], 0)
+    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+        return
+    torque, total = body_moments(motion, vertices, body)
     added = _Sums()
     for axis in range(3):
         added[axis] = _units(torque[axis])
-        added[MASS + 1 + axis] = _units(mass * x[axis])
-        added[MASS + 4 + axis] = _units(mass * x[axis] * x[axis] + half - inertia[axis, axis])
-    added[MASS] = _units(mass)
-    added[MASS + 7] = _units(mass * x[1] * x[2] - inertia[1, 2])
-    added[MASS + 8] = _units(mass * x[2] * x[0] - inertia[2, 0])
-    added[MASS + 9] = _units(mass * x[0] * x[1] - inertia[0, 1])
-    added[MASS + 10] = _units(mass * wp.length_sq(change) + wp.dot(turn, inertia * turn))
+    for i in range(MOMENTS):
+        added[MASS + i] = _units(total[i])
     _add(sums, world, added)
 
 
@@ -261,6 +279,13 @@ def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
+def body_change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
+    """Returns the changes of the linear and angular velocity of a body with its centre of mass at ``x``."""
+    turn, centre = _turn_of(torque, total)
+    return wp.cross(turn, x - centre), turn
+
+
+@wp.func
 def _totals(sums: wp.array2d[wp.int64], world: int):
     """Returns the torque on a world and its moments."""
     torque = wp.vec3d()
@@ -289,11 +314,10 @@ def turn_bodies(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
     """Turns the bodies that collided as :func:`turn_vertices` does the vertices of their world."""
     body = wp.tid()
     world = wp.max(motion.bodies.world[body], 0)
-    if not _body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
         return
     torque, total = _totals(sums, world)
-    turn, centre = _turn_of(torque, total)
-    change = wp.cross(turn, vertices.bodies.centre[body] - centre)
+    change, turn = body_change_by_turn(torque, total, vertices.bodies.centre[body])
     velocity = vertices.bodies.velocity[body]
     linear = to_double(wp.spatial_top(velocity)) + change
     angular = to_double(wp.spatial_bottom(velocity)) + turn

@@ -71,6 +71,7 @@ class MovedBodies:
     delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
     delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
     share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see bodies.find_body_shares
+    first_contact: wp.array[wp.int64]  # of its vertices, see bodies.first_contact_of_body
     loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
 
@@ -118,6 +119,7 @@ class Constraints:
     separation: wp.array[wp.float64]  # along the normal [m]
     friction: wp.array[float]  # coefficient
     kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
+    plane: wp.array[int]  # of a contact with a plane
     within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
     toi: wp.array[wp.float64]  # time of impact
     approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]

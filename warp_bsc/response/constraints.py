@@ -15,6 +15,7 @@ __all__ = [
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
     "MAX_TRUNCATIONS",
+    "MOST_SAGITTA",
     "NO_CONSTRAINT",
     "PLANE_CONTACT",
     "TIME_UNITS",
@@ -24,6 +25,7 @@ __all__ = [
     "Contacts",
     "add_constraint",
     "approach_of",
+    "contact_friction",
     "contact_vertices",
     "contact_weights",
     "count_contact",
@@ -64,6 +66,8 @@ VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, PLANE_CONTACT, VERTEX_FACE_PROXIMITY, ED
 
 NO_CONSTRAINT = wp.constant(3)
 """In place of the kind of a contact that has no constraint, in the key of a vertex's first contact."""
+MOST_SAGITTA = wp.constant(wp.float64(4.0))
+"""Most that the turn of a body adds to the separation of a contact, in separations."""
 TOUCH = wp.constant(wp.float64(1e-100))
 """Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities."""
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
@@ -275,6 +279,15 @@ def feasible_in_contact(
 
 
 @wp.func
+def contact_friction(a: float, b: float) -> float:
+    """Returns the coefficient of friction of a contact from those of its two sides: their geometric mean."""
+    product = a * b
+    if product > 0.0:  # at 0 there is no derivative
+        return wp.sqrt(product)
+    return 0.0
+
+
+@wp.func
 def widened(separation: wp.float64, progress: Progress) -> wp.float64:
     """Returns the separation of constraints that are added in this iteration."""
     return separation * wp.min(wp.pow(_WIDENING, wp.float64(progress.status.iteration[0])), _WIDEST)
@@ -328,8 +341,8 @@ def add_constraint(
     within_tolerance: bool,
     toi: wp.float64,
     multiplier: wp.vec3d,
-):
-    """Adds a constraint with a position multiplier if it fits; counts it in any case."""
+) -> int:
+    """Adds a constraint with a position multiplier if it fits; counts it in any case, and returns its place."""
     i = take_place(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = corners
@@ -346,3 +359,4 @@ def add_constraint(
         constraints.velocity_multiplier[i] = wp.vec3d()
         constraints.previous_multiplier[i] = wp.vec3d()
         constraints.last_sweep[i] = -2
+    return i

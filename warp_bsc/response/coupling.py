@@ -342,7 +342,7 @@ class Coupling:
         self._step, self._solver = step, solver
         self._mesh, self._motion, self._response = mesh, motion, response
         self._moves_bodies = moves_bodies
-        self._substep = ModelMotion(mesh, motion.vertices.friction, motion.planes.friction, moves_bodies=moves_bodies)
+        self._substep = ModelMotion(mesh, motion.friction, moves_bodies=moves_bodies)
         model, device = mesh.model, mesh.device
         self._start, self._in, self._out = model.state(), model.state(), model.state()
         self._histories: dict[str, wp.array] = {}  # copies of arrays of the inner solver

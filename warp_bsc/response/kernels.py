@@ -5,11 +5,12 @@ import warp as wp
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.signs import FREE
-from .bodies import sagitta
+from .bodies import first_contact_of_body, sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
     EDGE_EDGE_PROXIMITY,
+    MOST_SAGITTA,
     NO_CONSTRAINT,
     PLANE_CONTACT,
     TIME_UNITS,
@@ -18,6 +19,7 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     Contacts,
     add_constraint,
+    contact_friction,
     contact_vertices,
     contact_weights,
     count_contact,
@@ -46,13 +48,12 @@ __all__ = [
     "divide_near_pairs",
     "drop_if_full",
     "freeze_undetected",
+    "record_body_truncations",
     "record_offsets",
     "truncate_vertices",
 ]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
-_MOST_SAGITTA = wp.constant(wp.float64(4.0))
-"""Most that the turn of a body adds to the separation of a contact, in separations."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -161,11 +162,11 @@ def _collect_contact(
         if iteration == 0 and contacts.edges == 1:
             if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
                 return  # the next detection finds it, if it is still there
-    friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
+    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     target = widened(separation, progress)
     if slow == 1:
         target = feasible_in_contact(motion, corners, weights, normal, target, separation)
-    target += sagitta(motion, vertices, corners, _MOST_SAGITTA * separation)
+    target += sagitta(motion, vertices, corners, MOST_SAGITTA * separation)
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     add_constraint(
         motion,
@@ -302,19 +303,40 @@ def decide(
 
 @wp.func
 def _record_truncation(
-    vertices: Vertices, record: StepRecord, vertex: int, cuts: bool, time: wp.float64, first: int, contacts: Contacts
+    vertices: Vertices,
+    record: StepRecord,
+    vertex: int,
+    body: int,
+    cuts: bool,
+    key: wp.int64,
+    vertex_face: Contacts,
+    edge_edge: Contacts,
 ):
-    """Records the end of a path before it is truncated before its first contact, or before the vertex is frozen."""
+    """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
     entry = wp.atomic_add(record.counts.truncations, 0, 1)
     if entry >= record.vertex.shape[0]:
         return
-    record.vertex[entry] = vertex
+    record.vertex[entry] = wp.where(body < 0, vertex, -1)
     record.end[entry] = vertices.x1[vertex]
+    record.body[entry] = body
+    if body >= 0:
+        record.pose[entry] = vertices.bodies.pose[body]
+    first = int(key & wp.int64(0xFFFFFFFF))
+    if first & 3 == EDGE_EDGE_CONTACT:
+        _record_contact(record, entry, vertex, cuts, key, edge_edge)
+    else:
+        _record_contact(record, entry, vertex, cuts, key, vertex_face)
+
+
+@wp.func
+def _record_contact(record: StepRecord, entry: int, vertex: int, cuts: bool, key: wp.int64, contacts: Contacts):
+    """Records the contact that a path is truncated before."""
+    first = int(key & wp.int64(0xFFFFFFFF))
     kind = wp.where(cuts, first & 3, NO_CONTACT)
     i = first >> 2
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = time
+    record.toi[entry] = wp.float64(key >> wp.int64(32)) / TIME_UNITS
     if kind != PLANE_CONTACT and kind != NO_CONTACT:
         record.contact[entry] = contact_vertices(contacts, i)
         record.within_tolerance[entry] = contacts.within_tolerance[i]
@@ -364,11 +386,7 @@ def truncate_vertices(
     time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
     cuts = progress.status.iteration[0] <= progress.max_iterations + progress.max_truncations
     if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
-        first = int(key & wp.int64(0xFFFFFFFF))
-        if first & 3 == EDGE_EDGE_CONTACT:
-            _record_truncation(vertices, record, vertex, cuts, time, first, edge_edge)
-        else:
-            _record_truncation(vertices, record, vertex, cuts, time, first, vertex_face)
+        _record_truncation(vertices, record, vertex, -1, cuts, key, vertex_face, edge_edge)
     outcome = vertices.outcome[vertex]
     if cuts:
         x0 = motion.x0[vertex]
@@ -399,6 +417,24 @@ def truncate_vertices(
         vertices.velocity[vertex] = wp.vec3()
         vertices.outcome[vertex] = outcome | FROZEN
         wp.atomic_add(progress.status.newly_frozen, 0, 1)
+
+
+@wp.kernel(**_KERNEL)
+def record_body_truncations(
+    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: Contacts, edge_edge: Contacts
+):
+    """Records the pose of each body whose path is to be truncated before the first contact of its vertices."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    key = vertices.first_contact[vertex]
+    if key == NEVER:
+        return
+    vertices.first_contact[vertex] = NEVER
+    body = motion.bodies.of_vertex[vertex]
+    if body < 0 or motion.bodies.inverse_mass[body] == 0.0 or vertices.bodies.outcome[body] & FROZEN != 0:
+        return
+    if vertices.bodies.first_contact[body] == first_contact_of_body(key, vertex):
+        cuts = vertices.bodies.share[body] >= wp.int64(0)
+        _record_truncation(vertices, record, vertex, body, cuts, key, vertex_face, edge_edge)
 
 
 @wp.kernel(**_KERNEL)

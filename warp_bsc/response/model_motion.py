@@ -7,6 +7,7 @@ from newton import BodyFlags
 from .bodies import centre_of
 from .buffers import Bodies, Motion
 from .constraints import to_double, to_single
+from .friction import Friction
 from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
 
@@ -145,13 +146,16 @@ class ModelMotion:
     Attributes:
         vertices: The vertices, :class:`.buffers.Motion`.
         planes: The infinite planes, :class:`.planes.MovingPlanes`.
+        mesh: The mesh.
+        friction: The coefficients of its vertices and planes.
+        moves_bodies: Whether the response can move bodies.
+        keeps_poses: Whether poses of bodies at the start and end are kept: then, or if the model requires gradients.
     """
 
     def __init__(
         self,
         mesh: ModelMesh,
-        friction: wp.array[float],
-        plane_friction: wp.array[float],
+        friction: Friction,
         *,
         moves_bodies: bool = False,
         responds_to_bodies: bool = False,
@@ -160,30 +164,34 @@ class ModelMotion:
 
         Args:
             mesh: The mesh.
-            friction: Coefficients of its vertices; that of a contact is the geometric mean.
-            plane_friction: Coefficients of its planes.
+            friction: The coefficients of its vertices and planes.
             moves_bodies: Whether the response can move bodies.
             responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
         """
-        self._mesh = mesh
+        self.mesh, self.friction = mesh, friction
         self.vertices = vertices = Motion()
         for name in ("x0", "x1", "velocity"):
             setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
         vertices.is_lost = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
-        vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
+        vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction.vertices, mesh.device_world
         self.planes = planes = MovingPlanes()
-        planes.friction, planes.world = plane_friction, mesh.device_planes.world
+        planes.friction, planes.world = friction.planes, mesh.device_planes.world
         for name in ("start", "end"):
-            setattr(planes, name, wp.zeros(len(plane_friction), dtype=wp.vec4d, device=mesh.device))
-        self._size = max(mesh.vertex_count, len(plane_friction))
-        self._moves_bodies = moves_bodies
+            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=mesh.device))
+        self._size = max(mesh.vertex_count, len(friction.planes))
+        self.moves_bodies = moves_bodies
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
+        self.keeps_poses = moves_bodies or bool(mesh.model.requires_grad and mesh.model.body_count)
+        if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
+            for name in ("start", "end"):
+                poses = wp.zeros(mesh.model.body_count, dtype=wp.transform, device=mesh.device)
+                setattr(vertices.bodies, name, poses)
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
-        mesh, bodies = self._mesh, Bodies()
+        mesh, bodies = self.mesh, Bodies()
         model, device = mesh.model, mesh.device
         pairs = np.sort(np.array(list(model.shape_collision_filter_pairs), dtype=np.int64).reshape(-1, 2), axis=1)
         filtered = np.unique(model.shape_count * pairs[:, 0] + pairs[:, 1])
@@ -197,18 +205,16 @@ class ModelMotion:
         bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
         bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
         bodies.inverse_mass = wp.zeros(model.body_count, dtype=float, device=device)
-        for name in ("start", "end"):
-            setattr(bodies, name, wp.zeros(model.body_count, dtype=wp.transform, device=device))
         bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         return bodies
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""
         x0, planes = self.vertices.x0, self.planes.start
-        self._mesh.check_lengths(particle_q, body_q, x0)
+        self.mesh.check_lengths(particle_q, body_q, x0)
         inputs = [self._placement(particle_q, body_q)]
-        wp.launch(_write_start, self._size, inputs=inputs, outputs=[x0, planes], device=self._mesh.device)
-        if self._moves_bodies:
+        wp.launch(_write_start, self._size, inputs=inputs, outputs=[x0, planes], device=self.mesh.device)
+        if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, body_q)
 
     def set_end(
@@ -223,21 +229,23 @@ class ModelMotion:
 
         Velocities of bodies are needed only where the response can move bodies.
         """
-        self._mesh.check_lengths(particle_q, body_q, self.vertices.x1)
-        if self._moves_bodies:
+        self.mesh.check_lengths(particle_q, body_q, self.vertices.x1)
+        if self.moves_bodies:
             self.set_body_ends(body_q, body_qd)
+        elif self.keeps_poses:
+            wp.copy(self.vertices.bodies.end, body_q)
         inputs = [self._placement(particle_q, body_q), particle_qd, dt]
         outputs = [self.vertices, self.planes.end]
-        wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self._mesh.device)
+        wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
         """Copies the wanted poses and velocities of bodies, but not the positions of their vertices."""
-        model = self._mesh.model
+        model = self.mesh.model
         inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
-        wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self._mesh.device)
+        wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)
 
     def _placement(self, particle_q, body_q):
-        mesh, placement = self._mesh, _Placement()
+        mesh, placement = self.mesh, _Placement()
         placement.particle_q, placement.body_q = particle_q, body_q
         placement.shape_vertex_position = mesh.device_shape_vertices.position
         placement.shape_vertex_body = mesh.device_shape_vertices.body

@@ -7,6 +7,7 @@ from .constraints import (
     PLANE_CONTACT,
     TOUCH,
     add_constraint,
+    contact_friction,
     count_contact,
     is_dividing,
     to_double,
@@ -120,7 +121,7 @@ def collect_penetrations(
             multiplier = TOUCH * normal
         else:
             progress.status.projecting[0] = 1
-        add_constraint(
+        place = add_constraint(
             motion,
             vertices,
             constraints,
@@ -128,10 +129,12 @@ def collect_penetrations(
             wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
             normal,
             plane[3] + widened(separation, progress),
-            wp.sqrt(motion.friction[vertex] * planes.friction[i]),
+            contact_friction(motion.friction[vertex], planes.friction[i]),
             1,
             PLANE_CONTACT,
             True,
             _ZERO,
             multiplier,
         )
+        if place < constraints.plane.shape[0]:
+            constraints.plane[place] = i

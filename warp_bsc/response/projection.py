@@ -62,7 +62,7 @@ _KERNEL = {"enable_backward": False}
 
 @wp.func
 def _excess_speed(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.array[float]
 ) -> wp.float64:
     """Returns the speed at which contact points part less that of restitution [m/s]; negative if violated."""
     normal = constraints.normal[i]
@@ -70,7 +70,7 @@ def _excess_speed(
     corners = constraints.vertices[i]
     wanted = wp.dot(normal, relative(weights, corners, motion.velocity))
     speed = wp.dot(normal, relative(weights, corners, vertices.velocity))
-    return speed - restitution * wp.max(-wanted, _ZERO)
+    return speed - wp.float64(restitution[0]) * wp.max(-wanted, _ZERO)
 
 
 @wp.func
@@ -303,7 +303,7 @@ def position_multiplier_after(
 
 @wp.func
 def velocity_multiplier_after(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.float64
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, restitution: wp.array[float]
 ) -> wp.vec3d:
     """Returns the velocity multiplier of a constraint after a sweep, without momentum."""
     old = constraints.velocity_multiplier[i]
@@ -406,7 +406,7 @@ def activate_velocity_constraints(
     vertices: Vertices,
     constraints: Constraints,
     progress: Progress,
-    restitution: wp.float64,
+    restitution: wp.array[float],
     tolerance: wp.float64,
     dt: wp.float64,
 ):
@@ -441,7 +441,7 @@ def project_velocities(
     constraints: Constraints,
     progress: Progress,
     record: StepRecord,
-    restitution: wp.float64,
+    restitution: wp.array[float],
 ):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep, see :func:`project_positions`."""
     place = wp.tid()

@@ -12,6 +12,7 @@ from .constraints import (
     EDGE_EDGE_PROXIMITY,
     VERTEX_FACE_PROXIMITY,
     add_constraint,
+    contact_friction,
     feasible,
     has_overflowed,
     is_projecting,
@@ -166,7 +167,7 @@ def _collect_proximity(
         return
     if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
-    friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
+    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     target = feasible(separation, distance, separation, path)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     add_constraint(

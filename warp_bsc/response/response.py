@@ -43,6 +43,7 @@ from .kernels import (
     divide_near_pairs,
     drop_if_full,
     freeze_undetected,
+    record_body_truncations,
     record_offsets,
     truncate_vertices,
 )
@@ -126,7 +127,7 @@ class Response:
         constraints: The constraints of the last step, :class:`.buffers.Constraints`.
         progress: The state of the iterations, :class:`.buffers.Progress`.
         separation: Distance that projection moves contacts apart [m].
-        restitution: Share of the approaching velocity that comes back.
+        restitution: Share of the approaching velocity that comes back, array of one float.
         worlds: Number of worlds.
         device: The device.
     """
@@ -136,7 +137,7 @@ class Response:
         mesh: ModelMesh,
         *,
         separation: float,
-        restitution: float,
+        restitution: wp.array[float],
         differentiable: bool,
         moves_bodies: bool = False,
     ):
@@ -145,7 +146,7 @@ class Response:
         Args:
             mesh: The mesh.
             separation: Distance that projection moves contacts apart [m].
-            restitution: Share of the approaching velocity that comes back, in [0, 1].
+            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
             differentiable: Whether all sweeps are made and paths are truncated, not divided, as the adjoint has it:
                 whether a constraint is active would otherwise depend on tiny changes, and results would jump.
             moves_bodies: Whether motions have bodies that can be moved.
@@ -434,7 +435,7 @@ class Response:
         self._record_offsets()
         self._project(self._sweep_positions)
         if self._recorder is not None and not self.device.is_capturing:
-            self._record = self._recorder.reserve_truncations(self._movable)
+            self._record = self._recorder.reserve_truncations(self._movable + self._bodies)
         motion, vertices, dividing = self._motion.vertices, self.vertices, self._dividing
         if not self._differentiable:
             inputs = [motion, vertices, self.constraints, dividing, self.progress, self.separation]
@@ -442,7 +443,9 @@ class Response:
         inputs = [motion, vertices, self.progress, self._record, dividing]
         inputs += [*self._contacts(), dt]
         self._launch_over_particles(truncate_vertices, inputs)
-        self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing)
+        self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing, self._record)
+        if self._recorder is not None:
+            self._launch_over_shape_vertices(record_body_truncations, self._record, *self._contacts())
         self._launch_over_bodies(cut_bodies, self.progress, dt)
         self._launch_over_shape_vertices(place_vertices)
         self._detect(refit=True)

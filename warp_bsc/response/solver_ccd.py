@@ -15,6 +15,7 @@ from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
 from .coupling import Coupling
 from .coupling_hooks import CouplingHooks
+from .friction import Friction
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -193,8 +194,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         solver: SolverBase,
         *,
         separation: float | None = None,
-        friction: float | None = None,
-        restitution: float | None = None,
+        friction: float | wp.array[float] | None = None,
+        restitution: float | wp.array[float] | None = None,
         coupling: int | None = None,
         bodies: bool | None = None,
         lift_speed_limit: bool = True,
@@ -206,9 +207,11 @@ class SolverCCD(SolverBase, CouplingHooks):
             solver: Any Newton solver that moves particles.
             separation: Distance that contacts are moved apart [m]; default: 0.005 of the median edge length.
             friction: Coefficient of particles; default: the model's ``particle_mu``. Shapes have that of their
-                material, contacts the geometric mean.
+                material, contacts the geometric mean. May be an array of float32, of length 1 or of one for each
+                particle, which each step reads again, and which may require gradients; so are then the coefficients of
+                shapes, as with ``requires_grad``. Negative values count as 0.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
-                ``soft_contact_restitution``.
+                ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none.
             bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
@@ -247,12 +250,12 @@ class SolverCCD(SolverBase, CouplingHooks):
             for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
+        self._reads_friction = model.requires_grad or isinstance(friction, wp.array)
+        most = float(np.finfo(np.float32).max)
         friction = model.particle_mu if friction is None else friction
+        friction = self._coefficients("friction", friction, most, lengths=(1, model.particle_count))
         restitution = model.soft_contact_restitution if restitution is None else restitution
-        if respond and not 0.0 <= friction <= float(np.finfo(np.float32).max):
-            raise ValueError(f"friction must be at least 0, and finite in single precision, not {friction!r}")
-        if respond and not 0.0 <= restitution <= 1.0:
-            raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
+        restitution = self._coefficients("restitution", restitution, 1.0, lengths=(1,))
         if coupling is not None and coupling < 2:
             raise ValueError(f"coupling takes at least 2 substeps, not {coupling!r}")
         if coupling is not None and model.requires_grad:
@@ -264,12 +267,12 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"separation must be more than 0, not {separation!r}")
         self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(
-            mesh, *self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
+            mesh, self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
         )
         self._response = Response(
             mesh,
             separation=float(separation),
-            restitution=float(restitution),
+            restitution=restitution,
             differentiable=model.requires_grad,
             moves_bodies=self._moves_bodies,
         )
@@ -289,10 +292,6 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _find_moves_bodies(self, bodies):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
         model, mesh, solver = self.model, self.mesh, self.solver
-        if bodies is None and model.requires_grad:
-            return False
-        if bodies and model.requires_grad:
-            raise NotImplementedError("steps that move bodies carry no gradients: omit bodies, or requires_grad")
         if not self.respond or bodies is False or not model.body_count:
             return False
         if bodies is None:
@@ -304,19 +303,33 @@ class SolverCCD(SolverBase, CouplingHooks):
         kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
         return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
 
-    def _friction(self, friction):
-        """Returns the coefficients of vertices and of infinite planes, on the device; zeros without a response."""
+    def _coefficients(self, name, value, most, lengths):
+        """Returns an argument that is a coefficient, or an array of some, as an array; checks it for the response."""
+        if not isinstance(value, wp.array):
+            values = np.full(1, value)
+        elif value.dtype is not wp.float32 or value.ndim != 1 or len(value) not in lengths:
+            allowed = " or ".join(map(str, dict.fromkeys(lengths)))
+            raise ValueError(f"{name} must be a number, or an array of float32 of length {allowed}")
+        else:
+            values = value.numpy()
+        if self.respond and not ((values >= 0.0) & (values <= most)).all():
+            limits = "in [0, 1]" if most == 1.0 else "at least 0, and finite in single precision"
+            raise ValueError(f"{name} must be {limits}, not {value!r}")
+        if isinstance(value, wp.array):
+            return value
+        return wp.array(values, dtype=float, device=self.model.device)
+
+    def _friction(self, of_particles):
+        """Returns the coefficients of vertices and of infinite planes."""
         model, mesh = self.model, self.mesh
-        shape_friction = np.zeros(model.shape_count)
-        if self.respond and model.shape_material_mu is not None:
-            shape_friction = model.shape_material_mu.numpy()
-        for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
-            if not shape_friction[shape] >= 0.0:
-                raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {shape_friction[shape]}")
-        vertex_friction = np.full(mesh.vertex_count, friction if self.respond else 0.0, dtype=np.float32)
-        vertex_friction[model.particle_count :] = shape_friction[mesh.shape_vertices.shape]
-        coefficients = vertex_friction, shape_friction[mesh.planes.shape]
-        return [wp.array(values, dtype=float, device=mesh.device) for values in coefficients]
+        of_shapes = model.shape_material_mu
+        if of_shapes is None:
+            of_shapes = wp.zeros(0, dtype=float, device=mesh.device)
+        values = of_shapes.numpy()
+        for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape) if self.respond else ():
+            if not values[shape] >= 0.0:
+                raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
+        return Friction(mesh, of_particles, of_shapes)
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
@@ -399,6 +412,13 @@ class SolverCCD(SolverBase, CouplingHooks):
             return
         recorded = None
         arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
+        if self.model.body_count:
+            arrays += [state_in.body_q, end.body_q, end.body_qd]
+        model, motion = self.model, self._motion
+        read = [motion.friction.of_particles, motion.friction.of_shapes, self._response.restitution]
+        read += [model.particle_inv_mass, model.body_inv_mass, model.body_inv_inertia, model.body_mass]
+        read += [model.body_inertia, model.body_com]
+        read = [array for array in read if array is not None and len(array) and array.requires_grad]
 
         def forward():
             nonlocal recorded
@@ -414,7 +434,7 @@ class SolverCCD(SolverBase, CouplingHooks):
                 StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
 
         run_on_host(forward, device)
-        tape.record_func(lambda: run_on_host(backward, device), arrays)
+        tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
     def _set_end(self, end, dt):
         self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
@@ -422,6 +442,8 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _resolve(self, end, dt, record=None):
         """Resolves the motion from the start of the step to a state, and changes it."""
         with self._timed():
+            if self._reads_friction:
+                self._motion.friction.read()
             self._set_end(end, dt)
             resolution = self._response.resolve(self._motion, dt, record)
             self._finish(resolution, end)
@@ -430,6 +452,8 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _couple(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
+            if self._reads_friction:
+                self._motion.friction.read()
             self._set_end(_arrays(state), dt)
             assert self._coupling is not None
             resolution = self._coupling.resolve(state, control, contacts, dt, self._is_coupled)

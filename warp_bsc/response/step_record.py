@@ -26,7 +26,7 @@ MAX_OFFSETS = wp.constant(64)
 
 OFFSETS = "sweep_offsets", "constraint_offsets", "truncation_offsets"
 PER_ENTRY = "constraint", "multiplier", "previous_multiplier", "momentum"
-PER_TRUNCATION = "vertex", "end", "contact", "kind", "within_tolerance", "toi", "coordinates", "normal"
+PER_TRUNCATION = "vertex", "end", "body", "pose", "contact", "kind", "within_tolerance", "toi", "coordinates", "normal"
 """Arrays of a record that have an element for each iteration, each entry, and each truncated path."""
 
 
@@ -54,8 +54,10 @@ class StepRecord:
     sweep_offsets: wp.array[int]  # sweeps at the beginning of an iteration
     constraint_offsets: wp.array[int]  # constraints at the beginning of an iteration
     truncation_offsets: wp.array[int]  # truncated paths at the beginning of an iteration
-    vertex: wp.array[int]  # of a truncated path
+    vertex: wp.array[int]  # of a truncated path, -1 if it is that of a body
     end: wp.array[wp.vec3]  # of the path before it was truncated [m]
+    body: wp.array[int]  # of a truncated path, -1 if it is that of a vertex
+    pose: wp.array[wp.transform]  # of the body before its path was truncated
     kind: wp.array[int]  # of the contact that it was truncated before, or NO_CONTACT
     contact: wp.array[wp.vec4i]  # vertices of that contact; or the vertex and a plane
     within_tolerance: wp.array[wp.bool]
