@@ -329,12 +329,6 @@ def test_arguments_that_do_not_go_together(device):
     model = ball_and_sheet(device, fixed=True, n=2)
     with pytest.raises(ValueError, match="bodies"):
         bsc.SolverCCD(SOLVERS["vbd"](model), bodies=True, respond=False)
-    builder = newton.ModelBuilder()
-    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
-    add_body(builder, "sphere", (0.0, 0.0, 0.2), radius=0.1)
-    differentiable = builder.finalize(device=device, requires_grad=True)
-    with pytest.raises(NotImplementedError, match="gradients"):
-        bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), bodies=True)
 
 
 def boxes(device, *, velocities, positions, static=False):

@@ -11,17 +11,17 @@ from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import Impact
-from .bodies import body_change, sagitta
 from .angular_momentum import HELD, MASS, MOMENTS, Moments, acts, change_by_turn, is_held, moments, torque_of, turns
+from .bodies import body_change, sagitta
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
     EDGE_EDGE_PROXIMITY,
+    MOST_SAGITTA,
     PLANE_CONTACT,
     VERTEX_FACE_CONTACT,
     Contacts,
     approach_of,
-    MOST_SAGITTA,
     contact_friction,
     contact_vertices,
     contact_weights,
@@ -102,7 +102,9 @@ def _add_change(
         for side in range(2):
             body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
             if body >= 0:
-                wp.atomic_add(body_changes, body, wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2]))
+                wp.atomic_add(
+                    body_changes, body, wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+                )
 
 
 @wp.func

@@ -46,8 +46,8 @@ __all__ = [
     "place_vertices",
     "pose_between",
     "sagitta",
-    "share_before",
     "set_vertex_velocities",
+    "share_before",
     "sums_of",
     "turn_between",
     "turned_pose",
@@ -384,7 +384,7 @@ def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
 
 @wp.func
 def velocity_on_body(velocity: wp.spatial_vector, arm: wp.vec3d) -> wp.vec3:
-    """Returns the velocity of a point of a body [m/s], from that of the body and the arm from its centre of mass [m]."""
+    """Returns the velocity of a point of a body [m/s], from that of the body and the arm from its centre [m]."""
     turning = wp.cross(to_double(wp.spatial_bottom(velocity)), arm)
     return to_single(to_double(wp.spatial_top(velocity)) + turning)
 

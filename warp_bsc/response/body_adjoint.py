@@ -252,9 +252,7 @@ class BodyAdjoint:
         inverse_masses = model.body_inv_mass.grad
         if inverse_masses is None:
             inverse_masses = wp.zeros_like(model.body_inv_mass)
-        self._launch(
-            finish_bodies, [*inputs, self._step.complete, of_starts, of_ends, of_velocities, inverse_masses]
-        )
+        self._launch(finish_bodies, [*inputs, self._step.complete, of_starts, of_ends, of_velocities, inverse_masses])
 
     def _set_centres(self, poses):
         """Makes given poses those where impulses act."""
@@ -288,6 +286,4 @@ class BodyAdjoint:
 
     def _adjoin_over_vertices(self, kernel, inputs):
         of_outputs = [self._of.vertices]
-        launch_adjoint(
-            kernel, len(self._mesh.shape_vertices.body), inputs, of_outputs, of_outputs, device=self._device
-        )
+        launch_adjoint(kernel, len(self._mesh.shape_vertices.body), inputs, of_outputs, of_outputs, device=self._device)

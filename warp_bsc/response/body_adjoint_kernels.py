@@ -322,9 +322,7 @@ def restore_vertices(motion: Motion, vertices: Vertices, places: bool):
 
 
 @wp.kernel(**_KERNEL)
-def take_vertices(
-    motion: Motion, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3], gradients: BodyGradients
-):
+def take_vertices(motion: Motion, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3], gradients: BodyGradients):
     """Takes the gradients with respect to vertices of bodies, which are to become those with respect to bodies."""
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]

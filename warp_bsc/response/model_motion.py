@@ -173,7 +173,8 @@ class ModelMotion:
         for name in ("x0", "x1", "velocity"):
             setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
         vertices.is_lost = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
-        vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction.vertices, mesh.device_world
+        vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
+        vertices.friction = friction.vertices
         self.planes = planes = MovingPlanes()
         planes.friction, planes.world = friction.planes, mesh.device_planes.world
         for name in ("start", "end"):

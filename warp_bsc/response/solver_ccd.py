@@ -177,8 +177,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     tape then records what the inner solver records.
 
     A step on a :class:`warp.Tape` carries gradients, if the model was finalized with ``requires_grad=True`` and the
-    inner solver is differentiable: from positions and velocities of particles at its end to those at its start, and to
-    those that the inner solver wanted. The set of contacts and the motion of bodies are constants; everything else is
+    inner solver is differentiable: from positions and velocities of particles, poses and velocities of bodies at its
+    end to those that the inner solver wanted, to positions and poses at its start, to ``particle_inv_mass``,
+    ``body_inv_mass``, ``body_inv_inertia``, ``body_mass``, ``body_inertia`` and ``shape_material_mu`` of the model, and
+    to coefficients of friction and restitution that are arrays. The set of contacts is constant; everything else is
     differentiated as it was computed, see :mod:`.adjoint`. With ``requires_grad`` all sweeps are made, so that results
     do not jump.
 
@@ -216,13 +218,13 @@ class SolverCCD(SolverBase, CouplingHooks):
                 against the contacts, see :mod:`.coupling`; None for none.
             bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
                 friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
-                keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) and the model has
-                no ``requires_grad``; contacts between bodies are left to the inner solver, and those that its motion
-                passes are counted, see ``report.body_contacts``. True: bodies are kept apart from each other and from
-                static shapes as well, as their flags, groups and filters of collision say, and certified; this needs an
-                inner solver that reads ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic
-                bodies, bodies without mass, static shapes and infinite planes are never pushed, and bodies are not kept
-                out of infinite planes. Bodies that are all kinematic at construction stay so.
+                keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit); contacts between
+                bodies are left to the inner solver, and those that its motion passes are counted, see
+                ``report.body_contacts``. True: bodies are kept apart from each other and from static shapes as well, as
+                their flags, groups and filters of collision say, and certified; this needs an inner solver that reads
+                ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic bodies, bodies without
+                mass, static shapes and infinite planes are never pushed, and bodies are not kept out of infinite
+                planes. Bodies that are all kinematic at construction stay so.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
@@ -235,7 +237,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
                 argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver, or one that moves bodies, is to be differentiated.
+                solver is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
