@@ -72,6 +72,7 @@ class PaddleSolver(SolverSemiImplicit):
         self.unmoved = model.state()
 
     def step(self, state_in, state_out, control, contacts, dt):
+        """Steps the cloth, and moves the paddles."""
         self.unmoved.particle_q, self.unmoved.particle_qd = state_out.particle_q, state_out.particle_qd
         super().step(state_in, self.unmoved, control, contacts, dt)
         self.elapsed += dt
@@ -183,7 +184,7 @@ class Example:
         self.viewer.end_frame()
 
     def test_final(self):
-        """Checks that all cloths end within two centimetres of the mark; without the stage, that no path has changed."""
+        """Checks that all cloths end within two centimetres of the mark; without the stage, that paths are the same."""
         if self.ccd:
             assert self.distance.max() < 0.02, self.distance
             report = self.solver.report

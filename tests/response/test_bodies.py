@@ -325,6 +325,68 @@ def test_without_bodies_no_kernel_of_bodies_is_launched(device, monkeypatch):
     assert not [key for module, key in launched if "warp_bsc" in module and ("bod" in module or "bod" in key)]
 
 
+def box_above_ground(device, *, tilt=0.0, velocity=(0.5, 0.0, 0.0), gravity=9.81, cloth=False):
+    """A box half a millimetre above the ground, or a little more if it is tilted, and cloth that flies at it."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
+    builder.add_ground_plane()
+    add_patch(builder, 6, 0.05, (0.01, 0.02, 0.2 if cloth else 5.0), velocity=(0.0, 0.0, -20.0))
+    builder.particle_mass = [0.05] * builder.particle_count
+    rotation = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.3, 0.2)), tilt)
+    at = wp.transform(wp.vec3(0.0, 0.0, 0.0505 + 0.06 * np.sin(tilt)), rotation)
+    add_body(builder, "box", at, inertia=(2e-3, 2e-3, 2e-3), hx=0.06, hy=0.05, hz=0.05)
+    return finalize(builder, [[*velocity, 0.0, 0.0, 0.0]], device)
+
+
+def lowest_vertex(rollout, state):
+    """Height of the lowest vertex of shapes."""
+    return rollout.vertices(state)[rollout.model.particle_count :, 2].min()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+def test_the_ground_stops_a_box_if_asked(tilt, device):
+    model = box_above_ground(device, tilt=tilt, velocity=(0.5, 0.0, -4.0 * tilt))
+    rollout = Rollout(model, bsc.SolverCCD(free(model), bodies=True, friction=0.5))
+    for _ in range(90):
+        rollout.step()
+        assert rollout.solver.report.certified and lowest_vertex(rollout, rollout.states[0]) > 0.0
+    assert rollout.solver.report.truncated_steps == 0
+    assert lowest_vertex(rollout, rollout.states[0]) < 2e-4
+    assert np.abs(rollout.states[0].body_qd.numpy()).max() < 0.02  # friction has stopped it
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_cloth_pushes_no_box_into_the_ground(tilt, device):
+    """Nor deeper than the inner solver wanted it, whose own contact with the ground may be soft."""
+    model = box_above_ground(device, tilt=tilt, velocity=(0.0, 0.0, 0.0), gravity=0.0, cloth=True)
+    inner, wanted = free(model), []
+    step = inner.step
+
+    def recorded_step(state_in, state_out, *arguments, **options):
+        step(state_in, state_out, *arguments, **options)
+        wanted.append(lowest_vertex(rollout, state_out))
+
+    inner.step = recorded_step
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5))
+    pushed = 0
+    for _ in range(12):
+        before = lowest_vertex(rollout, rollout.states[0])
+        rollout.step()
+        assert rollout.solver.report.certified
+        lowest = lowest_vertex(rollout, rollout.states[0])
+        assert lowest > 0.0 or lowest > min(before, wanted[-1]) - 0.05 * rollout.solver._response.separation
+        pushed += lowest < wanted[-1] - 1e-4
+    assert pushed > 0
+
+
+def test_a_plane_does_not_stop_shapes_that_it_does_not_collide_with(device):
+    model = box_above_ground(device, velocity=(0.0, 0.0, -1.0))
+    model.shape_collision_group.fill_(0)
+    rollout = Rollout(model, bsc.SolverCCD(free(model), bodies=True))
+    for _ in range(4):
+        rollout.step()
+    assert rollout.solver.report.steps == 4 and lowest_vertex(rollout, rollout.states[0]) < -0.01
+
+
 def test_arguments_that_do_not_go_together(device):
     model = ball_and_sheet(device, fixed=True, n=2)
     with pytest.raises(ValueError, match="bodies"):

@@ -78,7 +78,9 @@ class Step:
 
     def __init__(self, device, shape, *, projections=40, truncations=8, turn=0.2, friction=0.5, restitution=0.4):
         builder = newton.ModelBuilder()
-        add_triangles(builder, SHEET)
+        add_triangles(builder, np.add(SHEET, (5.0, 0.0, 1.0)) if shape == "on the ground" else SHEET)
+        if shape == "on the ground":
+            builder.add_ground_plane(height=0.02, cfg=newton.ModelBuilder.ShapeConfig(mu=0.4))
         if shape == "plane":
             up = wp.transform(wp.vec3(0.0, 0.0, -0.05), wp.quat_from_axis_angle(wp.vec3(0.8, 0.6, 0.0), 0.02))
             config = newton.ModelBuilder.ShapeConfig(mu=0.4)
@@ -179,6 +181,8 @@ STEPS = {
     "truncation": ("wedge", {"projections": 0}),
     "frozen": ("wedge", {"projections": 0, "truncations": 0}),
     "kinematic": ("kinematic", {}),
+    "body on a plane": ("on the ground", {}),
+    "body on a plane, truncation": ("on the ground", {"projections": 0, "turn": 0.5}),
     "moving plane": ("plane", {"turn": 0.02}),
     "moving plane, truncation": ("plane", {"projections": 0, "turn": 0.02}),
 }
@@ -192,7 +196,8 @@ def test_gradient_of_a_step_is_that_of_central_differences(case, device):
     report, moved = scene.solver.report, {name: end[name] - scene.values[name] for name in end}
     assert report.hits > 0 and report.certified
     assert (report.truncated > 0) == ("truncation" in case) and (report.frozen_steps > 0) == (case == "frozen")
-    assert np.abs(moved["particle_q"]).max() > 1e-3 and (np.abs(moved["body_q"]).max() > 1e-3) == (shape == "wedge")
+    assert (np.abs(moved["particle_q"]).max() > 1e-3) == (shape != "on the ground")
+    assert (np.abs(moved["body_q"]).max() > 1e-3) == (shape in ("wedge", "on the ground"))
     random = np.random.default_rng(0)
     for _ in range(2):
         cotangents = {

@@ -34,7 +34,7 @@ from .constraints import (
     truncated_path,
     widened,
 )
-from .planes import MovingPlanes, signed_distance, time_of_entry
+from .planes import MovingPlanes, level, offset_from, signed_distance, time_of_entry
 from .projection import (
     has_pushed,
     initial_velocity_multiplier,
@@ -338,7 +338,7 @@ def make_constraints(
     if kind == PLANE_CONTACT:
         plane = planes.end[constraints.plane[i]]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        separation = plane[3] + widened(least, progress)
+        separation = offset_from(motion, planes, constraints.plane[i], corners[0], progress, least)
         friction = contact_friction(motion.friction[corners[0]], planes.friction[constraints.plane[i]])
     else:
         friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
@@ -380,7 +380,8 @@ def truncation_time(
         plane = corners[1]
         before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
         after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
-        toi = time_of_entry(before, after)
+        lowest = level(motion, planes, plane, vertex)
+        toi = time_of_entry(before - lowest, after - lowest)
     elif kind != NO_CONTACT:
         impact = impact_of(
             motion,

@@ -72,6 +72,14 @@ _KERNEL = {"enable_backward": False}
 
 
 @wp.func
+def _body_of_side(motion: Motion, corners: wp.vec4i, side: int) -> int:
+    """Returns the body of the first or second element of a constraint, -1 if there is none; a plane is none."""
+    if side == 1 and corners[0] == corners[3]:
+        return -1
+    return motion.bodies.of_vertex[corners[3 * side]]
+
+
+@wp.func
 def _lever(motion: Motion, vertices: Vertices, constraints: Constraints, i: int, side: int, x: wp.array[wp.vec3]):
     """Returns the lever of the first or second element of a constraint, at positions ``x`` of the vertices.
 
@@ -81,7 +89,7 @@ def _lever(motion: Motion, vertices: Vertices, constraints: Constraints, i: int,
     """
     corners = constraints.vertices[i]
     weights = constraints.weights[i]
-    body = motion.bodies.of_vertex[corners[3 * side]]
+    body = _body_of_side(motion, corners, side)
     if body >= 0 and motion.bodies.inverse_mass[body] == 0.0:
         body = -1
     weight = _ZERO
@@ -98,7 +106,7 @@ def _lever(motion: Motion, vertices: Vertices, constraints: Constraints, i: int,
 def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
     """Counts an active constraint for its bodies."""
     for side in range(2):
-        body = motion.bodies.of_vertex[constraints.vertices[i][3 * side]]
+        body = _body_of_side(motion, constraints.vertices[i], side)
         if body >= 0:
             wp.atomic_add(vertices.bodies.active, body, 1)
 

@@ -10,7 +10,7 @@ from ..kernels.signs import FREE, HIT
 from .buffers import Bodies, Motion
 from .model_mesh import Incidence
 
-__all__ = ["Connectivity", "bodies_meet", "count_crossings", "crossed_at_start", "is_movable"]
+__all__ = ["Connectivity", "bodies_meet", "collides", "count_crossings", "crossed_at_start", "is_movable"]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
@@ -44,7 +44,7 @@ def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
-def _collides(bodies: Bodies, shape: int, other: int) -> bool:
+def collides(bodies: Bodies, shape: int, other: int) -> bool:
     """Returns whether two shapes are to collide: by their flags, their groups, and the pairs that are filtered out.
 
     Shapes of one positive group collide with each other, and with all negative groups but no other positive one; those
@@ -79,7 +79,7 @@ def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
         movable = motion.bodies.inverse_mass[body] > 0.0
     if other >= 0:
         movable = movable or motion.bodies.inverse_mass[other] > 0.0
-    return movable and _collides(
+    return movable and collides(
         motion.bodies, motion.bodies.shape[corners[0] - particles], motion.bodies.shape[corners[3] - particles]
     )
 

@@ -177,6 +177,7 @@ class ModelMotion:
         vertices.friction = friction.vertices
         self.planes = planes = MovingPlanes()
         planes.friction, planes.world = friction.planes, mesh.device_planes.world
+        planes.shape, planes.body = mesh.device_planes.shape, mesh.device_planes.body
         for name in ("start", "end"):
             setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=mesh.device))
         self._size = max(mesh.vertex_count, len(friction.planes))

@@ -1,4 +1,9 @@
-"""Infinite planes: each bounds a solid half-space, which vertices stay out of."""
+"""Infinite planes: each bounds a solid half-space, which vertices stay out of.
+
+Vertices of bodies stay as deep as they began, as the inner solver may have soft contacts of its own with planes, and
+as deep as it wanted them, unless the response keeps bodies apart from static shapes. Only corrections by the response
+cannot push them in.
+"""
 
 import warp as wp
 
@@ -9,19 +14,32 @@ from .constraints import (
     add_constraint,
     contact_friction,
     count_contact,
+    feasible,
+    inverse_mass_of,
     is_dividing,
     to_double,
     update_first_contact,
     widened,
 )
 from .dividing_planes import DividingPlanes, add_plane
+from .exclusion import collides
 
-__all__ = ["MovingPlanes", "collect_penetrations", "signed_distance", "time_of_entry", "transformed_plane"]
+__all__ = [
+    "MovingPlanes",
+    "collect_penetrations",
+    "level",
+    "offset_from",
+    "signed_distance",
+    "time_of_entry",
+    "transformed_plane",
+]
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
 _MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
+_DEEPER = wp.constant(wp.float64(0.05))
+"""Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 _ZERO = wp.constant(wp.float64(0.0))
 
 _KERNEL = {"enable_backward": False}
@@ -38,6 +56,8 @@ class MovingPlanes:
     end: wp.array[wp.vec4d]
     friction: wp.array[float]
     world: wp.array[int]  # -1 for all
+    shape: wp.array[int]
+    body: wp.array[int]  # that the plane moves with, -1 for none
 
 
 @wp.func
@@ -72,6 +92,51 @@ def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
     return wp.min(wp.max(before, _ZERO) / wp.max(before - after, _TINY), wp.float64(1.0))
 
 
+@wp.func
+def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
+    """Returns whether a plane is to stop a vertex: not one of its own body, or of a shape that it passes."""
+    if not motion.bodies.of_vertex:
+        return True
+    body = motion.bodies.of_vertex[vertex]
+    if body < 0:
+        return True
+    shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
+    return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
+
+
+@wp.func
+def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float64:
+    """Returns the distance from a plane that a vertex is kept at [m]: 0, or less for one of a body, see the module."""
+    least = _ZERO
+    if motion.bodies.of_vertex:
+        if motion.bodies.of_vertex[vertex] >= 0:
+            before, _error = signed_distance(planes.start[i], motion.x0[vertex])
+            least = wp.min(before, _ZERO)
+            if motion.bodies.responds == 0:
+                wanted, _error_wanted = signed_distance(planes.end[i], motion.x1[vertex])
+                least = wp.min(wanted, least)
+    return least
+
+
+@wp.func
+def offset_from(
+    motion: Motion, planes: MovingPlanes, i: int, vertex: int, progress: Progress, separation: wp.float64
+) -> wp.float64:
+    """Returns the offset that constraints move a vertex to that a plane stops [m]."""
+    plane = planes.end[i]
+    distance = widened(separation, progress)
+    if motion.bodies.of_vertex:
+        if motion.bodies.of_vertex[vertex] >= 0:
+            least = level(motion, planes, i, vertex)
+            if least < _ZERO:
+                distance = least
+            else:
+                before, _error = signed_distance(planes.start[i], motion.x0[vertex])
+                path = wp.length(to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
+                distance = feasible(distance, before, separation, path)
+    return plane[3] + distance
+
+
 @wp.kernel(**_KERNEL)
 def collect_penetrations(
     motion: Motion,
@@ -90,7 +155,7 @@ def collect_penetrations(
     """
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0:
+    if inverse_mass_of(motion, vertex) == 0.0:
         return
     for i in range(planes.end.shape[0]):
         if planes.world[i] >= 0 and planes.world[i] != world:
@@ -98,7 +163,14 @@ def collect_penetrations(
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
         if not (after <= error_after):  # nor where the plane is not finite
             continue
+        if not _stops(motion, planes, i, vertex):
+            continue
+        least = level(motion, planes, i, vertex)
+        if least < _ZERO and after >= least - _DEEPER * separation:
+            continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
+        before -= least
+        after -= least
         if before < -error_before:
             if not ahead:
                 wp.atomic_add(progress.status.crossed_hits, 0, 1)
@@ -116,8 +188,10 @@ def collect_penetrations(
             if not dividing.first:
                 continue
             margin = _MARGIN * separation
-            least = plane[3] + wp.min(wp.float64(2.0) * error_after, margin)
-            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, least, margin)
+            offset = plane[3] + least + wp.min(wp.float64(2.0) * error_after, margin)
+            if least < _ZERO:
+                offset = plane[3] + least - _DEEPER * separation
+            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, offset, margin)
             multiplier = TOUCH * normal
         else:
             progress.status.projecting[0] = 1
@@ -128,7 +202,7 @@ def collect_penetrations(
             wp.vec4i(vertex),
             wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
             normal,
-            plane[3] + widened(separation, progress),
+            offset_from(motion, planes, i, vertex, progress, separation),
             contact_friction(motion.friction[vertex], planes.friction[i]),
             1,
             PLANE_CONTACT,

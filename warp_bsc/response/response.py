@@ -182,7 +182,8 @@ class Response:
         self._turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
-        self._most_penetrations = self._movable * int(planes_of_a_world)
+        self._stopped = mesh.vertex_count if moves_bodies else self._movable  # vertices that planes may stop
+        self._most_penetrations = self._stopped * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
         self._crossing_candidates = CrossingCandidates(mesh)
         self._dividing_planes = allocate_dividing_planes(mesh.vertex_count, _DIVIDING_PLANES * self._movable, device)
@@ -334,7 +335,8 @@ class Response:
     def _collect_penetrations(self, ahead):
         motion = self._motion
         inputs = [motion.vertices, self.vertices, motion.planes, self.constraints, self._dividing, self.progress]
-        self._launch_over_particles(collect_penetrations, [*inputs, self.separation, ahead])
+        inputs += [self.separation, ahead]
+        wp.launch(collect_penetrations, self._stopped, inputs=inputs, device=self.device)
 
     def _collect_near_pairs(self):
         """Adds constraints for proximities, in worlds that have contacts."""

@@ -222,9 +222,10 @@ class SolverCCD(SolverBase, CouplingHooks):
                 bodies are left to the inner solver, and those that its motion passes are counted, see
                 ``report.body_contacts``. True: bodies are kept apart from each other and from static shapes as well, as
                 their flags, groups and filters of collision say, and certified; this needs an inner solver that reads
-                ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic bodies, bodies without
-                mass, static shapes and infinite planes are never pushed, and bodies are not kept out of infinite
-                planes. Bodies that are all kinematic at construction stay so.
+                ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Pushes by the stage take no body into
+                an infinite plane that it collides with, nor deeper than it was or is wanted to be; with True, no motion
+                does. Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies
+                that are all kinematic at construction stay so.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
@@ -426,7 +427,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             nonlocal recorded
             resolution = self._resolve(end, dt, self._recorder)
             recorded = None
-            if device.is_capturing or resolution.vertices.outcome.numpy().any():
+            if device.is_capturing or self._changed(resolution.vertices):
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
                 inputs, outputs = [self._recorder.record.counts, recorded.complete], [self.report._totals]
                 self._launch(_count_record, 1, inputs, outputs)
@@ -437,6 +438,11 @@ class SolverCCD(SolverBase, CouplingHooks):
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+
+    def _changed(self, vertices):
+        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
+        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
+        return any(outcome.numpy().any() for outcome in outcomes)
 
     def _set_end(self, end, dt):
         self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
