@@ -19,16 +19,16 @@ from newton.solvers import SolverSemiImplicit
 
 import warp_bsc as bsc
 
-MARK = wp.vec3(0.2, 0.1, 0.35)  # [m]
+MARK = wp.vec3(0.15, 0.08, 0.25)  # [m]
 RADIUS = 0.3  # distance from the mark at which the loss grows fastest [m]
 # first paths: how far the paddle goes [m], and how far it turns, as axis times angle [rad]
 STARTS = [
-    ((0.0, 0.0, 0.3), (0.0, 0.0, 0.0)),
-    ((0.1, -0.1, 0.4), (-0.3, 0.2, 0.0)),
-    ((-0.1, 0.05, 0.25), (0.3, 0.3, 0.2)),
+    ((0.0, 0.0, 0.2), (0.0, 0.0, 0.0)),
+    ((0.05, -0.05, 0.3), (-0.3, 0.2, 0.0)),
+    ((-0.05, 0.05, 0.15), (0.3, 0.3, 0.2)),
 ]
 FALL = -0.3  # velocity of the cloth at the start [m/s]
-STEPS = 80
+STEPS = 60
 FIRST_RATE, RATE_DECAY = 0.05, 0.94  # learning rate of the first iteration [m, rad], and its factor per iteration
 
 

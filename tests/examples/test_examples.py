@@ -20,6 +20,7 @@ FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.rglob("example_*.py"))
 BULLET = FOLDER / "example_cloth_bullet.py"
 THROW = FOLDER / "example_diffsim_throw.py"
+PUSH = FOLDER / "example_diffsim_push.py"
 PAPER_SCENES = {
     "twisting": "degrees",
     "funnel": "from the axis",
@@ -191,6 +192,12 @@ def test_throw_is_not_learnt_without_stage():
     example = run(THROW, 3, "--no-ccd")
     example.test_final()
     assert np.min(example.loss_history) > 0.999999
+
+
+def test_push_is_learnt_through_the_stage():
+    first, *_, last = run(PUSH, 5).loss_history
+    assert (last < 0.5 * first).all()
+    run(PUSH, 2, "--no-ccd").test_final()
 
 
 def test_bullet_passes_without_stage():

@@ -117,7 +117,8 @@ def test_a_ball_dropped_on_a_pinned_sheet(device):
     assert lowest < -0.1 and rollout.states[0].body_qd.numpy()[0, 2] > 0.0  # thrown back
 
 
-def test_a_box_at_rest_on_a_sheet(device):
+@pytest.mark.parametrize(("rate", "steps"), [(240, 300), (960, 600)])
+def test_a_box_at_rest_on_a_sheet(rate, steps, device):
     """It comes to rest on the pinned sheet that it stretches, and stays: it moves by less than 1 mm/s."""
     builder = newton.ModelBuilder()
     sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
@@ -128,13 +129,13 @@ def test_a_box_at_rest_on_a_sheet(device):
     model = finalize(builder, [6 * [0.0]], device)
     rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), friction=0.5))
     rollout.count_collisions = lambda before, after: 0  # once at the end is enough here
-    for step in range(300):
-        rollout.step()
-        if step >= 280:
+    for step in range(steps):
+        rollout.step(1.0 / rate)
+        if step >= steps - 20:
             speed = np.linalg.norm(rollout.states[0].body_qd.numpy()[0, :3])
             assert speed < 1e-3, f"{1e3 * speed} mm/s"
     report = rollout.solver.report
-    assert report.hits > 5 and (report.uncertified_steps, report.frozen_steps) == (0, 0)
+    assert report.hits > 0 and (report.uncertified_steps, report.frozen_steps) == (0, 0)
     assert 0.0 < rollout.states[0].body_q.numpy()[0, 2] < 0.03
     assert not rollout.find_crossings(rollout.vertices(rollout.states[0]))
 

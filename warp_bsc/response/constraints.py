@@ -85,6 +85,9 @@ _SLOW = wp.constant(wp.float64(0.5))
 _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
+_REST = wp.constant(wp.float64(0.25))
+"""Distance of slow elements, as a share of their longest path, from which it does not grow: elements that are further
+apart than they come in a step do not collide in the next, fall freely, and never come to rest."""
 LEAST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
@@ -260,7 +263,7 @@ def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.
 @wp.func
 def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    recovered = wp.max(start + _RECOVERY * path, LEAST_DISTANCE * separation)
+    recovered = wp.max(wp.min(start, _REST * path) + _RECOVERY * path, LEAST_DISTANCE * separation)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
