@@ -28,7 +28,6 @@ from .constraints import (
     feasible,
     feasible_in_contact,
     is_excluded,
-    longest_path,
     to_double,
     to_single,
     truncated_path,
@@ -359,7 +358,7 @@ def make_constraints(
         weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
         distance = wp.length(between)
         normal = between / distance
-        separation = feasible(least, distance, least, longest_path(motion, corners))
+        separation = feasible(motion, corners, least, distance, least)
     weights[i] = weight
     normals[i] = normal
     separations[i] = separation

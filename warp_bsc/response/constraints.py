@@ -25,6 +25,7 @@ __all__ = [
     "Contacts",
     "add_constraint",
     "approach_of",
+    "are_on_body",
     "contact_friction",
     "contact_vertices",
     "contact_weights",
@@ -87,8 +88,8 @@ _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
 _REST = wp.constant(wp.float64(0.25))
-"""Distance of slow elements, as a share of their longest path, from which it does not grow: elements that are further
-apart than they come in a step do not collide in the next, fall freely, and never come to rest."""
+"""Distance of a body from slow elements, as a share of their longest path, from which it does not grow: what is further
+apart than it comes in a step does not collide in the next, and what falls freely every few steps never rests."""
 LEAST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
@@ -271,9 +272,26 @@ def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.
 
 
 @wp.func
-def feasible(target: wp.float64, start: wp.float64, separation: wp.float64, path: wp.float64) -> wp.float64:
+def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
+    """Returns whether one of two elements is of a body that can be moved."""
+    if motion.bodies.of_vertex:
+        for side in range(2):
+            body = motion.bodies.of_vertex[corners[3 * side]]
+            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+                return True
+    return False
+
+
+@wp.func
+def feasible(
+    motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
+) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
-    recovered = wp.max(wp.min(start, _REST * path) + _RECOVERY * path, LEAST_DISTANCE * separation)
+    path = longest_path(motion, corners)
+    before = start
+    if are_on_body(motion, corners):
+        before = wp.min(start, _REST * path)
+    recovered = wp.max(before + _RECOVERY * path, LEAST_DISTANCE * separation)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 
@@ -288,7 +306,7 @@ def feasible_in_contact(
 ) -> wp.float64:
     """Returns the separation for a contact of slow elements, where fast ones get ``target`` [m]."""
     start = wp.dot(normal, relative(weights, corners, motion.x0))
-    return feasible(target, start, separation, longest_path(motion, corners))
+    return feasible(motion, corners, target, start, separation)
 
 
 @wp.func

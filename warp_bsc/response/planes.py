@@ -132,8 +132,7 @@ def offset_from(
                 distance = least
             else:
                 before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-                path = wp.length(to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
-                distance = feasible(distance, before, separation, path)
+                distance = feasible(motion, wp.vec4i(vertex), distance, before, separation)
     return plane[3] + distance
 
 

@@ -8,6 +8,7 @@ from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_fin
 from .constraints import (
     EDGE_EDGE_PROXIMITY,
     PLANE_CONTACT,
+    are_on_body,
     gap,
     is_dividing,
     is_projecting,
@@ -195,12 +196,7 @@ def _activate(motion: Motion, vertices: Vertices, constraints: Constraints, i: i
 @wp.func
 def moves_body(motion: Motion, constraints: Constraints, i: int) -> bool:
     """Returns whether a constraint moves a body."""
-    if motion.bodies.of_vertex:
-        for side in range(2):
-            body = motion.bodies.of_vertex[constraints.vertices[i][3 * side]]
-            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                return True
-    return False
+    return are_on_body(motion, constraints.vertices[i])
 
 
 @wp.func

@@ -168,7 +168,7 @@ def _collect_proximity(
     if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    target = feasible(separation, distance, separation, path)
+    target = feasible(motion, corners, separation, distance, separation)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     add_constraint(
         motion,
