@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 import warp_bsc as bsc
+from warp_bsc.response.adjoint import RecordedStep, StepAdjoint
 
 DT = 0.01
 
@@ -216,6 +217,24 @@ def test_gradient_of_a_step_is_that_of_central_differences(case, device):
             expected = (sides[0] - sides[1]) / (2.0 * h)
             actual = (gradients[name] * direction).sum()
             np.testing.assert_allclose(actual, expected, rtol=2e-3, atol=8.0 * rounding / h, err_msg=name)
+
+
+def test_an_incomplete_record_gives_nan(device):
+    """As in a CUDA graph whose buffers are too small."""
+    scene = Step(device, "wedge")
+    scene.end(scene.values)
+    with wp.Tape():
+        scene.solver.step(*scene.states, None, None, DT)
+    response = scene.solver._response
+    recorded = RecordedStep(scene.solver._motion, response.resolution, scene.solver._recorder, DT)
+    arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
+    for complete in (1, 0):
+        for array in scene.arrays.values():
+            array.grad.fill_(1.0)
+        recorded.complete.fill_(complete)
+        StepAdjoint(recorded, response).backward(*(array.grad for array in arrays))
+        for name, array in scene.arrays.items():
+            assert np.isfinite(array.grad.numpy()).all() == (complete == 1), name
 
 
 @wp.kernel

@@ -261,12 +261,14 @@ def _finish(
     wanted_x1: wp.array[wp.vec3],
     wanted_velocity: wp.array[wp.vec3],
     inverse_mass: wp.array[float],
+    friction: wp.array[float],
     complete: wp.array[int],
     # out
     start_q: wp.array[wp.vec3],
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
     particle_inv_mass: wp.array[float],
+    restitution: wp.array[float],
 ):
     """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
 
@@ -278,6 +280,9 @@ def _finish(
         missing = wp.nan
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + wanted_x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + wanted_velocity[particle]
+    friction[particle] = friction[particle] + missing
+    if particle == 0 and restitution:
+        restitution[0] = restitution[0] + missing
     if particle >= particle_q.shape[0]:
         wanted_x1[particle] = x1
         wanted_velocity[particle] = velocity
@@ -443,9 +448,10 @@ class StepAdjoint:
         self._bodies.leave_velocities()
         wp.capture_while(self._more_iterations, self._through_iteration)
         self._bodies.take_positions()
-        inputs = [motion, gradients, of_motion.x0, of_motion.x1, of_motion.velocity, of_motion.inverse_mass]
+        inputs = [motion, gradients, of_motion.x0, of_motion.x1, of_motion.velocity]
+        inputs += [of_motion.inverse_mass, of_motion.friction, step.complete]
         outputs = [start_q, particle_q, particle_qd, step.mesh.model.particle_inv_mass.grad]
-        self._launch(_finish, len(motion.x0), [*inputs, step.complete], outputs)
+        self._launch(_finish, len(motion.x0), inputs, [*outputs, self._response.restitution.grad])
         self._bodies.finish(self._of_planes, start_body_q, body_q, body_qd)
         step.friction.adjoin(of_motion.friction, self._of_planes.friction)
 
@@ -506,7 +512,8 @@ class StepAdjoint:
         self._bodies.take_positions()
         self._through_truncation()
         self._launch(_begin_iteration, 1, [self._step.record, self._cursor], [self._more_sweeps])
-        wp.capture_if(self._more_sweeps, self._bodies.project)
+        if self._bodies.moves:
+            wp.capture_if(self._more_sweeps, self._bodies.project)
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_position_sweep)
         self._launch(_to_detection, 1, [self._cursor], [self._progress.status.iteration])
         step, of_constraints, separation = self._step, self._of_constraints, self._response.separation

@@ -249,10 +249,9 @@ class BodyAdjoint:
         launch_adjoint(place_planes, len(planes.body), inputs, outputs, outputs, self._device)
         inputs = [self._motion, self._of]
         inputs += [getattr(of_bodies, name, None) for name in _MOTION_ARRAYS]
-        inverse_masses = model.body_inv_mass.grad
-        if inverse_masses is None:
-            inverse_masses = wp.zeros_like(model.body_inv_mass)
-        self._launch(finish_bodies, [*inputs, self._step.complete, of_starts, of_ends, of_velocities, inverse_masses])
+        of_model = [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia]
+        inputs += [self._step.complete, of_starts, of_ends, of_velocities]
+        self._launch(finish_bodies, [*inputs, *(array.grad for array in of_model)])
 
     def _set_centres(self, poses):
         """Makes given poses those where impulses act."""

@@ -375,6 +375,9 @@ def finish_bodies(
     ends: wp.array[wp.transform],
     velocities: wp.array[wp.spatial_vector],
     inverse_masses: wp.array[float],
+    inverse_inertias: wp.array[wp.mat33],
+    masses: wp.array[float],
+    inertias: wp.array[wp.mat33],
 ):
     """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
 
@@ -392,7 +395,14 @@ def finish_bodies(
             velocity[i] = velocity[i] + missing
         velocities[body] = velocity
         if _is_movable(motion, body):
-            inverse_masses[body] = inverse_masses[body] + motion_inverse_masses[body] + missing
+            if inverse_masses:
+                inverse_masses[body] = inverse_masses[body] + motion_inverse_masses[body] + missing
+            if inverse_inertias:
+                inverse_inertias[body] = inverse_inertias[body] + missing * wp.identity(3, dtype=float)
+            if masses:
+                masses[body] = masses[body] + missing
+            if inertias:
+                inertias[body] = inertias[body] + missing * wp.identity(3, dtype=float)
     else:
         end = end + ends[body]
     for i in range(7):
