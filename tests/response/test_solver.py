@@ -264,6 +264,31 @@ def test_numbers_out_of_range_are_refused(options, message, device):
         bsc.SolverCCD(SOLVERS["xpbd"](model), **options)
 
 
+def test_coefficients_may_be_arrays_that_each_step_reads(device):
+    model = bullet(10.0, device=device)
+    for name, lengths in (("friction", (2, 0)), ("restitution", (model.particle_count,))):
+        for length in lengths:
+            with pytest.raises(ValueError, match=f"{name} must be a number, or an array of float32 of length"):
+                bsc.SolverCCD(SOLVERS["xpbd"](model), **{name: wp.zeros(length, dtype=float, device=device)})
+        with pytest.raises(ValueError, match=name):
+            bsc.SolverCCD(SOLVERS["xpbd"](model), **{name: wp.full(1, -0.5, dtype=float, device=device)})
+    ends = []
+    for value in (0.0, 0.7):
+        friction = wp.zeros(model.particle_count, dtype=float, device=device)
+        solver = bsc.SolverCCD(SOLVERS["xpbd"](model), friction=friction, restitution=0.5)
+        friction.fill_(value)  # after the constructor has checked it
+        number = bsc.SolverCCD(SOLVERS["xpbd"](model), friction=value, restitution=0.5)
+        for stage in (solver, number):
+            rollout = Rollout(model, stage)
+            for _ in range(8):
+                rollout.step()
+            assert stage.report.steps == 8
+            ends.append(rollout.states[0].particle_qd.numpy().copy())
+    np.testing.assert_array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[2], ends[3])
+    assert np.abs(ends[0] - ends[2]).max() > 1e-3
+
+
 @pytest.mark.parametrize("plane", [False, True])
 def test_friction_of_shapes_out_of_range_is_refused(plane, device):
     builder = newton.ModelBuilder()
