@@ -437,7 +437,7 @@ class Coupling:
                 only one.
             moves_bodies: Whether the response can move bodies.
         """
-        self._choices = tuple(substeps)
+        self._choices, self._chooses = substeps, len(substeps) > 1
         self._step, self._solver = step, solver
         self._mesh, self._motion, self._response = mesh, motion, response
         self._moves_bodies = moves_bodies
@@ -451,7 +451,7 @@ class Coupling:
         self._is_coupled = wp.zeros(response.worlds, dtype=int, device=device)
         self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
         self._remaining = wp.zeros(1, dtype=int, device=device)
-        if len(self._choices) > 1:
+        if self._chooses:
             edges, lengths, is_solid = edges_at_rest(model)
             self._edges = wp.array(edges, dtype=wp.vec2i, device=device), wp.array(lengths, dtype=float, device=device)
             self._edges += (wp.array(is_solid, dtype=bool, device=device),)
@@ -502,7 +502,7 @@ class Coupling:
         response, device = self._response, self._mesh.device
         always = device.is_capturing and self._allocates
         response.find_contacts(self._motion)
-        if len(self._choices) > 1:
+        if self._chooses:
             if always:
                 solver = type(self._solver).__name__
                 raise NotImplementedError(f"in a graph, {solver} needs a number of substeps: coupling='auto' has none")
@@ -556,7 +556,7 @@ class Coupling:
             wp.copy(saved, array)
         arguments = {"state": state, "control": control, "contacts": contacts, "dt": dt, "histories": histories}
         for i, substeps in enumerate(self._choices):
-            if len(self._choices) > 1:
+            if self._chooses:
                 is_chosen = self._is_chosen[i : i + 1]
                 wp.capture_if(is_chosen, self._take_number_of_substeps, substeps=substeps, **arguments)
             else:
