@@ -207,27 +207,29 @@ def test_worlds_are_like_one_alone(device):
         assert world.tobytes() == one.positions.tobytes()
 
 
-def test_momentum_of_free_bodies_is_conserved(device):
+@pytest.mark.parametrize("coupling", [None, 4, "auto"])
+def test_momentum_of_free_bodies_is_conserved(coupling, device):
     """Two patches collide; momentum is kept to 1e-6 of what collides, as XPBD keeps it and VBD by itself does not."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 1.0))
     add_patch(builder, 5, 0.04, (0.013, 0.017, 0.012), velocity=(0.5, 0.0, -1.0))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, coupling=4))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, coupling=coupling))
     before, _ = rollout.momenta()
     colliding = model.particle_mass.numpy() @ np.linalg.norm(rollout.velocities, axis=1)
     for _ in range(8):
         rollout.step()
     after, _ = rollout.momenta()
     assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    assert rollout.solver.report.coupled_steps > 0
+    assert (rollout.solver.report.coupled_steps > 0) is (coupling is not None)
     assert np.abs(after - before).max() < 1e-6 * colliding
     assert abs(rollout.velocities[: 7 * 7, 2].mean() - 1.0) > 0.3  # they did collide
 
 
+@pytest.mark.parametrize("coupling", [None, 4])
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_a_bounce_returns_the_energy_of_restitution(restitution, device):
+def test_a_bounce_returns_the_energy_of_restitution(restitution, coupling, device):
     """A patch hits a box squarely: its energy afterwards is that before times restitution squared."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     box = newton.ModelBuilder.ShapeConfig(mu=0.0)
@@ -235,17 +237,18 @@ def test_a_bounce_returns_the_energy_of_restitution(restitution, device):
     add_patch(builder, 5, 0.05, (0.0, 0.0, 0.02), velocity=(0.0, 0.0, -2.0))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, coupling=4)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, coupling=coupling)
     rollout = Rollout(model, solver)
     mass = model.particle_mass.numpy()[:, None]
     before = (mass * rollout.velocities**2).sum()
     for _ in range(8):
         rollout.step()
-    assert solver.report.coupled_steps > 0 and rollout.collisions == 0
+    assert (solver.report.coupled_steps > 0) is (coupling is not None) and rollout.collisions == 0
     assert abs((mass * rollout.velocities**2).sum() / before - restitution**2) < 0.02
 
 
-def test_a_pile_comes_to_rest(device):
+@pytest.mark.parametrize("coupling", [None, 3, "auto"])
+def test_a_pile_comes_to_rest(coupling, device):
     """Layers that fall on the ground gain no energy, and lie still."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
@@ -253,7 +256,7 @@ def test_a_pile_comes_to_rest(device):
         add_patch(builder, 4, 0.05, (0.011 * layer, 0.007 * layer, 0.02 * (layer + 1)))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, coupling=3))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, coupling=coupling))
     mass = model.particle_mass.numpy().astype(float)
 
     def energy():

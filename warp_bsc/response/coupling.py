@@ -404,6 +404,12 @@ class Coupling:
     inner solver are restored after the substeps, so that histories and clocks advance once a step. Options of a step,
     such as observables, are those of the whole step.
 
+    What a substep is depends on the inner solver. VBD and Style3D make all their iterations in each, on the forces of a
+    shorter step. So does XPBD, whose multipliers start anew in each substep, with the compliance of its length: as
+    XPBD always does in shorter steps, it then also converges further, and cloth is stiffer, with contacts or without.
+    An explicit solver (``SolverSemiImplicit``) needs no coupling: it is stable only at steps in which contacts strain
+    elements little. It is taken in substeps as well, and ``"auto"`` leaves its steps as they are.
+
     Limitations:
         In a CUDA graph, steps that allocate memory, as those of ``SolverXPBD`` do, cannot be left out where nothing
         touches, so that the substeps cost their time in each step. ``SolverVBD`` and ``SolverStyle3D`` themselves are
