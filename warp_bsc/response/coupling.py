@@ -372,6 +372,17 @@ def _place_bodies(motion: Motion):
 
 
 @wp.kernel(**_KERNEL)
+def _restore_fast(has_fast: wp.array[int], progress: Progress):
+    """Counts worlds with fast or pushing contacts in the motion that the inner solver wanted as such.
+
+    Where something immovable pushes, substeps that obey it may end in contacts that do not look like it; but to divide
+    them could leave vertices in its way.
+    """
+    world = wp.tid()
+    progress.fast[world] = wp.max(progress.fast[world], has_fast[world])
+
+
+@wp.kernel(**_KERNEL)
 def _restore_hits(detected: wp.array[int], progress: Progress):
     """Makes the contacts of the step the inner solver wanted those that the status counts."""
     progress.status.first_hits[0] = detected[1]
@@ -455,6 +466,7 @@ class Coupling:
         self._number = wp.full(response.worlds, self._choices[0], dtype=int, device=device)  # of substeps, by world
         self._has_constraints = wp.zeros(response.worlds, dtype=int, device=device)
         self._is_coupled = wp.zeros(response.worlds, dtype=int, device=device)
+        self._fast = wp.zeros(response.worlds, dtype=int, device=device)  # as in Progress, of the wanted motion
         self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
         self._remaining = wp.zeros(1, dtype=int, device=device)
         if self._chooses:
@@ -558,6 +570,7 @@ class Coupling:
         inputs = [self._motion.vertices, constraints, self._has_constraints]
         response.launch_over_constraints(_find_worlds, inputs)
         self._launch(_keep_counts, 1, [constraints, progress], [self._detected])
+        wp.copy(self._fast, progress.fast)
         for array, saved in histories:
             wp.copy(saved, array)
         arguments = {"state": state, "control": control, "contacts": contacts, "dt": dt, "histories": histories}
@@ -631,8 +644,11 @@ class Coupling:
 
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""
-        self._response.resolve(self._motion, dt)
-        self._launch(_restore_hits, 1, [self._detected], [self._response.progress])
+        response = self._response
+        response.find_contacts(self._motion)
+        self._launch(_restore_fast, response.worlds, [self._fast], [response.progress])
+        response.finish(dt)
+        self._launch(_restore_hits, 1, [self._detected], [response.progress])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._mesh.device)
