@@ -5,7 +5,16 @@ import warp as wp
 from ..kernels.pipeline.queues import take_slot
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_final_velocity
-from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
+from .constraints import (
+    EDGE_EDGE_PROXIMITY,
+    PLANE_CONTACT,
+    gap,
+    is_dividing,
+    is_projecting,
+    relative,
+    to_double,
+    to_single,
+)
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
@@ -56,6 +65,10 @@ _UNITS = wp.constant(wp.float64(2.0**40))
 """Units in a metre; sums are of integers in these units, so that they are the same in any order."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
+
+_NEAR = wp.constant(wp.float64(0.1))
+"""Distance of near edges at the start, as a share of their separation, below which they are projected in any case:
+planes keep a share of the distance, which becomes ever smaller where something presses."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -259,12 +272,18 @@ def activate_position_constraints(
 ):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
-    Constraints met within the tolerance cost nothing, and move nothing.
+    Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities of edges where planes divide
+    near pairs afterwards, unless they are too near: a stack has four times as many as of vertices and faces, which hold
+    it as well.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
+    if constraints.kind[i] == EDGE_EDGE_PROXIMITY and is_dividing(progress, world, progress.status.iteration[0]):
+        start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
+        if wp.dot(constraints.normal[i], start) >= _NEAR * constraints.separation[i]:
+            return
     past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
         return
