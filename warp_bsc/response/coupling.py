@@ -416,16 +416,16 @@ class Coupling:
     such as observables, are those of the whole step.
 
     What a substep is depends on the inner solver. VBD and Style3D make all their iterations in each, on the forces of a
-    shorter step. So does XPBD, whose multipliers start anew in each substep, with the compliance of its length: as
-    XPBD always does in shorter steps, it then also converges further, and cloth is stiffer, with contacts or without.
-    An explicit solver (``SolverSemiImplicit``) needs no coupling: it is stable only at steps in which contacts strain
-    elements little. It is taken in substeps as well, and ``"auto"`` leaves its steps as they are.
+    shorter step. So does XPBD, whose multipliers start anew in each substep, with the compliance of its length: it is
+    XPBD in small steps, which stays stable where long ones diverge. An explicit solver (``SolverSemiImplicit``) needs
+    no coupling: it is stable only at steps in which contacts strain elements little. A number of substeps is taken all
+    the same, and ``"auto"`` leaves such steps as they are.
 
     Limitations:
         In a CUDA graph, steps that allocate memory, as those of ``SolverXPBD`` do, cannot be left out where nothing
-        touches, so that the substeps cost their time in each step. ``SolverVBD`` and ``SolverStyle3D`` themselves are
-        known not to allocate; every other solver and derived class counts as one that does. Python attributes that the
-        inner solver changes in place, and not by assignment, are not restored.
+        touches, so that the substeps cost their time in each step, and ``"auto"`` refuses them. ``SolverVBD`` and
+        ``SolverStyle3D`` themselves are known not to allocate; every other solver and derived class counts as one that
+        does. Python attributes that the inner solver changes in place, and not by assignment, are not restored.
 
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken again.

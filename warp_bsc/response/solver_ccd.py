@@ -359,6 +359,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         Raises:
             ValueError: If a tape records gradients of the response, and both states are the same.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
+            NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
+                memory, such as ``SolverXPBD``.
         """
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
