@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..detection.collisions import Collisions
+from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
@@ -32,7 +33,7 @@ class Checks:
         selection: Which pairs of meshes count.
         method: Method of detection.
         device: Name of the Warp device; None for Warp's default.
-        intersections: Whether to find the intersections at each time.
+        intersections: Whether to find the intersections at each time, and what is inside what.
         min_distance: Distance up to which elements are near each other, None to look for none.
         validate_most: Number of hits, and of other pairs, that the exact checker decides again; None for all.
     """
@@ -70,11 +71,17 @@ class IntervalChecker:
             result = self._at(interval).check(interval)
             yield replace(result, work=Work(self._worker, reading, time.perf_counter() - started))
 
-    def initial_crossings(self) -> frozenset[tuple[str, str]]:
-        """Returns the names of the meshes that cross at the first time, each pair sorted."""
+    def selection_without_initial(self) -> Selection:
+        """Returns the selection that also ignores what crosses at the first time, and that what is inside then is so."""
         interval = self.scene.interval(0)
         found = summarize_intersections(self._at(interval).find(interval.x0, interval.start))
-        return frozenset((min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings)
+        crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
+        selection = self._checks.selection
+        return replace(
+            selection,
+            ignored_names=selection.ignored_names | crossing,
+            ignored_inside=selection.ignored_inside | found.inside.keys(),
+        )
 
     def _at(self, interval: Interval) -> "_SegmentChecker":
         if self._of_segment is None or interval.segment is not self._of_segment.segment:
@@ -92,7 +99,10 @@ class _SegmentChecker:
         self._checks = checks
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
         self._detector = CollisionDetector(self._mesh, method=checks.method)
-        self._finder = self._detector.intersection_finder() if checks.intersections else None
+        self._finder = self._containment = None
+        if checks.intersections:
+            self._finder = self._detector.intersection_finder()
+            self._containment = ContainmentFinder(segment.faces, segment.face_meshes, len(segment.faces))
         self._last: SceneIntersections | None = None  # those found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
@@ -148,9 +158,16 @@ class _SegmentChecker:
         """
         last = self._last
         if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
-            assert self._finder
+            assert self._finder and self._containment
+            selection, meshes = self._checks.selection, self.segment.meshes
             found = self._finder.find(x, is_end=is_end)
-            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, self._checks.selection)
+
+            def are_wanted(pairs: np.ndarray) -> np.ndarray:
+                ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
+                return selection.counted_pairs(meshes, pairs) & ~ignored
+
+            inside = self._containment.find(x, self._mesh.edges, found, are_wanted)
+            self._last = last = name_intersections(self.segment, self._mesh, found, inside, x, time, selection)
         return last
 
     def _find_near(self, x: np.ndarray, time: float) -> SceneProximities:

@@ -105,8 +105,12 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
     intersections = proximities = None
     if "edges_through_faces" in record:
         intersections = (
-            _rebuild_intersections(interval, record["edges_through_faces"], interval.start, interval.x0),
-            _rebuild_intersections(interval, at_end("edges_through_faces"), interval.end, interval.x1),
+            _rebuild_intersections(
+                interval, record["edges_through_faces"] + record["inside"], interval.start, interval.x0
+            ),
+            _rebuild_intersections(
+                interval, at_end("edges_through_faces") + at_end("inside"), interval.end, interval.x1
+            ),
         )
     if "near_pairs" in record:
         proximities = (

@@ -58,8 +58,8 @@ def replay_facts(
 class HitsJson(RecordFile):
     """A JSON file: facts of the replay, every interval with its contacts and intersections, then the sums.
 
-    An interval lists the intersections and proximities at its start, and where the next interval may start elsewhere,
-    or there is none, those at its end as well. Every interval is in a line of its own.
+    An interval lists what intersects, is inside and is near at its start, and where the next interval may start
+    elsewhere, or there is none, at its end as well. Every interval is in a line of its own.
 
     The file holds no measured times, so that it is the same whoever has found the results.
     :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it.
@@ -112,9 +112,11 @@ class HitsJson(RecordFile):
         yield from _list("contacts", contacts, _contact_rows)
         if result.intersections:
             start, end = result.intersections
-            yield from _list("edges_through_faces", start, _intersection_rows)
+            yield from _list("edges_through_faces", start, _intersection_rows, start.edge_rows)
+            yield from _list("inside", start, _intersection_rows, start.inside_rows)
             if not is_joined:
-                yield from _list("edges_through_faces_at_end", end, _intersection_rows)
+                yield from _list("edges_through_faces_at_end", end, _intersection_rows, end.edge_rows)
+                yield from _list("inside_at_end", end, _intersection_rows, end.inside_rows)
         if result.proximities:
             start, end = result.proximities
             yield from _list("near_pairs", start, _proximity_rows)
@@ -137,6 +139,7 @@ class HitsJson(RecordFile):
             "collision_spans": [asdict(span) for span in summary.collision_spans],
             "ignored": _mesh_pairs_to_list(summary.ignored),
             "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
+            "proximity_spans": [asdict(span) for span in summary.proximity_spans],
             "nearest": [asdict(nearest) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
@@ -147,7 +150,9 @@ class HitsCsv(RecordFile):
     """A CSV file: a row for each contact, intersection and proximity, and a last line with # if some are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
-    start, in the last interval its end too. The same holds for proximities, which have the phase "near" and a distance.
+    start, in the last interval its end too. Parts of a mesh that are inside another have the phase "inside", and the
+    kind "vertex-face": a vertex of the part and a face of the other. The same holds for proximities, which have the
+    phase "near" and a distance.
     """
 
     _COLUMNS = (
@@ -189,10 +194,12 @@ class HitsCsv(RecordFile):
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)
 
 
-def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]]) -> Iterator[str | bytes]:
-    """Yields a member of a JSON object: the list of all pairs."""
+def _list(
+    name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]], which: slice = slice(None)
+) -> Iterator[str | bytes]:
+    """Yields a member of a JSON object: the list of all pairs, or of some rows of them."""
     yield f', "{name}": ['
-    for number, rows in enumerate(pairs.chunks()):
+    for number, rows in enumerate(pairs.chunks(which)):
         yield (b", " if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
     yield "]"
 
@@ -222,14 +229,18 @@ def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
 
 def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[dict]:
     """Returns the fields of some intersections."""
-    crosses = intersections.crosses[rows].tolist()
+    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
+    insides = [row >= edges for row in range(*rows.indices(len(intersections)))]
     return _to_rows(
         {
-            "kind": ["edge-face"] * len(crosses),
+            "kind": ["vertex-face" if inside else "edge-face" for inside in insides],
             **_names(intersections, rows),
             "time": [intersections.time] * len(crosses),
             "position": intersections.position[rows].tolist(),
-            "phase": ["crosses" if passes else "touches" for passes in crosses],
+            "phase": [
+                "inside" if inside else "crosses" if passes else "touches"
+                for inside, passes in zip(insides, crosses, strict=True)
+            ],
         }
     )
 
@@ -289,7 +300,8 @@ def _numbers(found: IntersectionSummary) -> dict:
         {"meshes": meshes, "crossings": crossings, "touches": touches}
         for meshes, (crossings, touches) in found.mesh_pairs.items()
     ]
-    return asdict(found) | {"mesh_pairs": pairs}
+    inside = [{"meshes": meshes, "parts": parts} for meshes, parts in found.inside.items()]
+    return asdict(found) | {"mesh_pairs": pairs, "inside": inside}
 
 
 def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:

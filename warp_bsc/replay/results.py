@@ -1,5 +1,6 @@
 """What a replay finds in one interval, and the numbers of it."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,20 +48,28 @@ class Contact:
 
 @dataclass(frozen=True)
 class IntersectionSummary:
-    """The edges that meet faces at one time of a scene, in numbers.
+    """The edges that meet faces at one time of a scene, and the parts of meshes that are inside others, in numbers.
 
     Attributes:
         time: Time code.
         crossings: Number of edges that pass through faces: pairs of an edge and a face.
         touches: Number of edges that only touch faces.
-        mesh_pairs: Both numbers for each two meshes that intersect, by their names, in order; a mesh that intersects
-            itself is there twice.
+        mesh_pairs: Both numbers for each two meshes of which an edge meets a face, by their names, in order; a mesh
+            that intersects itself is there twice.
+        inside: Number of connected parts of a mesh that are wholly inside another, by the name of the mesh and that of
+            the other.
     """
 
     time: float
     crossings: int
     touches: int
     mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+    inside: dict[tuple[str, str], int]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing intersects."""
+        return not self.mesh_pairs and not self.inside
 
 
 @dataclass(frozen=True)
@@ -246,9 +255,16 @@ def summarize(
 
 def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
     """Returns the numbers of the intersections at one time."""
-    by_meshes = count_by_meshes(found.segment, found.meshes, np.stack([found.crosses, ~found.crosses], axis=1))
+    edges = found.edge_rows
+    crosses = found.crosses[edges]
+    by_meshes = count_by_meshes(found.segment, found.meshes[edges], np.stack([crosses, ~crosses], axis=1))
+    inside = Counter(found.mesh_names(found.inside_rows))
     return IntersectionSummary(
-        found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
+        found.time,
+        found.crossings,
+        found.touches,
+        {names: (a, b) for names, (a, b) in by_meshes.items()},
+        dict(inside),
     )
 
 

@@ -71,9 +71,10 @@ class ScenePairs:
     def __len__(self) -> int:
         return len(self.meshes)
 
-    def chunks(self) -> list[slice]:
-        """Returns all rows as slices of limited length: their text takes many times their memory."""
-        return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
+    def chunks(self, rows: slice = slice(None)) -> list[slice]:
+        """Returns rows, default all, as slices of limited length: their text takes many times their memory."""
+        first, stop, _ = rows.indices(len(self))
+        return [slice(start, min(start + _CHUNK, stop)) for start in range(first, stop, _CHUNK)]
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the names of the two meshes of some pairs."""

@@ -167,6 +167,11 @@ class Segment:
         return welded, self._welded_to[welded]
 
     @property
+    def face_meshes(self) -> np.ndarray:
+        """Mesh of each face, shape [face_count]."""
+        return np.searchsorted(self._face_ends, np.arange(len(self.faces)), side="right")
+
+    @property
     def vertex_meshes(self) -> np.ndarray:
         """Mesh of each vertex, the first of those welded there, shape [vertex_count]."""
         return np.searchsorted(self._vertex_ends, self._kept, side="right")
@@ -223,6 +228,15 @@ class Segment:
             mesh, members = self.meshes[number], meshes == number
             vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
         return np.searchsorted(self._kept, self._welded_to[vertices])
+
+    def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Returns which points of given meshes' prims vertices are, the first if several were welded, shape [n]."""
+        unwelded, order = self._unwelded
+        wanted = self._kept[vertices]
+        rows, places = _expand(np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right"))
+        own_meshes, points = self._locate(order[places])
+        (own,) = np.nonzero(own_meshes == meshes[rows])
+        return points[own[np.unique(rows[own], return_index=True)[1]]]
 
     def locate_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mesh of each edge, the indices of its ends among the prim's points, and which are diagonals.
