@@ -1,6 +1,7 @@
 """The parts of bodies that are wholly inside other bodies in one configuration, exactly."""
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from .. import checker
 from .intersections import Intersections
+from .mesh import CollisionMesh
 
 __all__ = ["Containment", "ContainmentFinder"]
 
@@ -32,7 +34,7 @@ class Containment:
 class ContainmentFinder:
     """Finds what is inside what, in one configuration after another, in meshes that consist of several bodies.
 
-    A part of a body is what its faces, edges and points connect. A part is closed if an even number of its faces meet
+    A part of a body is what its faces connect. A part is closed if an even number of its faces meet
     at each edge. Closed parts enclose what they wind around; where the faces of a part are not oriented alike, what a
     ray from it passes an odd number of times. All closed parts of a body count together, with their signs: what is in
     the cavity of a hollow body, whose inner surface is turned inwards, is not inside. Open parts enclose nothing.
@@ -43,31 +45,21 @@ class ContainmentFinder:
     No floating-point error can change the answer: signs that are not certain are computed in rational arithmetic.
     """
 
-    def __init__(self, cells: np.ndarray, bodies: np.ndarray, face_count: int):
-        """Takes the elements; finds the parts when they are needed first.
+    def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
+        """Takes a mesh; finds its parts when they are needed first.
 
         Args:
-            cells: Vertices of the faces, counterclockwise seen from outside, then of edges as a b b and points as
-                a a a, integers, shape [n, 3]. A body's vertices may be another's too.
-            bodies: Body of each cell, integers from 0, shape [n].
-            face_count: Number of faces.
+            mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
+            bodies: Body of each face, integers from 0, shape [face_count].
         """
-        self._cells, self._bodies, self._face_count = cells.astype(np.int64), bodies.astype(np.int64), face_count
-        self._vertex_count = int(cells.max(initial=-1)) + 1
+        self._mesh, self._bodies = mesh, bodies.astype(np.int64)
 
-    def find(
-        self,
-        x: np.ndarray,
-        edges: np.ndarray,
-        found: Intersections,
-        are_wanted: Callable[[np.ndarray], np.ndarray],
-    ) -> Containment:
+    def find(self, x: np.ndarray, found: Intersections, are_wanted: Callable[[np.ndarray], np.ndarray]) -> Containment:
         """Returns what is inside what in one configuration.
 
         Args:
             x: Positions, finite, any unit of length, shape [vertex_count, 3].
-            edges: Vertices of the edges that ``found`` refers to, shape [edge_count, 2].
-            found: The intersections in this configuration, of all cells.
+            found: The intersections of the mesh in this configuration.
             are_wanted: Returns which pairs of an inner and an outer body are looked for, given shape [m, 2].
         """
         none = Containment(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -77,13 +69,13 @@ class ContainmentFinder:
         x = x.astype(np.float64)
         low, high = parts.boxes(x)
         (outer,) = np.nonzero(parts.closed)
-        pairs = np.concatenate([np.zeros((0, 2), np.int64), *_enclosing(low, high, low[outer], high[outer])])
+        pairs = _enclosing(low, high, low[outer], high[outer], 3)
         pairs[:, 1] = outer[pairs[:, 1]]
         pairs = pairs[parts.body[pairs[:, 0]] != parts.body[pairs[:, 1]]]
         pairs = pairs[are_wanted(parts.body[pairs])]
         if not len(pairs):
             return none
-        meeting, passing = parts.meeting(edges, found)
+        meeting, passing = parts.meeting(found)
         touching = _keys(pairs, len(low)), _keys(pairs[:, ::-1], len(low))
         is_touching = np.isin(touching[0], meeting) | np.isin(touching[1], meeting)
         # a part that passes through any part of a body is not inside it
@@ -91,21 +83,18 @@ class ContainmentFinder:
         of_bodies = np.concatenate([of_bodies, of_bodies[:, ::-1]])
         passing = of_bodies[:, 0] * len(low) + parts.body[of_bodies[:, 1]]
         kept = ~np.isin(pairs[:, 0] * len(low) + parts.body[pairs[:, 1]], passing)
-        return self._decide(x, edges, found, pairs[kept], is_touching[kept])
+        return self._decide(x, found, pairs[kept], is_touching[kept])
 
     @functools.cached_property
     def _parts(self) -> "_Parts":
-        return _Parts(self._cells, self._bodies, self._face_count, self._vertex_count)
+        return _Parts(self._mesh, self._bodies)
 
-    def _decide(
-        self, x: np.ndarray, edges: np.ndarray, found: Intersections, pairs: np.ndarray, is_touching: np.ndarray
-    ) -> Containment:
+    def _decide(self, x: np.ndarray, found: Intersections, pairs: np.ndarray, is_touching: np.ndarray) -> Containment:
         """Returns which parts are inside, given pairs of an inner and a closed part that pass through each other nowhere.
 
         Args:
-            x: As of :meth:`find`, as the next two.
-            edges: As above.
-            found: As above.
+            x: As of :meth:`find`.
+            found: As of :meth:`find`.
             pairs: Pairs of parts of which one's box is in the other's, shape [m, 2].
             is_touching: Whether they touch each other, shape [m].
         """
@@ -116,7 +105,7 @@ class ContainmentFinder:
         touches = np.bincount(case_of_pair, is_touching, len(cases)) > 0
         queries = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
         for case in np.flatnonzero(touches):
-            ends = parts.ends_of_touching(*cases[case], edges, found)
+            ends = parts.ends_of_touching(*cases[case], found)
             queries[case] = ends if len(ends) else queries[case]
         case_of_query = np.repeat(np.arange(len(cases)), list(map(len, queries)))
         vertices = np.concatenate([np.zeros(0, np.int64), *queries])
@@ -127,30 +116,30 @@ class ContainmentFinder:
         firsts = np.cumsum(counts) - counts
         rows, places = _expand(firsts[case_of_query], (firsts + counts)[case_of_query])
         compared = _keys(np.stack([rows, pairs[order[places], 1]], axis=1), len(parts.body))
-        (faces,) = np.nonzero(np.isin(parts.of_cell[: self._face_count], pairs[:, 1]))
-        corners = x[self._cells[faces]]
-        low, high, points = corners.min(axis=1), corners.max(axis=1), x[vertices]
+        points = x[vertices]
+        faces = self._faces_ahead(x, points, pairs[:, 1])
+        corners = x[self._mesh.faces[faces]]
+        low, high = corners.min(axis=1), corners.max(axis=1)
 
-        def pair_up(box_low: np.ndarray) -> np.ndarray:
-            """Returns queries and faces of which the point, seen along the axes y, z and x, is in the box."""
-            axes = [1, 2, 0]
-            boxes = _enclosing(points[:, axes], points[:, axes], box_low[:, axes], high[:, axes])
-            found = np.concatenate([np.zeros((0, 2), np.int64), *boxes])
-            keys = found[:, 0] * len(parts.body) + parts.of_cell[faces[found[:, 1]]]
+        def pair_up(box_low: np.ndarray, axes: int) -> np.ndarray:
+            """Returns queries and faces of which the point is in the box, the first axes, of y, z and x, bounded."""
+            turned = [1, 2, 0]
+            found = _enclosing(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
+            keys = found[:, 0] * len(parts.body) + parts.of_face[faces[found[:, 1]]]
             return found[np.isin(keys, compared)]
 
         on_surface = np.zeros(len(vertices), dtype=bool)
         if touches.any():
-            met = pair_up(low)
+            met = pair_up(low, 3)
             met = met[touches[case_of_query[met[:, 0]]]]
             at = np.repeat(points[met[:, 0], None], 2, axis=1)
             on_surface[met[checker.edge_face_crossings(at, corners[met[:, 1]]), 0]] = True
         # rays along +x
-        met = pair_up(np.where([True, False, False], -np.inf, low))
+        met = pair_up(np.where([True, False, False], -np.inf, low), 2)
         signs = checker.rays_pass_faces(points[met[:, 0]], corners[met[:, 1]]).astype(np.int64)
         met, signs = met[signs != 0], signs[signs != 0]
         keys, pair_of_ray = np.unique(
-            met[:, 0] * len(parts.body) + parts.of_cell[faces[met[:, 1]]], return_inverse=True
+            met[:, 0] * len(parts.body) + parts.of_face[faces[met[:, 1]]], return_inverse=True
         )
         turns = np.where(
             parts.oriented[keys % len(parts.body)],
@@ -173,6 +162,17 @@ class ContainmentFinder:
         order = np.lexsort((vertices[rows], bodies[:, 1], bodies[:, 0]))
         return Containment(bodies[order], vertices[rows][order], faces[first_of][order])
 
+    def _faces_ahead(self, x: np.ndarray, points: np.ndarray, parts: np.ndarray) -> np.ndarray:
+        """Returns the faces of some parts that are not on the same side of all rays from some points, ascending."""
+        is_wanted = np.zeros(len(self._parts.body), dtype=bool)
+        is_wanted[parts] = True
+        low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+        sides = np.zeros(len(x), dtype=np.uint8)
+        for bit, is_aside in enumerate((x[:, 0] < low[0], *(x[:, 1:] < low[1:]).T, *(x[:, 1:] > high[1:]).T)):
+            sides |= is_aside.astype(np.uint8) << bit
+        a, b, c = (sides[corners] for corners in self._mesh.faces.T)
+        return np.flatnonzero(is_wanted[self._parts.of_face] & (a & b & c == 0))
+
 
 class _Parts:
     """The connected parts of bodies.
@@ -181,39 +181,50 @@ class _Parts:
 
     Attributes:
         body: Body of each part, shape [part_count].
-        closed: Whether an even number of its faces meet at each edge, and it has faces, shape [part_count].
+        closed: Whether an even number of its faces meet at each edge, shape [part_count].
         oriented: Whether its faces pass each edge as often in one direction as in the other, shape [part_count].
-        of_cell: Part of each cell, shape [cell_count].
+        of_face: Part of each face, shape [face_count].
         first_vertex: The first vertex of each part, shape [part_count].
     """
 
-    def __init__(self, cells: np.ndarray, bodies: np.ndarray, face_count: int, vertex_count: int):
-        """Connects the cells of each body."""
-        self._vertex_count = vertex_count
-        keys, nodes = np.unique(bodies[:, None] * vertex_count + cells, return_inverse=True)
-        nodes = nodes.reshape(-1, 3)
-        roots = _connect(nodes, len(keys))
-        part_roots, self._of_node = np.unique(roots, return_inverse=True)
-        part_count = len(part_roots)
-        self._node_vertices, node_bodies = keys % vertex_count, keys // vertex_count
-        self.body = node_bodies[part_roots]
-        self.of_cell = self._of_node[nodes[:, 0]]
-        order = np.argsort(self._of_node, kind="stable")
+    def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
+        """Connects the faces of each body."""
+        self._edges, count = mesh.edges, mesh.vertex_count
+        # the nodes of a vertex that bodies share come after all vertices
+        last_body = np.zeros(count, dtype=np.int64)
+        last_body[mesh.faces] = bodies[:, None]
+        is_shared = np.zeros(count, dtype=bool)
+        is_shared[mesh.faces[last_body[mesh.faces] != bodies[:, None]]] = True
+        nodes, self._node_vertices = _divide(mesh.faces, is_shared, bodies)
+        edges, of_edges = _divide(mesh.face_edges, is_shared[mesh.edges].all(axis=1), bodies)
+
+        roots = _connect(nodes, len(self._node_vertices))
+        used = np.zeros(len(roots), dtype=bool)
+        used[nodes] = True
+        is_root = used & (roots == np.arange(len(roots)))
+        part_count = int(is_root.sum())
+        self._of_node = np.where(used, (np.cumsum(is_root) - 1)[roots], -1)
+        self.of_face = self._of_node[nodes[:, 0]]
+        self.body = np.zeros(part_count, dtype=np.int64)
+        self.body[self.of_face] = bodies
+        vertices, shared = np.arange(count), self._node_vertices[count:]
+        first, last = np.searchsorted(shared, vertices), np.searchsorted(shared, vertices, side="right")
+        self._first_node = np.where(is_shared, count + first, vertices)
+        self._last_node = np.where(is_shared, count + last, vertices + 1)
+        (nodes_used,) = np.nonzero(used)
+        order = nodes_used[np.argsort(self._of_node[nodes_used], kind="stable")]
         self._ordered_vertices = self._node_vertices[order]
         self._starts = np.searchsorted(self._of_node[order], np.arange(part_count))
         self.first_vertex = self._ordered_vertices[self._starts]
-        self._by_vertex = np.argsort(self._node_vertices, kind="stable")
-        self._sorted_vertices = self._node_vertices[self._by_vertex]
 
-        a, b = np.concatenate([nodes[:face_count, side] for side in ([0, 1], [1, 2], [2, 0])]).T
-        a, b = a[a != b], b[a != b]
-        low, high = np.minimum(a, b), np.maximum(a, b)
-        edges, of_side, counts = np.unique(low * len(keys) + high, return_inverse=True, return_counts=True)
-        sums = np.bincount(of_side, np.where(a < b, 1, -1), len(edges))
-        of_edge = self._of_node[edges // max(1, len(keys))]
-        self.closed = np.bincount(of_edge, counts % 2, part_count) == 0
-        self.closed &= np.bincount(of_edge, minlength=part_count) > 0
-        self.oriented = np.bincount(of_edge, sums != 0, part_count) == 0
+        proper = edges >= 0  # others are between corners in one vertex
+        of_side = np.broadcast_to(self.of_face[:, None], edges.shape)[proper]
+        forward = mesh.faces == mesh.edges[mesh.face_edges, 0]
+        counts = np.bincount(edges[proper], minlength=len(of_edges))
+        sums = np.bincount(edges[proper], np.where(forward[proper], 1, -1), len(of_edges))
+        self.closed = np.bincount(of_side, counts[edges[proper]] % 2, part_count) == 0
+        self.closed &= np.bincount(of_side, minlength=part_count) > 0
+        self.oriented = np.bincount(of_side, sums[edges[proper]] != 0, part_count) == 0
 
     def boxes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the lowest and the highest corners of the parts' bounding boxes, each of shape [part_count, 3]."""
@@ -223,41 +234,46 @@ class _Parts:
             for bound in (np.minimum, np.maximum)
         )
 
-    def meeting(self, edges: np.ndarray, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
+    def meeting(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
         """Returns keys of the pairs of parts that meet, and of those of which an edge passes through a face.
 
-        Arguments are those of :meth:`ContainmentFinder.find`. The part of the edge comes first in each key; parts that
-        share vertices are among those that meet, in both orders.
+        The part of the edge comes first in each key; parts that share vertices are among those that meet, in both
+        orders.
+
+        Args:
+            found: The intersections.
         """
-        rows, of_edge = self._parts_at_edges(edges[found.pairs[:, 0]].astype(np.int64))
-        keys = _keys(np.stack([of_edge, self.of_cell[found.pairs[rows, 1]]], axis=1), len(self.body))
-        (shared,) = np.nonzero(np.bincount(self._node_vertices, minlength=self._vertex_count) > 1)
-        at_shared, of_node = self._parts_at(shared)
-        counts = np.bincount(at_shared, minlength=len(shared))
-        firsts = np.cumsum(counts) - counts
-        one, other = _expand(firsts[at_shared], (firsts + counts)[at_shared])
+        rows, of_edge = self._parts_at_edges(self._edges[found.pairs[:, 0]].astype(np.int64))
+        keys = _keys(np.stack([of_edge, self.of_face[found.pairs[rows, 1]]], axis=1), len(self.body))
+        vertices, firsts, counts = np.unique(self._node_vertices[self._sharing], return_index=True, return_counts=True)
+        of_node = self._of_node[self._sharing]
+        ranges = np.repeat(firsts, counts), np.repeat(firsts + counts, counts)
+        one, other = _expand(*ranges)
         sharing = _keys(np.stack([of_node[one], of_node[other]], axis=1), len(self.body))
         return np.union1d(keys, sharing), np.unique(keys[found.crosses[rows]])
 
-    def ends_of_touching(self, part: int, body: int, edges: np.ndarray, found: Intersections) -> np.ndarray:
+    def ends_of_touching(self, part: int, body: int, found: Intersections) -> np.ndarray:
         """Returns the vertices of all edges of a part that meet faces of a body or have a vertex of it, ascending.
 
         Whatever of the part is left without these edges stays on one side of the body, and has one of these vertices
         unless it is the whole part.
         """
         own = self._ordered_vertices[self._starts[part] : [*self._starts, None][part + 1]]
-        others = self._node_vertices[self.body[self._of_node] == body]
-        meets = edges[found.pairs[self.body[self.of_cell[found.pairs[:, 1]]] == body, 0]]
-        shared = edges[np.isin(edges, np.intersect1d(own, others)).any(axis=1)]
+        others = self._node_vertices[(self._of_node >= 0) & (self.body[self._of_node] == body)]
+        meets = self._edges[found.pairs[self.body[self.of_face[found.pairs[:, 1]]] == body, 0]]
+        shared = self._edges[np.isin(self._edges, np.intersect1d(own, others)).any(axis=1)]
         touching = np.concatenate([meets, shared]).astype(np.int64)
         return np.unique(touching[np.isin(touching, own).all(axis=1)])
 
+    @property
+    def _sharing(self) -> slice:
+        """The nodes of the vertices that bodies share, sorted by vertex."""
+        return slice(len(self._first_node), None)
+
     def _parts_at(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all parts that have each vertex: rows of the argument, and the parts."""
-        first = np.searchsorted(self._sorted_vertices, vertices)
-        last = np.searchsorted(self._sorted_vertices, vertices, side="right")
-        rows, places = _expand(first, last)
-        return rows, self._of_node[self._by_vertex[places]]
+        rows, nodes = _expand(self._first_node[vertices], self._last_node[vertices])
+        return rows, self._of_node[nodes]
 
     def _parts_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all parts that have both vertices of each edge: rows of the argument, and the parts."""
@@ -266,6 +282,27 @@ class _Parts:
         count = len(self.body)
         both = np.intersect1d(rows * count + first, other_rows * count + other)
         return both // count, both % count
+
+
+def _divide(elements: np.ndarray, is_shared: np.ndarray, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gives elements that bodies share a number for each body.
+
+    Args:
+        elements: Numbers of the elements of each face, -1 for none, shape [n, 3].
+        is_shared: Which elements bodies may share, shape [m].
+        bodies: Body of each face, shape [n].
+
+    Returns:
+        The elements of each face, those shared with new numbers from m on, shape [n, 3], and the element of each
+        number, shape [k]. New numbers are sorted by element, then by body.
+    """
+    divided = elements.astype(np.int64)
+    places = is_shared[elements] & (elements >= 0)
+    body_count = int(bodies.max(initial=-1)) + 1
+    keys = divided[places] * body_count + np.broadcast_to(bodies[:, None], divided.shape)[places]
+    unique, numbers = np.unique(keys, return_inverse=True)
+    divided[places] = len(is_shared) + numbers
+    return divided, np.concatenate([np.arange(len(is_shared)), unique // max(1, body_count)])
 
 
 def _connect(nodes: np.ndarray, count: int) -> np.ndarray:
@@ -287,43 +324,56 @@ def _connect(nodes: np.ndarray, count: int) -> np.ndarray:
             roots = roots[roots]
 
 
-def _enclosing(low: np.ndarray, high: np.ndarray, outer_low: np.ndarray, outer_high: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields the pairs of an inner box and an outer one that contains it, borders included, a chunk at a time.
+def _enclosing(
+    low: np.ndarray, high: np.ndarray, outer_low: np.ndarray, outer_high: np.ndarray, axes: int
+) -> np.ndarray:
+    """Returns the pairs of an inner box and an outer one that contains it, borders included.
 
-    The outer boxes are grouped by their widths along the first axis and sorted there, so that those that may contain a
-    box are neighbours.
+    Outer boxes are grouped by size. For each group, boxes are put into a grid by their lowest corners; the cells are as
+    large as the outer boxes, so that an outer box is in the cell of the inner box or in the one before along some axes.
 
     Args:
-        low: Lowest corners of the inner boxes, shape [n, d].
+        low: Lowest corners of the inner boxes, shape [n, 3].
         high: Highest corners.
-        outer_low: Lowest corners of the outer boxes, shape [m, d].
+        outer_low: Lowest corners of the outer boxes, shape [m, 3].
         outer_high: Highest corners.
+        axes: Number of axes, from the first one, along which the boxes are finite, and the grid has cells.
 
-    Yields:
-        Indices of the inner and the outer boxes, shape [k, 2].
+    Returns:
+        Indices of the inner and the outer boxes, sorted, shape [k, 2].
     """
-    if not len(low):
-        return
-    (near,) = np.nonzero(((outer_low <= low.max(axis=0)) & (outer_high >= high.min(axis=0))).all(axis=1))
-    width = outer_high[near, 0] - outer_low[near, 0]
-    _, group = np.frexp(width)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    near = np.zeros(0, dtype=np.int64)
+    if len(low):
+        (near,) = np.nonzero(((outer_low <= low.max(axis=0)) & (outer_high >= high.min(axis=0))).all(axis=1))
+    if not len(near):
+        return found[0]
+    starts, outer_starts = 0.5 * low[:, :axes], 0.5 * outer_low[near, :axes]  # halves, so that nothing overflows
+    sizes = (0.5 * outer_high[near, :axes] - outer_starts).max(axis=1)
+    corner = np.minimum(starts.min(axis=0), outer_starts.min(axis=0))
+    extent = np.maximum(starts.max(axis=0), outer_starts.max(axis=0)) - corner
+    smallest = max(float(extent.max()) * 2.0**-20, float(np.finfo(np.float64).tiny))  # cells fit into 21 bits
+    group = np.ceil(np.log2(np.maximum(sizes / smallest, 1.0)))
+    weights = np.array([1 << 42, 1 << 21, 1])[:axes]
     for number in np.unique(group):
-        members = near[group == number]
-        members = members[np.argsort(outer_low[members, 0], kind="stable")]
-        lows = outer_low[members, 0]
-        widest = np.nextafter(width[group == number].max(), np.inf)  # differences are rounded
-        first = np.searchsorted(lows, np.nextafter(low[:, 0] - widest, -np.inf))
-        last = np.searchsorted(lows, low[:, 0], side="right")
-        totals = np.cumsum(last - first)
-        at = 0
-        while at < len(low):
-            before = totals[at - 1] if at else 0
-            stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
-            rows, places = _expand(first[at:stop], last[at:stop])
-            inner, outer = at + rows, members[places]
-            kept = (outer_low[outer] <= low[inner]).all(axis=1) & (high[inner] <= outer_high[outer]).all(axis=1)
-            yield np.stack([inner[kept], outer[kept]], axis=1)
-            at = stop
+        cell = smallest * 2.0**number * (1.0 + 1e-6)  # cells are numbered with rounding
+        (members,) = np.nonzero(group == number)
+        keys = (np.floor((outer_starts[members] - corner) / cell).astype(np.int64) + 1) @ weights
+        order = np.argsort(keys, kind="stable")
+        keys, members = keys[order], near[members[order]]
+        of_inner = (np.floor((starts - corner) / cell).astype(np.int64) + 1) @ weights
+        for step in itertools.product((0, 1), repeat=axes):
+            wanted = of_inner - np.array(step) @ weights
+            first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
+            for rows, places in _expand_in_chunks(first, last):
+                inner, outer = rows, members[places]
+                for axis in range(3):
+                    kept = outer_low[outer, axis] <= low[inner, axis]
+                    kept &= high[inner, axis] <= outer_high[outer, axis]
+                    inner, outer = inner[kept], outer[kept]
+                found.append(np.stack([inner, outer], axis=1))
+    pairs = np.concatenate(found)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
 def _distances_along_x(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -339,6 +389,19 @@ def _expand(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray
     counts = last - first
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+
+
+def _expand_in_chunks(first: np.ndarray, last: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields what :func:`_expand` returns, about a chunk at a time, without empty ranges."""
+    (ranges,) = np.nonzero(last > first)
+    totals = np.cumsum((last - first)[ranges])
+    at = 0
+    while at < len(ranges):
+        before = totals[at - 1] if at else 0
+        stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
+        rows, places = _expand(first[ranges[at:stop]], last[ranges[at:stop]])
+        yield ranges[at + rows], places
+        at = stop
 
 
 def _keys(pairs: np.ndarray, count: int) -> np.ndarray:

@@ -102,7 +102,7 @@ class _SegmentChecker:
         self._finder = self._containment = None
         if checks.intersections:
             self._finder = self._detector.intersection_finder()
-            self._containment = ContainmentFinder(segment.faces, segment.face_meshes, len(segment.faces))
+            self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
         self._last: SceneIntersections | None = None  # those found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
@@ -166,7 +166,7 @@ class _SegmentChecker:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
                 return selection.counted_pairs(meshes, pairs) & ~ignored
 
-            inside = self._containment.find(x, self._mesh.edges, found, are_wanted)
+            inside = self._containment.find(x, found, are_wanted)
             self._last = last = name_intersections(self.segment, self._mesh, found, inside, x, time, selection)
         return last
 

@@ -179,7 +179,7 @@ class HitsCsv(RecordFile):
         """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
-        times = 2 if interval.index == self._last_index else 1
+        times = 2 if interval.index == self._last_index and interval.end > interval.start else 1
         yield from _csv_rows(where, [contacts], _contact_rows)
         yield from _csv_rows(where, (result.intersections or ())[:times], _intersection_rows)
         yield from _csv_rows(where, (result.proximities or ())[:times], _proximity_rows)
