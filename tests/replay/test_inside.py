@@ -64,11 +64,8 @@ def test_three_in_one_another_and_parts(stage):
     two = [*moved(CORNERS, (4, 4, 4)), *moved(CORNERS, (20, 0, 0))]
     add_mesh(stage, "/World/Two", two, [4] * 12, SIDES + [corner + 8 for corner in SIDES])
     inside = sum_up(bsc.Scene(save(stage))).intersections[0].inside
-    letters = {
-        (inner.removeprefix("/World/"), outer.removeprefix("/World/")): n for (inner, outer), n in inside.items()
-    }
     names = [("B", "A"), ("C", "A"), ("C", "B"), ("Two", "A"), ("Two", "B"), ("Two", "C")]
-    assert letters == dict.fromkeys(names, 1)
+    assert inside == {(f"/World/{inner}", f"/World/{outer}"): 1 for inner, outer in names}
 
 
 @pytest.fixture

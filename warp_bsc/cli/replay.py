@@ -158,7 +158,7 @@ def add_to(commands: Commands) -> None:
     which.add_argument(
         "--ignore-initial",
         action="store_true",
-        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; of meshes "
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; of those "
         "that are inside others then, ignore only that they are inside",
     )
     which.add_argument(
@@ -212,8 +212,8 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--baseline",
         metavar="FILE",
-        help="compare with the JSON file of an earlier replay: print which meshes collide, cross, are inside others or, "
-        "with --min-distance, near each other at times at which they were not",
+        help="compare with the JSON file of an earlier replay: print which meshes collide, cross, are inside others "
+        "or, with --min-distance, near each other at times at which they were not",
     )
     out.add_argument(
         "--fail-on",

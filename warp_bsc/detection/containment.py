@@ -90,7 +90,7 @@ class ContainmentFinder:
         return _Parts(self._mesh, self._bodies)
 
     def _decide(self, x: np.ndarray, found: Intersections, pairs: np.ndarray, is_touching: np.ndarray) -> Containment:
-        """Returns which parts are inside, given pairs of an inner and a closed part that pass through each other nowhere.
+        """Returns which parts are inside, given pairs of an inner and a closed part that do not pass through each other.
 
         Args:
             x: As of :meth:`find`.
@@ -245,7 +245,8 @@ class _Parts:
         """
         rows, of_edge = self._parts_at_edges(self._edges[found.pairs[:, 0]].astype(np.int64))
         keys = _keys(np.stack([of_edge, self.of_face[found.pairs[rows, 1]]], axis=1), len(self.body))
-        vertices, firsts, counts = np.unique(self._node_vertices[self._sharing], return_index=True, return_counts=True)
+        shared = self._node_vertices[self._sharing]
+        _, firsts, counts = np.unique(shared, return_index=True, return_counts=True)
         of_node = self._of_node[self._sharing]
         ranges = np.repeat(firsts, counts), np.repeat(firsts + counts, counts)
         one, other = _expand(*ranges)

@@ -72,7 +72,7 @@ class IntervalChecker:
             yield replace(result, work=Work(self._worker, reading, time.perf_counter() - started))
 
     def selection_without_initial(self) -> Selection:
-        """Returns the selection that also ignores what crosses at the first time, and that what is inside then is so."""
+        """Returns the selection that also ignores what crosses, and that something is inside, at the first time."""
         interval = self.scene.interval(0)
         found = summarize_intersections(self._at(interval).find(interval.x0, interval.start))
         crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}

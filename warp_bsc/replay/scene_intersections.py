@@ -1,4 +1,4 @@
-"""What intersects at one time of a scene: edges that meet faces, the curves of cut surfaces, and parts inside others."""
+"""What intersects at one time of a scene: edges that meet faces, curves of cut surfaces, and parts inside others."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -53,7 +53,7 @@ class CollisionSpan:
 
 @dataclass(frozen=True)
 class IntersectionSpan:
-    """Consecutive times of a scene at all of which two meshes intersect, a mesh intersects itself, or is inside another.
+    """Consecutive times of a scene at all of which two meshes or a mesh with itself intersect, or one is inside another.
 
     Attributes:
         meshes: Names of the two; the one that is inside first.

@@ -26,8 +26,8 @@ from .summary import Summary
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
 NAME = f"{__name__}:Collisions"
-"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked; its warning is
-``Inside``, for a mesh that is wholly inside another, which may be meant."""
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked; its
+warning is ``Inside``, for a mesh that is wholly inside another, which may be meant."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
