@@ -90,7 +90,7 @@ class ContainmentFinder:
         return _Parts(self._mesh, self._bodies)
 
     def _decide(self, x: np.ndarray, found: Intersections, pairs: np.ndarray, is_touching: np.ndarray) -> Containment:
-        """Returns which parts are inside, given pairs of an inner and a closed part that do not pass through each other.
+        """Returns which parts are inside, given pairs of a part and a closed one that do not pass through each other.
 
         Args:
             x: As of :meth:`find`.
@@ -105,7 +105,7 @@ class ContainmentFinder:
         touches = np.bincount(case_of_pair, is_touching, len(cases)) > 0
         queries = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
         for case in np.flatnonzero(touches):
-            ends = parts.ends_of_touching(*cases[case], found)
+            ends = parts.ends_of_touching(cases[case, 0], cases[case, 1], found)
             queries[case] = ends if len(ends) else queries[case]
         case_of_query = np.repeat(np.arange(len(cases)), list(map(len, queries)))
         vertices = np.concatenate([np.zeros(0, np.int64), *queries])

@@ -53,7 +53,7 @@ class CollisionSpan:
 
 @dataclass(frozen=True)
 class IntersectionSpan:
-    """Consecutive times of a scene at all of which two meshes or a mesh with itself intersect, or one is inside another.
+    """Consecutive times of a scene at all of which two meshes intersect, a mesh itself, or one is inside another.
 
     Attributes:
         meshes: Names of the two; the one that is inside first.
@@ -195,7 +195,8 @@ class Summary:
 
         Of the same time, edges in faces come before parts inside; then those with the most come first.
         """
-        spans, running = [], {}
+        spans: list[IntersectionSpan] = []
+        running: dict[tuple[bool, tuple[str, str]], list[tuple[float, int, int]]] = {}
         for sample in self.intersections:
             found = {(False, meshes): numbers for meshes, numbers in sample.mesh_pairs.items()}
             found |= {(True, meshes): (0, parts) for meshes, parts in sample.inside.items()}
@@ -205,10 +206,10 @@ class Summary:
                     becomes = "crosses" * any(sample.mesh_pairs.get(pair, (0,))[0] for pair in (meshes, meshes[::-1]))
                 else:
                     becomes = "inside" * any(pair in sample.inside for pair in (meshes, meshes[::-1]))
-                spans.append(_span(*key, running.pop(key), False, becomes))
+                spans.append(_span(inside, meshes, running.pop(key), False, becomes))
             for key, numbers in found.items():
                 running.setdefault(key, []).append((sample.time, *numbers))
-        spans += [_span(*key, samples, True, "") for key, samples in running.items()]
+        spans += [_span(inside, meshes, samples, True, "") for (inside, meshes), samples in running.items()]
         return sorted(spans, key=lambda span: (span.since, span.inside, -span.most))
 
     @cached_property

@@ -6,6 +6,7 @@ const REST_COLOR = [0.62, 0.64, 0.67];
 const LIT_COLOR = [0.93, 0.28, 0.22];
 const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1]];
 const CURVE_COLOR = [0.55, 0.24, 0.92];
+const NEAR_COLOR = [0.05, 0.6, 0.35];
 const CHOSEN_COLOR = [0.05, 0.75, 0.95];
 
 const TRIANGLE_SHADER = `#version 300 es
@@ -130,7 +131,8 @@ const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_C
 
 // Returns the blocks of an interval as the arrays that are drawn.
 async function loadView(index) {
-  const [view, hits, ...rest] = await Promise.all(["view", "hits", "rest"].map((name) => unpack(`${name}-${index}`)).concat(unpack(`rest-${index + 1}`)));
+  const names = [`view-${index}`, `hits-${index}`, ...["rest", "near"].flatMap((name) => [`${name}-${index}`, `${name}-${index + 1}`])];
+  const [view, hits, ...atEnds] = await Promise.all(names.map(unpack));
   if (!view) return null;
   const topology = await unpack(`faces-${view.faces}`);
   const faces = topology.faces, lit = new Int32Array(3 * view.lit.length);
@@ -139,8 +141,11 @@ async function loadView(index) {
   return {
     faces, lit, meshes: topology.mesh_of_vertex, start: view.start, end: view.end, of: view.of,
     contacts, toi: hits ? hits.toi : NO_FLOATS, kinds: hits ? hits.kind : NO_INTS,
-    rest: rest.map((block) => (block ? block.position : NO_FLOATS)),
-    curves: rest.map((block) => (block ? block.curves : NO_FLOATS)),
+    // at the start and at the end of the interval
+    rest: atEnds.slice(0, 2).map((block) => (block ? block.position : NO_FLOATS)),
+    curves: atEnds.slice(0, 2).map((block) => (block ? block.curves : NO_FLOATS)),
+    inside: atEnds.slice(0, 2).map((block) => (block ? block.position.filter((_, i) => block.kind[Math.floor(i / 3)] === INSIDE) : NO_FLOATS)),
+    close: atEnds.slice(2).map((block) => (block ? block.position : NO_FLOATS)),
   };
 }
 
@@ -169,7 +174,7 @@ function makeViewer() {
     ask();
   }
 
-  // Shows an interval. `at`, if given, is a row of the table: {isRest, place, time}.
+  // Shows an interval. `at`, if given, is a row of the table: {from, place, time}, from "hits", "rest" or "near".
   async function show(index, at = null) {
     const isNew = index !== state.index;
     state.index = index;
@@ -195,14 +200,16 @@ function makeViewer() {
     [state.parts, state.shown, state.chosen] = [[], shown, null];
     const legend = byId("viewer-legend");
     legend.replaceChildren();
-    const [hits, rest] = [hitsIn(index), restAt(index)];
-    let title = plural(hits, "collision");
-    if (data.rest.length) title += `; ${plural(rest, "edge")} in faces at the start, ${count(restAt(index + 1))} at the end`;
+    let title = plural(hitsIn(index), "collision");
+    const atEnds = (numberAt, one, how) => { title += `; ${plural(numberAt(index), one)} ${how} at the start, ${count(numberAt(index + 1))} at the end`; };
+    if (data.rest.length) atEnds(edgesAt, "edge", "in faces");
+    if (insideAt(index) + insideAt(index + 1)) atEnds(insideAt, "part", "inside");
+    if (data.near.length) atEnds(nearAt, "pair", "near");
     const isEmpty = !shown;
     byId("viewer-title").textContent = title;
     byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
     if (isEmpty) {
-      say(hits + rest + restAt(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
+      say(hitsIn(index) + atStart(index) + atStart(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       return;
     }
@@ -227,12 +234,20 @@ function makeViewer() {
     shown.all = vertexArray(gl, triangles, positions, faces);
     shown.some = vertexArray(gl, triangles, positions, lit);
     shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
+    if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
+    if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "near pair");
+    // Marks of what is at the start, and at the end.
+    shown.marks = shown.inside.map((inside, end) => {
+      const places = new Float32Array([...inside, ...shown.close[end]]), markColors = new Float32Array(places.length);
+      for (let i = 0; i < places.length; i += 3) markColors.set(i < inside.length ? CURVE_COLOR : NEAR_COLOR, i);
+      return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
+    });
     shown.cuts = shown.curves.map((curves) => vertexArray(gl, lines, [["start", curves, 3, [24, 0]], ["end", curves, 3, [24, 12]]]));
-    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts];
+    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks];
 
     const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
     shown.whole = boxOf(moving.some((values) => values.length) ? moving : [start]);
-    const places = [contacts, ...shown.rest].filter((values) => values.length);
+    const places = [contacts, ...shown.rest, ...shown.close].filter((values) => values.length);
     shown.near = places.length ? boxOf(places) : { ...shown.whole };
     shown.near.radius = Math.max(shown.near.radius * 1.2, shown.whole.radius * 0.12);
     shown.median = toi.length ? Array.from(toi).sort((a, b) => a - b)[toi.length >> 1] : 0;
@@ -245,9 +260,10 @@ function makeViewer() {
   }
 
   // Marks the place of a row, and moves the view to it.
-  function choose({ isRest, place, time }) {
-    const from = isRest ? state.shown.rest[Math.round(time)] : state.shown.contacts;
-    const point = from.slice(3 * place, 3 * place + 3);
+  function choose({ from, place, time }) {
+    const { contacts, rest, close } = state.shown;
+    const places = from === "hits" ? contacts : (from === "rest" ? rest : close)[Math.round(time)];
+    const point = places.slice(3 * place, 3 * place + 3);
     state.time = time;
     if (point.length < 3) return;
     state.chosen?.free();
@@ -311,13 +327,16 @@ function makeViewer() {
     // What is behind a surface shines through it faintly. Cut curves belong to one end of the interval.
     const end = state.time < 0.5 ? 0 : 1;
     // Many contacts would hide one another, and all else.
-    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, shown.toi.length)) ** 1.4) * scale;
+    const marks = shown.marks[end], dots = shown.toi.length + marks.count;
+    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
       set(lines, { pixel: [(2 * scale) / width, (2 * scale) / height], color: [...CURVE_COLOR, fade] });
       gl.bindVertexArray(shown.cuts[end].array);
       gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
-      set(points, { time: state.time, fade, size, core: shown.toi.length > 300 ? 2 : 0.68 });
+      set(points, { time: state.time, fade, size, core: dots > 300 ? 2 : 0.68 });
+      gl.bindVertexArray(marks.array);
+      gl.drawArrays(gl.POINTS, 0, marks.count);
       gl.bindVertexArray(shown.dots.array);
       gl.drawArrays(gl.POINTS, 0, shown.toi.length);
     }
