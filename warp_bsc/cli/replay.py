@@ -466,7 +466,7 @@ def _open_outputs(
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
-        (arguments.json, lambda path: HitsJson(path, facts=facts)),
+        (arguments.json, lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands)),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),

@@ -73,7 +73,7 @@ def print_replay(console: Console, summary: Summary) -> None:
             f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
         )
     if summary.validation:
-        _print_validation(console, summary.validation)
+        _print_validation(console, summary.validation, scene.has_strands)
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
@@ -182,12 +182,13 @@ def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
 def _print_collisions(console: Console, summary: Summary) -> None:
     """Prints the number of pairs that collide, in all and by meshes, and the first contact."""
     colliding = summary.colliding
-    vertex_face = sum(interval.vertex_face_hits for interval in colliding)
-    edge_edge = sum(interval.edge_edge_hits for interval in colliding)
+    kinds = ["vertex_face", "edge_edge"] + ["vertex_edge", "vertex_vertex"] * summary.scene.has_strands
+    numbers = [sum(getattr(interval, f"{kind}_hits") for interval in colliding) for kind in kinds]
+    texts = [f"{number:,} {kind.replace('_', '-')}" for number, kind in zip(numbers, kinds, strict=True)]
     say(
         console,
         f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
-        f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
+        f"{', '.join(texts[:-1])} and {texts[-1]} pairs.",
     )
     spans = defaultdict(list)
     for span in summary.collision_spans:
@@ -297,7 +298,7 @@ def _history(span: IntersectionSpan) -> str:
     return f"from {span.since:g} to {span.until:g}, {numbers}: {says}"
 
 
-def _print_validation(console: Console, found: ValidationSummary) -> None:
+def _print_validation(console: Console, found: ValidationSummary, has_strands: bool) -> None:
     """Prints how the answers compare with the exact checker's."""
     wrong = found.disagreements
     say(
@@ -305,6 +306,8 @@ def _print_validation(console: Console, found: ValidationSummary) -> None:
         f"Validated by the exact checker: {count(found.hits, 'collision')} and "
         f"{count(found.others, 'other pair')}, {count(len(wrong), 'disagreement')}.",
     )
+    if has_strands:
+        say(console, "Collisions of curves and points are not validated.")
     for line in wrong[:LONGEST]:
         say(console, f"  {line}")
     if len(wrong) > LONGEST:

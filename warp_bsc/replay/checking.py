@@ -16,7 +16,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .results import IntervalResult, Work, summarize, summarize_intersections
-from .scene_contacts import find_contacts
+from .scene_contacts import SceneContacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
@@ -103,6 +103,7 @@ class _SegmentChecker:
         if checks.intersections:
             self._finder = self._detector.intersection_finder()
             self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
+        self._strands = _StrandDetector(segment, checks) if segment.has_strands else None
         self._last: SceneIntersections | None = None  # those found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
@@ -127,6 +128,10 @@ class _SegmentChecker:
             near = self._find_near(interval.x0, interval.start)
             proximities = near, self._find_near(interval.x1, interval.end)
         contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection, intersections)
+        certified = collisions.certified
+        if self._strands and not self._is_still:
+            more, is_certified = self._strands.find(interval, self._checks.selection, bool(intersections))
+            contacts, certified = join_contacts(contacts, more), certified and is_certified
         validation = None
         if most != 0:
             validation = validate(
@@ -142,7 +147,7 @@ class _SegmentChecker:
             contacts,
             intersections,
             proximities,
-            certified=collisions.certified,
+            certified=certified,
             stats=collisions.stats,
             validation=validation,
         )
@@ -181,6 +186,33 @@ class _SegmentChecker:
         found = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
         self._last_near = x, found
         return found
+
+
+class _StrandDetector:
+    """Finds the collisions of the curves and points of a segment, with each other and with its meshes."""
+
+    def __init__(self, segment: Segment, checks: Checks):
+        self._mesh = CollisionMesh(
+            segment.faces,
+            segment.vertex_count,
+            edges=segment.free_edges,
+            points=segment.points,
+            radius=segment.radius,
+            device=checks.device,
+        )
+        self._detector = CollisionDetector(self._mesh, method=checks.method)
+
+    def find(self, interval: Interval, selection: Selection, is_compared: bool) -> tuple[SceneContacts, bool]:
+        """Returns the contacts in an interval, and whether none is missing.
+
+        Args:
+            interval: The interval.
+            selection: Which pairs of meshes count.
+            is_compared: Whether contacts of meshes are compared with intersections.
+        """
+        collisions = self._detector.detect(interval.x0, interval.x1)
+        assert isinstance(collisions, Collisions)  # nothing is captured here
+        return find_strand_contacts(interval, self._mesh, collisions, selection, is_compared), collisions.certified
 
 
 def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:

@@ -135,7 +135,7 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
 
 
 def _rebuild_contacts(interval: Interval, record: dict, is_compared: bool) -> SceneContacts:
-    rows = record["contacts"]
+    rows, phases = record["contacts"], {None: -1} | {phase: number for number, phase in enumerate(PHASES)}
     return SceneContacts(
         **_rebuild_pairs(interval, rows),
         interval=interval,
@@ -146,7 +146,7 @@ def _rebuild_contacts(interval: Interval, record: dict, is_compared: bool) -> Sc
         counted=np.ones(len(rows), dtype=bool),
         ignored={(first, second): hits for (first, second), hits in (pair.values() for pair in record["ignored"])},
         separate=np.array([row["separate"] for row in rows], dtype=bool) if is_compared else None,
-        phase=np.array([PHASES.index(row["phase"]) for row in rows], dtype=np.int64) if is_compared else None,
+        phase=np.array([phases[row["phase"]] for row in rows], dtype=np.int64) if is_compared else None,
     )
 
 

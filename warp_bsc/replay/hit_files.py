@@ -13,7 +13,7 @@ import orjson
 from .. import __version__
 from ..usd.scene import Scene
 from .outputs import RecordFile
-from .results import IntersectionSummary, IntervalResult
+from .results import IntersectionSummary, IntervalResult, IntervalSummary
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, ScenePairs
@@ -65,18 +65,20 @@ class HitsJson(RecordFile):
     :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it.
     """
 
-    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any]):
+    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], has_strands: bool):
         """Opens the file.
 
         Args:
             path: The file's place.
             facts: What :func:`replay_facts` returns.
+            has_strands: Whether the scene has curves or points.
 
         Raises:
             OSError: If it cannot be written.
         """
         super().__init__(path)
         self._facts = facts
+        self._has_strands = has_strands
 
     def head(self) -> str:
         """Returns the text before the first interval."""
@@ -94,6 +96,7 @@ class HitsJson(RecordFile):
             "hits": interval.hits,
             "vertex_face_hits": interval.vertex_face_hits,
             "edge_edge_hits": interval.edge_edge_hits,
+            **self._point_hits(interval),
             "earliest": asdict(interval.earliest) if interval.earliest else None,
             "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
             "ignored": _mesh_pairs_to_list(interval.ignored.items()),
@@ -123,6 +126,12 @@ class HitsJson(RecordFile):
             if not is_joined:
                 yield from _list("near_pairs_at_end", end, _proximity_rows)
         yield "}"
+
+    def _point_hits(self, interval: IntervalSummary) -> dict[str, int]:
+        """Returns the numbers of collisions that only scenes with curves or points have."""
+        if not self._has_strands:
+            return {}
+        return {"vertex_edge_hits": interval.vertex_edge_hits, "vertex_vertex_hits": interval.vertex_vertex_hits}
 
     def tail(self, summary: Summary) -> str:
         """Returns the text after the last interval."""
@@ -222,8 +231,9 @@ def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
         "normal": contacts.normal[rows].tolist(),
     }
     if contacts.phase is not None and contacts.separate is not None:
-        fields["phase"] = [PHASES[phase] for phase in contacts.phase[rows].tolist()]
-        fields["separate"] = contacts.separate[rows].tolist()
+        phases, separate = contacts.phase[rows].tolist(), contacts.separate[rows].tolist()
+        fields["phase"] = [PHASES[phase] if phase >= 0 else None for phase in phases]
+        fields["separate"] = [one if phase >= 0 else None for phase, one in zip(phases, separate, strict=True)]
     return _to_rows(fields)
 
 

@@ -261,7 +261,13 @@ def _data(summary: Summary) -> dict:
         "partial": "",
         "tiles": tiles,
         "intervals": [
-            (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
+            (
+                interval.start,
+                interval.end,
+                interval.vertex_face_hits,
+                interval.edge_edge_hits,
+                *([interval.vertex_edge_hits + interval.vertex_vertex_hits] * scene.has_strands),
+            )
             for interval in summary.intervals
         ],
         "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],

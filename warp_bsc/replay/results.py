@@ -8,7 +8,7 @@ import numpy as np
 from ..detection.collisions import DetectionStats
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import count_by_meshes
+from .scene_pairs import KINDS, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
 
@@ -118,19 +118,22 @@ class IntervalSummary:
         end: Time code at which it ends.
         vertex_face_hits: Number of vertex-face pairs that collide.
         edge_edge_hits: Number of edge-edge pairs that collide.
+        vertex_edge_hits: Number of pairs of a point and an edge of a curve that collide.
+        vertex_vertex_hits: Number of pairs of points that collide.
         toi_counts: Number of pairs by their time of impact, in equal parts of the interval.
         mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
             with itself is there twice.
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
             move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes, and not
+            those with an element of curves or points.
         validation: The comparison with the exact checker, None if none was asked for.
         intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
         ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
-        phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
+        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
         proximities: The proximities at the start and at the end, as ``intersections``; None if they were not looked
             for.
     """
@@ -140,6 +143,8 @@ class IntervalSummary:
     end: float
     vertex_face_hits: int
     edge_edge_hits: int
+    vertex_edge_hits: int
+    vertex_vertex_hits: int
     toi_counts: tuple[int, ...]
     mesh_pairs: dict[tuple[str, str], int]
     earliest: Contact | None
@@ -155,7 +160,7 @@ class IntervalSummary:
     @property
     def hits(self) -> int:
         """Number of pairs that collide."""
-        return self.vertex_face_hits + self.edge_edge_hits
+        return self.vertex_face_hits + self.edge_edge_hits + self.vertex_edge_hits + self.vertex_vertex_hits
 
     @property
     def pairs_tested(self) -> int:
@@ -231,14 +236,19 @@ def summarize(
     if proximities:
         start, end = map(_summarize_proximities, proximities)
         near = start, end
+    phases = None
+    if contacts.phase is not None:
+        phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
     hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
-    edge_edge = int(contacts.kind.sum())
+    by_kind = np.bincount(contacts.kind, minlength=len(KINDS)).tolist()
     return IntervalSummary(
         index=interval.index,
         start=interval.start,
         end=interval.end,
-        vertex_face_hits=len(contacts) - edge_edge,
-        edge_edge_hits=edge_edge,
+        vertex_face_hits=by_kind[0],
+        edge_edge_hits=by_kind[1],
+        vertex_edge_hits=by_kind[2],
+        vertex_vertex_hits=by_kind[3],
         toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
         mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
@@ -248,7 +258,7 @@ def summarize(
         intersections=at_rest,
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
-        phases=None if contacts.phase is None else tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()),
+        phases=phases,
         proximities=near,
     )
 

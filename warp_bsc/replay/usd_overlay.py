@@ -27,6 +27,8 @@ COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
     "VertexFace": (1.0, 0.9, 0.2),
     "EdgeEdge": (1.0, 0.5, 0.0),
+    "VertexEdge": (1.0, 0.7, 0.1),
+    "VertexVertex": (1.0, 0.8, 0.5),
     "Intersections": (0.6, 0.2, 1.0),
     "Inside": (0.1, 0.5, 1.0),
     "Near": (0.1, 0.85, 0.4),
@@ -62,6 +64,8 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "VertexFace": ("PointInstancer", _CONTACTS),
     "EdgeEdge": ("PointInstancer", _CONTACTS),
+    "VertexEdge": ("PointInstancer", _CONTACTS),
+    "VertexVertex": ("PointInstancer", _CONTACTS),
     "Intersections": (
         "BasisCurves",
         _EXTENT
@@ -72,7 +76,7 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
 
-_ONLY_IF_FOUND = "Inside", "Near"
+_ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "Inside", "Near"
 """The prims that a layer has only if they are ever there."""
 
 
@@ -84,7 +88,8 @@ class Overlay:
     - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
       are lifted by :data:`LIFT` to both sides, move with the scene, and are there from the start of the interval to its
       end;
-    - ``VertexFace`` and ``EdgeEdge``, markers at the contact points of both kinds, from the start of their interval to
+    - ``VertexFace`` and ``EdgeEdge``, and if there are any, ``VertexEdge`` and ``VertexVertex``, which have curves and
+      points, markers at the contact points of these kinds, from the start of their interval to
       its end. Each is an instance with the primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the
       attribute ``prims`` of ``/Collisions``, which has their names; ``elementA`` and ``elementB``, the two elements in
       the prims' own numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of
@@ -149,7 +154,7 @@ class Overlay:
         contacts = result.contacts
         interval = contacts.interval
         self._sample("Polygons", interval.start, *self._find_polygons(contacts))
-        for kind, name in enumerate(("VertexFace", "EdgeEdge")):
+        for kind, name in enumerate(("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")):
             rows = np.flatnonzero(contacts.kind == kind)
             self._sample(name, interval.start, self._find_points(contacts, rows, {"toi": contacts.toi}))
         for name, arrays in self._find_at_rest(result, 0).items():

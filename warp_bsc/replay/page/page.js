@@ -104,7 +104,8 @@ const edgesAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[i
 const insideAt = (index) => (data.rest[index] ? data.rest[index][3] : 0);
 const restAt = (index) => edgesAt(index) + insideAt(index);
 const nearAt = (index) => (data.near[index] ? data.near[index][1] : 0);
-const hitsIn = (index) => data.intervals[index][2] + data.intervals[index][3];
+const ofPoints = (interval) => interval[4] || 0; // of points with edges of curves and with points
+const hitsIn = (index) => data.intervals[index][2] + data.intervals[index][3] + ofPoints(data.intervals[index]);
 const atStart = (index) => restAt(index) + nearAt(index);
 const isBusy = (index) => hitsIn(index) + atStart(index) + (index === LAST ? atStart(index + 1) : 0) > 0;
 let table = null, rows = null, viewer = null;
@@ -168,6 +169,8 @@ function fillIntervals() {
     const rest = data.rest.slice(at, at + together);
     const most = (column) => rest.reduce((largest, sample) => Math.max(largest, sample[column]), 0);
     let tip = `time ${short(from)} to ${short(to)}\n${count(sum(2))} vertex-face\n${count(sum(3))} edge-edge`;
+    const points = some.reduce((total, interval) => total + ofPoints(interval), 0);
+    if (points) tip += `\n${count(points)} of points with curves and points`;
     if (rest.length) tip += `\n${together > 1 ? "at most " : ""}${count(most(1))} edges through faces`;
     if (rest.length && most(2)) tip += `, ${count(most(2))} touch`;
     if (rest.length && most(3)) tip += `\n${plural(most(3), "part")} inside`;
@@ -180,7 +183,7 @@ function fillIntervals() {
       showInterval(best);
     };
     const place = { from, to: to > from ? to : from + 1, tip, click };
-    bars.push({ ...place, parts: [sum(2), sum(3)] });
+    bars.push({ ...place, parts: [sum(2), sum(3) + points] });
     restBars.push({ ...place, parts: [most(1) + most(2) + most(3)] });
     nearBars.push({ ...place, parts: [near] });
   }
@@ -269,7 +272,7 @@ function filterRows() {
     found.push(row);
   }
   table.show(found);
-  const all = data.intervals.reduce((sum, interval) => sum + interval[2] + interval[3], 0) + data.rest.reduce((sum, _, index) => sum + restAt(index), 0) + data.near.reduce((sum, at) => sum + at[1], 0);
+  const all = data.intervals.reduce((sum, _, index) => sum + hitsIn(index), 0) + data.rest.reduce((sum, _, index) => sum + restAt(index), 0) + data.near.reduce((sum, at) => sum + at[1], 0);
   byId("rows-count").textContent = `${count(found.length)} of ${plural(rows.count, "row")}${rows.count < all ? `; ${count(all)} were found, see the notes` : ""}`;
 }
 
