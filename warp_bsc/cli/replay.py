@@ -262,6 +262,7 @@ def _run(arguments: argparse.Namespace) -> int:
             device,
             intersections=arguments.intersections,
             proximities=arguments.min_distance is not None,
+            strands=scene.has_strands,
         )
     return run_replay(scene, arguments, str(device))
 

@@ -134,7 +134,7 @@ def _print_certificate(console: Console, summary: Summary) -> None:
             f"{count(len(intervals), 'interval')}.",
         )
     elif summary.method == "conservative":
-        unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
+        unsure = sum(interval.unsure for interval in intervals)
         say(
             console,
             f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not "

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..detection.collisions import Collisions
+from ..detection.collisions import Collisions, add_stats
 from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
@@ -128,10 +128,11 @@ class _SegmentChecker:
             near = self._find_near(interval.x0, interval.start)
             proximities = near, self._find_near(interval.x1, interval.end)
         contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection, intersections)
-        certified = collisions.certified
+        certified, stats = collisions.certified, collisions.stats
         if self._strands and not self._is_still:
-            more, is_certified = self._strands.find(interval, self._checks.selection, bool(intersections))
-            contacts, certified = join_contacts(contacts, more), certified and is_certified
+            more, of_strands = self._strands.find(interval, self._checks.selection, bool(intersections))
+            contacts, stats = join_contacts(contacts, more), add_stats(stats, of_strands.stats)
+            certified &= of_strands.certified
         validation = None
         if most != 0:
             validation = validate(
@@ -148,7 +149,7 @@ class _SegmentChecker:
             intersections,
             proximities,
             certified=certified,
-            stats=collisions.stats,
+            stats=stats,
             validation=validation,
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
@@ -202,8 +203,8 @@ class _StrandDetector:
         )
         self._detector = CollisionDetector(self._mesh, method=checks.method)
 
-    def find(self, interval: Interval, selection: Selection, is_compared: bool) -> tuple[SceneContacts, bool]:
-        """Returns the contacts in an interval, and whether none is missing.
+    def find(self, interval: Interval, selection: Selection, is_compared: bool) -> tuple[SceneContacts, Collisions]:
+        """Returns the contacts in an interval, and the detection in which they are.
 
         Args:
             interval: The interval.
@@ -212,7 +213,7 @@ class _StrandDetector:
         """
         collisions = self._detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        return find_strand_contacts(interval, self._mesh, collisions, selection, is_compared), collisions.certified
+        return find_strand_contacts(interval, self._mesh, collisions, selection, is_compared), collisions
 
 
 def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:

@@ -118,7 +118,7 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
             _rebuild_proximities(interval, at_end("near_pairs"), interval.end),
         )
     contacts = _rebuild_contacts(interval, record, bool(intersections))
-    # a scene has no points, so that their pairs have no record
+    # a scene without curves and points has no record of their pairs
     counts = {kind.label: StageCounts(**record["stages"].get(kind.label, {})) for kind in DistanceKind}
     validation = record["validation"]
     if validation:

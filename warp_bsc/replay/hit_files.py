@@ -11,9 +11,10 @@ from typing import Any, TypeVar
 import orjson
 
 from .. import __version__
+from ..detection.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
 from .outputs import RecordFile
-from .results import IntersectionSummary, IntervalResult, IntervalSummary
+from .results import IntersectionSummary, IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, ScenePairs
@@ -78,7 +79,7 @@ class HitsJson(RecordFile):
         """
         super().__init__(path)
         self._facts = facts
-        self._has_strands = has_strands
+        self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
 
     def head(self) -> str:
         """Returns the text before the first interval."""
@@ -94,14 +95,12 @@ class HitsJson(RecordFile):
             "end": interval.end,
             "pairs_tested": interval.pairs_tested,
             "hits": interval.hits,
-            "vertex_face_hits": interval.vertex_face_hits,
-            "edge_edge_hits": interval.edge_edge_hits,
-            **self._point_hits(interval),
+            **{f"{kind}_hits": getattr(interval, f"{kind}_hits") for kind in self._kinds},
             "earliest": asdict(interval.earliest) if interval.earliest else None,
             "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
             "ignored": _mesh_pairs_to_list(interval.ignored.items()),
             "certified": interval.certified,
-            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in ("vertex_face", "edge_edge")},
+            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in self._kinds},
             "validation": asdict(interval.validation) if interval.validation else None,
         }
         if interval.intersections:
@@ -126,12 +125,6 @@ class HitsJson(RecordFile):
             if not is_joined:
                 yield from _list("near_pairs_at_end", end, _proximity_rows)
         yield "}"
-
-    def _point_hits(self, interval: IntervalSummary) -> dict[str, int]:
-        """Returns the numbers of collisions that only scenes with curves or points have."""
-        if not self._has_strands:
-            return {}
-        return {"vertex_edge_hits": interval.vertex_edge_hits, "vertex_vertex_hits": interval.vertex_vertex_hits}
 
     def tail(self, summary: Summary) -> str:
         """Returns the text after the last interval."""

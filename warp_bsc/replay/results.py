@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.collisions import DetectionStats
+from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, count_by_meshes
@@ -126,8 +127,8 @@ class IntervalSummary:
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
             move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes, and not
-            those with an element of curves or points.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes, and
+            where there are curves or points, all pairs of meshes twice.
         validation: The comparison with the exact checker, None if none was asked for.
         intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
@@ -165,7 +166,16 @@ class IntervalSummary:
     @property
     def pairs_tested(self) -> int:
         """Number of candidate pairs."""
-        return self.stats.vertex_face.candidates + self.stats.edge_edge.candidates
+        return sum(stage.candidates for stage in self._stages)
+
+    @property
+    def unsure(self) -> int:
+        """Number of candidate pairs that floating point could not certify."""
+        return sum(stage.unsure for stage in self._stages)
+
+    @property
+    def _stages(self) -> list[StageCounts]:
+        return [getattr(self.stats, kind.label) for kind in DistanceKind]
 
     @property
     def milliseconds(self) -> float:

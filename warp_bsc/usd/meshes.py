@@ -1,4 +1,4 @@
-"""Finds meshes, curves and points of a USD stage, and reads them. Imports pxr, which is slow: import this where used."""
+"""Finds meshes, curves and points of a USD stage and reads them. Imports pxr, which is slow: import this where used."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
