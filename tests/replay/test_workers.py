@@ -127,7 +127,7 @@ def test_two_workers_write_the_same_files(troubled, tmp_path, capsys):
     together = run(troubled, tmp_path / "2", "--workers", "2", *OPTIONS, status=LEFT_OUT)
     assert not say_where(together, alone)
     printed = capsys.readouterr().out
-    assert len(re.findall(r"^  \S+:\d+: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
+    assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
 def test_workers_compare_with_a_baseline(tmp_path, waves):
@@ -320,6 +320,7 @@ def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
     ("name", "number", "gpus", "device"),
     [
         (None, 3, 2, "cuda:1"),
+        ("cuda", 1, 1, "cuda:0"),
         ("cuda", 4, 4, "cuda:0"),
         ("cuda:1", 0, 4, "cuda:1"),
         ("cpu", 1, 4, "cpu"),

@@ -230,7 +230,7 @@ def add_to(commands: Commands) -> None:
         default=1,
         metavar="N",
         help="check intervals in N processes on this machine, which share its cores, or use a GPU each, in turns, "
-        "unless --device names one (default: 1)",
+        "unless --device names one, such as cuda:0; more processes than GPUs share these (default: 1)",
     )
     run.add_argument(
         "--scheduler",

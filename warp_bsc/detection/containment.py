@@ -104,9 +104,12 @@ class ContainmentFinder:
         case_of_pair = case_of_pair.reshape(-1)  # NumPy 2.0 shapes it otherwise
         touches = np.bincount(case_of_pair, is_touching, len(cases)) > 0
         queries = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
-        for case in np.flatnonzero(touches):
-            ends = parts.ends_of_touching(cases[case, 0], cases[case, 1], found)
-            queries[case] = ends if len(ends) else queries[case]
+        if touches.any():
+            of_edges, ends = parts.touching_edges(found)
+            wanted = _keys(cases, int(parts.body.max()) + 1)
+            first, last = np.searchsorted(of_edges, wanted), np.searchsorted(of_edges, wanted, side="right")
+            for case in np.flatnonzero(touches & (last > first)):
+                queries[case] = np.unique(ends[first[case] : last[case]])
         case_of_query = np.repeat(np.arange(len(cases)), list(map(len, queries)))
         vertices = np.concatenate([np.zeros(0, np.int64), *queries])
 
@@ -253,18 +256,30 @@ class _Parts:
         sharing = _keys(np.stack([of_node[one], of_node[other]], axis=1), len(self.body))
         return np.union1d(keys, sharing), np.unique(keys[found.crosses[rows]])
 
-    def ends_of_touching(self, part: int, body: int, found: Intersections) -> np.ndarray:
-        """Returns the vertices of all edges of a part that meet faces of a body or have a vertex of it, ascending.
+    def touching_edges(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all edges of parts that meet faces of bodies, or have a vertex of them.
 
-        Whatever of the part is left without these edges stays on one side of the body, and has one of these vertices
-        unless it is the whole part.
+        Whatever of a part is left without those of a body stays on one side of that body, and has a vertex of one of
+        these edges unless it is the whole part.
+
+        Args:
+            found: The intersections.
+
+        Returns:
+            Keys of the part and the body, ascending, shape [n], and the vertices of the edge, shape [n, 2].
         """
-        own = self._ordered_vertices[self._starts[part] : [*self._starts, None][part + 1]]
-        others = self._node_vertices[(self._of_node >= 0) & (self.body[self._of_node] == body)]
-        meets = self._edges[found.pairs[self.body[self.of_face[found.pairs[:, 1]]] == body, 0]]
-        shared = self._edges[np.isin(self._edges, np.intersect1d(own, others)).any(axis=1)]
-        touching = np.concatenate([meets, shared]).astype(np.int64)
-        return np.unique(touching[np.isin(touching, own).all(axis=1)])
+        rows, of_edge = self._parts_at_edges(self._edges[found.pairs[:, 0]].astype(np.int64))
+        touching = [(of_edge, self.body[self.of_face[found.pairs[rows, 1]]], self._edges[found.pairs[rows, 0]])]
+        (shared,) = np.nonzero((self._last_node - self._first_node > 1)[self._edges].any(axis=1))
+        ends = self._edges[shared]
+        rows, of_edge = self._parts_at_edges(ends.astype(np.int64))
+        for end in range(2):
+            places, others = self._parts_at(ends[rows, end])
+            touching.append((of_edge[places], self.body[others], ends[rows[places]]))
+        part, body, ends = (np.concatenate(arrays) for arrays in zip(*touching, strict=True))
+        keys = _keys(np.stack([part, body], axis=1), int(self.body.max()) + 1)
+        order = np.argsort(keys, kind="stable")
+        return keys[order], ends[order].astype(np.int64)
 
     @property
     def _sharing(self) -> slice:

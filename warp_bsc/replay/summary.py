@@ -202,10 +202,11 @@ class Summary:
             found |= {(True, meshes): (0, parts) for meshes, parts in sample.inside.items()}
             for key in [key for key in running if key not in found]:
                 inside, meshes = key
+                both = meshes, (meshes[1], meshes[0])
                 if inside:
-                    becomes = "crosses" * any(sample.mesh_pairs.get(pair, (0,))[0] for pair in (meshes, meshes[::-1]))
+                    becomes = "crosses" * any(sample.mesh_pairs.get(pair, (0, 0))[0] for pair in both)
                 else:
-                    becomes = "inside" * any(pair in sample.inside for pair in (meshes, meshes[::-1]))
+                    becomes = "inside" * any(pair in sample.inside for pair in both)
                 spans.append(_span(inside, meshes, running.pop(key), False, becomes))
             for key, numbers in found.items():
                 running.setdefault(key, []).append((sample.time, *numbers))

@@ -252,6 +252,8 @@ def device_of_cluster(address: str, name: str | None) -> str:
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
     """Returns the device that a worker on this machine uses: one GPU each, in turns, where no certain one is named.
 
+    Workers share GPUs if there are more of them.
+
     Args:
         name: The device that is wanted, None for Warp's default.
         number: Number of the worker, from 0.
@@ -406,7 +408,7 @@ def _open(job: bytes) -> IntervalChecker:
         if _local:
             device = device_of_worker(device, _local[0], gpu_count())
         checks = replace(checks, device=find_device(device).alias)
-        _opened = job, IntervalChecker(scene, checks, _worker_name())
+        _opened = job, IntervalChecker(scene, checks, f"{_worker_name()} on {checks.device}")
     return _opened[1]
 
 
