@@ -5,8 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from chromium import CHROMIUM, Browser
 from pxr import UsdGeom
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
+from test_replay_outputs import Page
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
@@ -245,3 +247,34 @@ def test_selection_and_workers(stage, tmp_path):
     out.write_bytes(b"".join([*lines[:2], lines[2].rstrip(b",\n") + b"],\n", lines[-1]]))
     assert main(["replay", path, "--device", "cpu", "--json", str(out), "--resume"]) == 0
     assert json.loads(out.read_text()) == whole
+
+
+@pytest.fixture
+def shown(stage, tmp_path):
+    """The page of a rope and a point that come down."""
+    add_rope(stage, "/World/Rope", lowered(ALONG, 1, 0), [0.25])
+    add_points(stage, "/World/Dust", lowered([(0.25, -1.0, 0.0)], 1, 0.5), [0.25])
+    path = tmp_path / "page.html"
+    assert main(["replay", save(stage), "--device", "cpu", "--report", str(path)]) == 0
+    return path
+
+
+def test_page_has_curves_and_points(shown):
+    page = Page(shown.read_text())
+    block, view = page.block("faces-0"), page.block("view-0")
+    names = [page.data["meshes"][number]["name"] for number in block["mesh_of_vertex"]]
+    assert [names[vertex] for vertex in block["edges"]] == ["/World/Rope"] * 4
+    assert [names[vertex] for vertex in block["points"]] == ["/World/Dust"]
+    start = view["start"].reshape(-1, 3) + page.data["center"]
+    np.testing.assert_allclose(start[block["edges"]], np.add(ALONG, (0, 0, 1))[[0, 1, 1, 2]], atol=1e-6)
+    assert page.data["intervals"] == [[0, 1, 3, 0, 0]]
+
+
+@pytest.mark.browser
+def test_page_in_chromium(shown, tmp_path):
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here")
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(shown)
+        assert "/World/Rope" in browser.value("document.getElementById('viewer-legend').textContent")
+        assert browser.value("document.getElementById('viewer-message').hidden") and browser.console == []

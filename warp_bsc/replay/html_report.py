@@ -91,6 +91,7 @@ class ReportPage(RecordFile):
         ] = []  # by interval: collisions, intersections and proximities at its start
         self._last: list[tuple[str, _AtRest]] = []  # what is at the end of the last complete interval
         self._without_view = 0
+        self._some_strands = 0  # number of views without all curves and points
 
     def head(self) -> str:
         """Returns the page up to the first interval."""
@@ -168,18 +169,20 @@ class ReportPage(RecordFile):
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
             curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
-            spread = np.linspace(0, len(curves) - 1, min(len(curves), self._most_rows)).astype(int)
             arrays |= {
                 "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
-                "curves": self._placed(curves[spread]),
+                "curves": self._placed(curves[_spread(len(curves), self._most_rows)]),
             }
             facts["curves"] = len(curves)
         return len(rows), _block(f"{name}-{index}", facts, arrays)
 
     def _view(self, result: IntervalResult, places: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
-        """Yields the blocks of the triangles that move in an interval: all, or those around the given places."""
+        """Yields the blocks of the triangles that move in an interval: all, or those around the given places.
+
+        Edges of curves, and points, are among them, at most as many of each as triangles.
+        """
         interval, segment = result.contacts.interval, result.contacts.segment
-        if not len(segment.faces):
+        if not len(segment.faces) and not segment.has_strands:
             return
         if self._view_bytes > _VIEW_BYTES:
             self._without_view += 1
@@ -187,12 +190,18 @@ class ReportPage(RecordFile):
         lit = result.contacts.colliding_faces
         shown = choose_faces(interval.x0[segment.faces[:, 0]], places, lit, self._most_faces)
         texts = []
+        self._some_strands += max(len(segment.free_edges), len(segment.points)) > self._most_faces
         if len(shown) == len(segment.faces) and self._faces and self._faces[0] is segment:
             vertices, number = np.arange(segment.vertex_count), self._faces[1]
         else:
-            vertices, corners = np.unique(segment.faces[shown], return_inverse=True)
+            elements = [segment.faces[shown]]
+            if segment.has_strands:
+                elements += [own[_spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
+            vertices, places = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
+            parts = np.split(places, np.cumsum([own.size for own in elements])[:-1])
             number = interval.index
-            arrays = {"faces": corners, "mesh_of_vertex": numbers[segment.locate_vertices(vertices)[0]]}
+            arrays = dict(zip(("faces", "edges", "points"), parts, strict=False))
+            arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
             texts.append(_block(f"faces-{number}", {}, arrays))
             if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:
                 self._faces = segment, number
@@ -220,6 +229,8 @@ class ReportPage(RecordFile):
         for name, found, shown in zip(names, (summary.hits, rest, near), zip(*rows, strict=True), strict=True):
             if sum(shown) < found:
                 notes.append(f"The table has {sum(shown):,} of {found:,} {name}: {most}. --json and --csv have all.")
+        if self._some_strands:
+            notes.append(f"{self._some_strands:,} views in 3D have only some of the curves or points, spread evenly.")
         if self._without_view:
             notes.append(f"{self._without_view:,} intervals have no view in 3D, as the page is full.")
         spans = [*summary.collision_spans, *summary.intersection_spans, *summary.proximity_spans]
@@ -337,13 +348,18 @@ def _pairs_of_meshes(summary: Summary) -> list[dict]:
     ]
 
 
+def _spread(count: int, most: int) -> np.ndarray:
+    """Returns the numbers below a count, or ``most`` of them, evenly."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
+
+
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
     """Returns which pairs are in the page: all, or ``most`` spread evenly with the first of each two meshes."""
     if len(pairs) <= most:
         return np.arange(len(pairs))
     firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
     others = np.delete(np.arange(len(pairs)), firsts)
-    return np.union1d(firsts, others[np.linspace(0, len(others) - 1, most - len(firsts)).astype(int)])
+    return np.union1d(firsts, others[_spread(len(others), most - len(firsts))])
 
 
 def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:

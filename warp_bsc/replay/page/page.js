@@ -156,7 +156,7 @@ let timeline = null, mark = null;
 function fillIntervals() {
   if (LAST < 0) return;
   addKey(byId("intervals-legend"), { class: "first" }, "vertex-face");
-  addKey(byId("intervals-legend"), { class: "second" }, "edge-edge");
+  addKey(byId("intervals-legend"), { class: "second" }, data.intervals[0].length > 4 ? "edge-edge, vertex-edge, vertex-vertex" : "edge-edge");
   if (data.rest.length) addKey(byId("intervals-legend"), { class: "third" }, "edges in faces and parts inside, at rest");
   if (data.near.length) addKey(byId("intervals-legend"), { class: "fourth" }, "near pairs, at rest");
   const width = Math.max(340, Math.min(1100, byId("intervals").clientWidth || 1100));

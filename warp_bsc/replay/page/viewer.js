@@ -4,8 +4,9 @@
 const MESH_COLORS = [[0.52, 0.68, 0.86], [0.62, 0.78, 0.6], [0.8, 0.7, 0.55], [0.72, 0.62, 0.8], [0.55, 0.76, 0.76], [0.84, 0.66, 0.72]];
 const REST_COLOR = [0.62, 0.64, 0.67];
 const LIT_COLOR = [0.93, 0.28, 0.22];
-const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1]];
+const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1], [0.85, 0.75, 0.1], [0.6, 0.45, 0.2]]; // by kind
 const CURVE_COLOR = [0.55, 0.24, 0.92];
+const ROPE_COLOR = [0.12, 0.16, 0.2];
 const NEAR_COLOR = [0.05, 0.6, 0.35];
 const CHOSEN_COLOR = [0.05, 0.75, 0.95];
 
@@ -28,6 +29,21 @@ void main() {
   float light = 0.42 + 0.5 * abs(dot(normal, normalize(vec3(0.25, 0.45, 0.85)))) + 0.08 * abs(normal.y);
   result = vec4(mix(tint, only.rgb, only.a) * light, 1.0);
 }`;
+// Points of the scene.
+const STRAND_SHADER = `#version 300 es
+in vec3 start; in vec3 end; in vec3 color;
+uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size;
+out vec3 tint;
+void main() {
+  tint = 0.4 * color;
+  gl_Position = projection * view * vec4(mix(start, end, time), 1.0);
+  gl_PointSize = size;
+}`;
+const STRAND_COLOR = `#version 300 es
+precision highp float;
+in vec3 tint;
+out vec4 result;
+void main() { result = vec4(tint, 1.0); }`;
 const POINT_SHADER = `#version 300 es
 in vec3 start; in vec3 color; in float toi;
 uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size; uniform float fade;
@@ -53,10 +69,10 @@ void main() {
 
 // A segment is drawn as a rectangle of some pixels' width: two triangles, of four corners.
 const CURVE_SHADER = `#version 300 es
-in vec3 start; in vec3 end;
-uniform mat4 view; uniform mat4 projection; uniform vec2 pixel;
+in vec3 start; in vec3 end; in vec3 start_1; in vec3 end_1; // its ends at the start of the interval, and at the end
+uniform mat4 view; uniform mat4 projection; uniform vec2 pixel; uniform float time;
 void main() {
-  vec4 a = projection * view * vec4(start, 1.0), b = projection * view * vec4(end, 1.0);
+  vec4 a = projection * view * vec4(mix(start, start_1, time), 1.0), b = projection * view * vec4(mix(end, end_1, time), 1.0);
   vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-6, 0.0));
   int corner = int[](0, 1, 2, 2, 1, 3)[gl_VertexID]; // two at a, two at b
   gl_Position = corner < 2 ? a : b;
@@ -139,6 +155,7 @@ async function loadView(index) {
   view.lit.forEach((face, place) => lit.set(faces.subarray(3 * face, 3 * face + 3), 3 * place));
   const contacts = hits ? hits.position : NO_FLOATS;
   return {
+    edges: topology.edges || NO_INTS, alone: topology.points || NO_INTS,
     faces, lit, meshes: topology.mesh_of_vertex, start: view.start, end: view.end, of: view.of,
     contacts, toi: hits ? hits.toi : NO_FLOATS, kinds: hits ? hits.kind : NO_INTS,
     // at the start and at the end of the interval
@@ -160,6 +177,7 @@ function makeViewer() {
 
   const triangles = gl && program(gl, TRIANGLE_SHADER, TRIANGLE_COLOR);
   const points = gl && program(gl, POINT_SHADER, POINT_COLOR);
+  const strands = gl && program(gl, STRAND_SHADER, STRAND_COLOR);
   const lines = gl && program(gl, CURVE_SHADER, CURVE_COLOR_SHADER);
   // Up is the scene's: y in the view.
   const zUp = data.up_axis === "Z";
@@ -225,8 +243,8 @@ function makeViewer() {
     present.slice(0, 6).forEach((mesh) => addKey(legend, { fill: css(meshColor(mesh)) }, data.meshes[mesh].name));
     if (present.length > 6) add(legend, "span", {}, `and ${count(present.length - 6)} more`);
     if (lit.length) addKey(legend, { fill: css(LIT_COLOR) }, "faces that collide");
-    ["vertex-face contact", "edge-edge contact"].forEach((text, kind) => {
-      if (kinds.includes(kind)) addKey(legend, { fill: css(CONTACT_COLORS[kind]), rx: 5 }, text);
+    CONTACT_COLORS.forEach((color, kind) => {
+      if (kinds.includes(kind)) addKey(legend, { fill: css(color), rx: 5 }, `${KINDS[kind]} contact`);
     });
     if (shown.curves.some((curves) => curves.length)) addKey(legend, { fill: css(CURVE_COLOR), y: 3, height: 4 }, "curves where surfaces cut");
 
@@ -242,8 +260,13 @@ function makeViewer() {
       for (let i = 0; i < places.length; i += 3) markColors.set(i < inside.length ? CURVE_COLOR : NEAR_COLOR, i);
       return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
     });
-    shown.cuts = shown.curves.map((curves) => vertexArray(gl, lines, [["start", curves, 3, [24, 0]], ["end", curves, 3, [24, 12]]]));
-    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks];
+    const segments = (values, stride, places) => vertexArray(gl, lines, ["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]));
+    shown.cuts = shown.curves.map((curves) => segments(curves, 24, [0, 12, 0, 12]));
+    const ropes = new Float32Array(6 * shown.edges.length);
+    shown.edges.forEach((vertex, i) => [start, end].forEach((values, when) => ropes.set(values.subarray(3 * vertex, 3 * vertex + 3), 12 * (i >> 1) + 6 * when + 3 * (i % 2))));
+    shown.ropes = segments(ropes, 48, [0, 12, 24, 36]);
+    shown.dust = vertexArray(gl, strands, positions, shown.alone);
+    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks, shown.ropes, shown.dust];
 
     const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
     shown.whole = boxOf(moving.some((values) => values.length) ? moving : [start]);
@@ -323,6 +346,13 @@ function makeViewer() {
       gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
     }
     gl.disable(gl.POLYGON_OFFSET_FILL);
+    const pixel = [(2 * scale) / width, (2 * scale) / height];
+    set(lines, { pixel, time: state.time, color: [...ROPE_COLOR, 1] });
+    gl.bindVertexArray(shown.ropes.array);
+    gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.edges.length / 2);
+    set(strands, { time: state.time, size: 5 * scale });
+    gl.bindVertexArray(shown.dust.array);
+    gl.drawElements(gl.POINTS, shown.alone.length, gl.UNSIGNED_INT, 0);
     gl.depthMask(false);
     // What is behind a surface shines through it faintly. Cut curves belong to one end of the interval.
     const end = state.time < 0.5 ? 0 : 1;
@@ -331,7 +361,7 @@ function makeViewer() {
     const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
-      set(lines, { pixel: [(2 * scale) / width, (2 * scale) / height], color: [...CURVE_COLOR, fade] });
+      set(lines, { pixel, time: 0, color: [...CURVE_COLOR, fade] });
       gl.bindVertexArray(shown.cuts[end].array);
       gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
       set(points, { time: state.time, fade, size, core: dots > 300 ? 2 : 0.68 });
