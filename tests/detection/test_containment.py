@@ -137,3 +137,18 @@ def test_many_bodies(monkeypatch):
     n = len(places)
     pairs, _, _ = find(solids)
     assert set(pairs) == {(n + i, i) for i in range(n)} | {(i, 2 * n) for i in range(2 * n)}
+
+
+def test_balls():
+    """Polyhedra of 80 faces in balls: inside another ball's if that one's inscribed ball contains the ball."""
+    random, ball = np.random.default_rng(5), trimesh.creation.icosphere(1)
+    inscribed = np.linalg.norm(ball.triangles_center, axis=1).min()
+    center, radius = random.uniform(-1, 1, (60, 3)), random.choice([0.02, 0.1, 0.5, 1.0], 60)
+    turned = [trimesh.transformations.random_rotation_matrix(random.random(3))[:3, :3] for _ in center]
+    solids = [(r * ball.vertices @ turn + c, ball.faces) for c, r, turn in zip(center, radius, turned, strict=True)]
+    distance = np.linalg.norm(center[:, None] - center[None], axis=2)
+    surely = distance + radius[:, None] < inscribed * radius[None]
+    maybe = distance + inscribed * radius[:, None] < radius[None]
+    pairs = set(find(solids, dtype=np.float32)[0])
+    assert set(map(tuple, np.argwhere(surely).tolist())) <= pairs <= set(map(tuple, np.argwhere(maybe).tolist()))
+    assert 20 < surely.sum() < maybe.sum()

@@ -50,7 +50,8 @@ Find the collisions of the meshes of a USD scene, with themselves and with each
 other, between each two consecutive time samples; vertices move straight from
 sample to sample. Meshes that never move are obstacles: contacts between
 obstacles are excluded, and so are contacts of a mesh with itself if only its
-transform moves it. Rotations are sampled at every whole time code as well.
+transform moves it. Linear curves and points take part, with half their widths
+as radii. Rotations are sampled at every whole time code as well.
 At the time samples themselves, find the edges that pass through faces and the
 meshes that are wholly inside closed ones, obstacles included; where nothing
 moves, this is done at one time.
@@ -379,7 +380,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
             try:
                 written.wait()
             except Exception as error:
-                problems += [] if interrupt else [_explain(error, scene)]
+                problem = _explain(error, scene)  # a change of the scene's files is found by all that read or write
+                problems += [] if interrupt or problem in problems else [problem]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one

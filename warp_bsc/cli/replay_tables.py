@@ -101,7 +101,7 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
     )
     by_worker = defaultdict(list)
     for work in done:
-        by_worker[work.worker].append(work.reading + work.checking)
+        by_worker[work.worker and f"{work.worker} on {work.device}"].append(work.reading + work.checking)
     if "" in by_worker:  # this process alone
         return
     for worker, seconds in sorted(by_worker.items())[:LONGEST]:

@@ -103,15 +103,7 @@ class ContainmentFinder:
         cases, case_of_pair = np.unique(of_body, axis=0, return_inverse=True)
         case_of_pair = case_of_pair.reshape(-1)  # NumPy 2.0 shapes it otherwise
         touches = np.bincount(case_of_pair, is_touching, len(cases)) > 0
-        queries = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
-        if touches.any():
-            of_edges, ends = parts.touching_edges(found)
-            wanted = _keys(cases, int(parts.body.max()) + 1)
-            first, last = np.searchsorted(of_edges, wanted), np.searchsorted(of_edges, wanted, side="right")
-            for case in np.flatnonzero(touches & (last > first)):
-                queries[case] = np.unique(ends[first[case] : last[case]])
-        case_of_query = np.repeat(np.arange(len(cases)), list(map(len, queries)))
-        vertices = np.concatenate([np.zeros(0, np.int64), *queries])
+        case_of_query, vertices = self._choose_vertices(cases, touches, found)
 
         # the closed parts that each query is compared with, and their faces
         order = np.argsort(case_of_pair, kind="stable")
@@ -161,9 +153,33 @@ class ContainmentFinder:
         bodies = np.stack([parts.body[cases[kept, 0]], cases[kept, 1]], axis=1)
         distance = _distances_along_x(points[met[:, 0]], corners[met[:, 1]])
         nearest = met[np.lexsort((faces[met[:, 1]], distance, met[:, 0]))]
-        first_of = nearest[np.searchsorted(nearest[:, 0], rows), 1]
+        first_faces = faces[nearest[np.searchsorted(nearest[:, 0], rows), 1]]
         order = np.lexsort((vertices[rows], bodies[:, 1], bodies[:, 0]))
-        return Containment(bodies[order], vertices[rows][order], faces[first_of][order])
+        return Containment(bodies[order], vertices[rows[order]], first_faces[order])
+
+    def _choose_vertices(
+        self, cases: np.ndarray, touches: np.ndarray, found: Intersections
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the vertices that decide whether parts are inside bodies.
+
+        Args:
+            cases: The parts and the bodies, sorted, shape [n, 2].
+            touches: Whether they touch each other, shape [n]. If not, one vertex decides.
+            found: The intersections.
+
+        Returns:
+            The case of each vertex, ascending, and the vertices, each of shape [m].
+        """
+        parts = self._parts
+        chosen = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
+        if touches.any():
+            of_edges, ends = parts.touching_edges(found)
+            wanted = _keys(cases, int(parts.body.max()) + 1)
+            first, last = np.searchsorted(of_edges, wanted), np.searchsorted(of_edges, wanted, side="right")
+            for case in np.flatnonzero(touches & (last > first)):
+                chosen[case] = np.unique(ends[first[case] : last[case]])
+        case_of_vertex = np.repeat(np.arange(len(cases)), list(map(len, chosen)))
+        return case_of_vertex, np.concatenate([np.zeros(0, np.int64), *chosen])
 
     def _faces_ahead(self, x: np.ndarray, points: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Returns the faces of some parts that are not on the same side of all rays from some points, ascending."""

@@ -68,8 +68,9 @@ class IntervalChecker:
         """
         for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
             started = time.perf_counter()
-            result = self._at(interval).check(interval)
-            yield replace(result, work=Work(self._worker, reading, time.perf_counter() - started))
+            checker = self._at(interval)
+            result = checker.check(interval)
+            yield replace(result, work=Work(self._worker, checker.device, reading, time.perf_counter() - started))
 
     def selection_without_initial(self) -> Selection:
         """Returns the selection that also ignores what crosses, and that something is inside, at the first time."""
@@ -108,6 +109,11 @@ class _SegmentChecker:
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
         self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
+
+    @property
+    def device(self) -> str:
+        """Name of the Warp device."""
+        return self._mesh.device.alias
 
     def check(self, interval: Interval) -> IntervalResult:
         """Returns the collisions of an interval."""

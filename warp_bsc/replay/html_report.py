@@ -200,7 +200,7 @@ class ReportPage(RecordFile):
             vertices, places = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
             parts = np.split(places, np.cumsum([own.size for own in elements])[:-1])
             number = interval.index
-            arrays = dict(zip(("faces", "edges", "points"), parts, strict=False))
+            arrays: dict[str, np.ndarray] = dict(zip(("faces", "edges", "points"), parts, strict=False))
             arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
             texts.append(_block(f"faces-{number}", {}, arrays))
             if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:

@@ -189,11 +189,13 @@ class Work:
 
     Attributes:
         worker: The process that did it; empty for the one that writes the results.
+        device: Name of the Warp device that it used.
         reading: Time to read the scene's samples [s]; another interval may be checked meanwhile.
         checking: Time to find everything in them [s].
     """
 
     worker: str
+    device: str
     reading: float
     checking: float
 

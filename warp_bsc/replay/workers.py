@@ -408,7 +408,7 @@ def _open(job: bytes) -> IntervalChecker:
         if _local:
             device = device_of_worker(device, _local[0], gpu_count())
         checks = replace(checks, device=find_device(device).alias)
-        _opened = job, IntervalChecker(scene, checks, f"{_worker_name()} on {checks.device}")
+        _opened = job, IntervalChecker(scene, checks, _worker_name())
     return _opened[1]
 
 
