@@ -115,11 +115,16 @@ def test_parts_of_one_body():
     assert find([parts])[0] == []
 
 
-def test_an_edge_that_leaves_through_an_edge():
-    """All meetings are touches, as the strip passes the box's edges only: its ends are on different sides."""
-    outer = box((0, 0, 0), (2, 2, 2))
-    strip = np.array([(1, 1, 1), (3, 3, 1), (3, 3, 1.5), (1, 1, 1.5)], float)
-    assert find([outer, (strip, np.array([(0, 1, 2), (0, 2, 3)]))])[0] == []
+def test_an_edge_that_leaves_through_a_corner():
+    """An angle's inner corner is a vertex of it: an edge only touches it there, and has its ends on different sides."""
+    around = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 4), (0, 4)], float)
+    vertices = np.concatenate([np.c_[around, np.full(6, z)] for z in (0.0, 1.0, 2.0)])
+    caps = np.array([(3, 4, 5), (3, 5, 0), (3, 0, 1), (3, 1, 2)])
+    low = np.concatenate([[(i, (i + 1) % 6, (i + 1) % 6 + 6), (i, (i + 1) % 6 + 6, i + 6)] for i in range(6)])
+    angle = vertices, np.concatenate([caps[:, ::-1], low, low + 6, caps + 12])
+    for ends, expected in (((1, 3), []), ((0.5, 1.5), [(1, 0)]), ((1, 2), [(1, 0)]), ((2, 3), [])):
+        wire = np.array([(end, end, 1.0) for end in (*ends, np.mean(ends))])
+        assert find([angle, (wire, np.array([(0, 1, 2)]))])[0] == expected, ends
 
 
 def test_only_wanted_pairs_are_looked_for():

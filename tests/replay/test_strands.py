@@ -208,6 +208,26 @@ def test_emitted_points_split_the_motion(stage):
     assert any("/World/Dust changes its topology at time 1" in warning for warning in found["warnings"])
 
 
+def test_points_with_ids_move_on_while_others_come_and_go(stage):
+    """Two fall through the floor while one ends and two begin; between samples they move straight, in either order."""
+    add_mesh(stage, "/World/Far", {0: moved(FALLING, (9, 9, 9)), 0.5: moved(FALLING, (9, 9, 8))})
+    places = {1: (0.5, -0.5), 2: (0.75, -0.5), 3: (1.0, -0.5), 7: (1.25, -0.5), 8: (1.5, -0.5)}
+    dust = add_points(stage, "/World/Dust", [])
+    for time, height, ids in ((0, 1.0, (1, 2, 3)), (1, -0.5, (7, 3, 1, 8)), (2, -1.0, (7, 3, 1, 8))):
+        dust.GetPointsAttr().Set([(*places[number], height) for number in ids], time)
+        dust.CreateIdsAttr().Set(list(ids), time)
+    dust.CreateWidthsAttr([0.1875])
+    dust.SetWidthsInterpolation("constant")
+    found = find(stage)
+    assert [(interval["start"], interval["end"], interval["hits"]) for interval in found["intervals"]] == [
+        (0, 0.5, 0), (0.5, 1, 2), (1, 2, 0)
+    ]  # fmt: skip
+    # from a height of 1 to -0.5 in a time code, a radius of 0.09375 comes to the floor after 0.90625 / 1.5
+    assert {(contact["elements"][0], round(contact["time"], 4)) for contact in found["intervals"][1]["contacts"]} == {
+        ("vertex 0", 0.6042), ("vertex 2", 0.6042)
+    }  # fmt: skip
+
+
 def test_what_is_not_read_is_named(stage, capsys):
     add_rope(stage, "/World/Hair", [(0, 0, 9)] * 4, [1.0], kind="cubic")
     add_rope(stage, "/World/Short", lowered(ALONG, 1, 0), [1.0], counts=[2, 1])

@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import bisect
 from typing import Any
 
 import numpy as np
@@ -24,12 +25,16 @@ class Strands:
     def __init__(self, prim: Usd.Prim):
         """Finds the attributes."""
         self.has_edges = prim.IsA(UsdGeom.BasisCurves)
+        self._id_times: list[float] = []  # of the samples of points whose ids change
         self._schema = schema = UsdGeom.BasisCurves(prim) if self.has_edges else UsdGeom.Points(prim)
         self.point_attributes = (schema.GetPointsAttr(),)
         if self.has_edges:
             self.topology_attributes = (schema.GetCurveVertexCountsAttr(),)
         else:
-            self.topology_attributes = (schema.GetPointsAttr(), schema.GetIdsAttr())
+            self._ids = schema.GetIdsAttr()
+            self.topology_attributes = (schema.GetPointsAttr(), self._ids)
+            if self._ids.ValueMightBeTimeVarying():
+                self._id_times = schema.GetPointsAttr().GetTimeSamples()
         # As the schema has it, the primvar comes before the attribute.
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
         self._widths = primvar if primvar and primvar.HasAuthoredValue() else None
@@ -41,8 +46,27 @@ class Strands:
         return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
     def read_points(self, time: Usd.TimeCode) -> Any:
-        """Returns the points."""
-        return self.point_attributes[0].Get(time)
+        """Returns the points.
+
+        Between two samples with different ids, points that have the same id in both move straight, where USD would hold
+        all of them if their number changes; the others stay in place.
+        """
+        held = self.point_attributes[0].Get(time)
+        if not self._id_times:
+            return held
+        earlier = bisect.bisect_left if time.IsPreTime() else bisect.bisect_right
+        place = earlier(self._id_times, time.GetValue())
+        if not 0 < place < len(self._id_times):
+            return held
+        first, last = self._id_times[place - 1 : place + 1]
+        ids, next_ids = (np.array(self._ids.Get(sample) or ()) for sample in (first, last))
+        points, next_points = (np.array(self.point_attributes[0].Get(sample) or ()) for sample in (first, last))
+        if np.array_equal(ids, next_ids) or len(ids) != len(points) or len(next_ids) != len(next_points):
+            return held
+        _, stays, comes = np.intersect1d(ids, next_ids, return_indices=True)
+        share = np.float32((time.GetValue() - first) / (last - first))
+        points[stays] += share * (next_points[comes] - points[stays])
+        return points
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
         """Returns the numbers of points of the curves; of points, their number and their ids, which tell them apart."""
@@ -51,7 +75,7 @@ class Strands:
         points = self.read_points(time)
         return [
             None if points is None else [len(points)] * bool(len(points)),
-            self._schema.GetIdsAttr().Get(time),
+            self._ids.Get(time),
             None,
         ]
 
