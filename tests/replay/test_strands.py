@@ -94,7 +94,7 @@ def test_primvars_of_widths_come_first_and_scale_lengthens_them(stage):
 
 def test_widths_that_change_count_as_the_largest(stage, capsys):
     rope = add_rope(stage, "/World/Rope", lowered(ALONG, 1, 0, 1))
-    for time, width in enumerate((0.25, 0.5, 0.25)):
+    for time, width in ((0, 0.25), (0.5, 0.5), (2, 0.25)):  # the rope has no sample at the second of these
         rope.CreateWidthsAttr().Set([width], time)
     rope.SetWidthsInterpolation("constant")
     assert find(stage)["intervals"][0]["contacts"][0]["time"] == pytest.approx(0.75, abs=1e-5)
@@ -216,8 +216,8 @@ def test_points_with_ids_move_on_while_others_come_and_go(stage):
     for time, height, ids in ((0, 1.0, (1, 2, 3)), (1, -0.5, (7, 3, 1, 8)), (2, -1.0, (7, 3, 1, 8))):
         dust.GetPointsAttr().Set([(*places[number], height) for number in ids], time)
         dust.CreateIdsAttr().Set(list(ids), time)
-    dust.CreateWidthsAttr([0.1875])
-    dust.SetWidthsInterpolation("constant")
+        dust.CreateWidthsAttr().Set([0.1875] * len(ids), time)
+    dust.SetWidthsInterpolation("vertex")
     found = find(stage)
     assert [(interval["start"], interval["end"], interval["hits"]) for interval in found["intervals"]] == [
         (0, 0.5, 0), (0.5, 1, 2), (1, 2, 0)

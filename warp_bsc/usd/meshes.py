@@ -466,7 +466,7 @@ class UsdMesh:
         """Reads the edges of curves, and the radii of curves and points; of a mesh, there are none.
 
         Args:
-            times: Times at which the topology is the same, ascending.
+            times: Times, ascending, from the first to before the last of which the topology is the same.
             point_count: Number of points.
 
         Returns:
@@ -481,12 +481,12 @@ class UsdMesh:
         with reading(self._where, self, times[0]):
             counts, _, _ = self._read_topology(self._time_code(times[0], False))
             edges, curves = self._strands.read_edges(counts, point_count, self._where)
-        vary = self._strands.width_attribute.ValueMightBeTimeVarying()
+        own = sample_times(self._strands.width_attribute)
         radius = np.zeros(point_count)
-        for time in times if vary else times[:1]:
+        for time in sorted({*times, *(time for time in own if times[0] < time < times[-1])}) if own else times[:1]:
             with reading(self._where, self, time):
-                widths = self._strands.read_widths(self._time_code(time, False), curves, self._where)
-                radius = np.maximum(radius, 0.5 * widths)
+                code = self._time_code(time, time == times[-1] > times[0])
+                radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves, self._where))
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:

@@ -65,7 +65,7 @@ class Strands:
             return held
         _, stays, comes = np.intersect1d(ids, next_ids, return_indices=True)
         share = np.float32((time.GetValue() - first) / (last - first))
-        points[stays] += share * (next_points[comes] - points[stays])
+        points[stays] = (np.float32(1.0) - share) * points[stays] + share * next_points[comes]
         return points
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
