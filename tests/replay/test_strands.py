@@ -76,7 +76,7 @@ def test_a_rope_meets_a_floor_at_half_its_width(stage, widths, interpolation, ra
     assert interval["vertex_face_hits"] == 3 and interval["hits"] == len(listed)
     assert all(contact["phase"] is contact["separate"] is None for contact in interval["contacts"])
     assert found["warnings"] == [
-        "curves and points are checked as edges and points with half their widths as radii: 1 BasisCurves"
+        "curves and points are checked between the times alone, with half their widths as radii: 1 BasisCurves"
     ]
     assert found["certified"] and found["intersections"] == []
 
@@ -206,6 +206,20 @@ def test_emitted_points_split_the_motion(stage):
     found = find(stage)
     assert [interval["hits"] for interval in found["intervals"]] == [0, 3]
     assert any("/World/Dust changes its topology at time 1" in warning for warning in found["warnings"])
+
+
+def test_a_scene_without_faces(tmp_path):
+    stage = new_stage(tmp_path / "ropes.usda")
+    add_rope(stage, "/World/Still", [(-1, 0, 0), (1, 0, 0)], [0.25])
+    add_rope(stage, "/World/Falling", lowered([(0, -1, 0), (0, 1, 0)], 1, -1), [0.25])
+    add_points(stage, "/World/Thin", lowered([(0.5, 0, 0)], 1, -1))
+    words = [word for name in ("csv", "overlay", "report") for word in (f"--{name}", str(tmp_path / f"{name}.usda"))]
+    found = find(stage, "--min-distance", "0.1", *words)
+    assert [(contact["kind"], contact["triangle"]) for contact in found["intervals"][0]["contacts"]] == [
+        ("edge-edge", None), ("vertex-edge", None)
+    ]  # fmt: skip
+    times = [contact["time"] for contact in found["intervals"][0]["contacts"]]
+    assert times == pytest.approx([0.375, 0.4375], abs=1e-5)  # 0.25 and 0.125 apart
 
 
 def test_points_with_ids_move_on_while_others_come_and_go(stage):

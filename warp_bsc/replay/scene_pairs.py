@@ -111,8 +111,13 @@ class ScenePairs:
     def triangles(self, rows: slice) -> list[int | None]:
         """Returns which triangle of its polygon the face of some pairs is, from 0; None where no element is a face."""
         faces = self.faces[rows].max(axis=1)
-        places = self.segment.places_in_polygons(np.maximum(faces, 0))
-        return [place if face >= 0 else None for face, place in zip(faces.tolist(), places.tolist(), strict=True)]
+        places: list[int | None] = [None] * len(faces)
+        (of_faces,) = np.nonzero(faces >= 0)
+        for row, place in zip(
+            of_faces.tolist(), self.segment.places_in_polygons(faces[of_faces]).tolist(), strict=True
+        ):
+            places[row] = place
+        return places
 
     def _of_meshes(self, texts, rows) -> list[tuple[str, str]]:
         """Returns the texts of the two meshes of some pairs; pairs of the same meshes share them."""

@@ -91,9 +91,8 @@ def find_meshes(
     if finder.other:
         warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
     if strands := Counter(mesh.type_name for mesh in meshes if mesh.is_strands):
-        warnings.append(
-            f"curves and points are checked as edges and points with half their widths as radii: {_listed(strands)}"
-        )
+        how = "between the times alone, with half their widths as radii"
+        warnings.append(f"curves and points are checked {how}: {_listed(strands)}")
     if varying := [mesh for mesh in meshes if mesh.may_thicken]:
         warnings.append(
             f"widths or scales that change count as the largest: {len(varying)}, the first {varying[0].name}"
