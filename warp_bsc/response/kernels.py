@@ -4,6 +4,7 @@ import warp as wp
 
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
+from ..kernels.polynomials import EDGE_EDGE
 from ..kernels.signs import FREE
 from .bodies import sagitta
 from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
@@ -21,12 +22,16 @@ from .constraints import (
     contact_vertices,
     contact_weights,
     count_contact,
+    distances_at_start,
     divides_near_pairs,
-    feasible_in_contact,
+    feasible,
     has_overflowed,
     is_dividing,
     is_pushing,
     is_slow,
+    least_distance,
+    longest_path,
+    relative,
     to_double,
     to_single,
     truncated_path,
@@ -90,6 +95,7 @@ def begin_step(
         status.frozen[0] = 0
         status.lost[0] = 0
         status.projecting[0] = 0
+        status.near[0] = 0
         status.rounds[0] = 0
         constraints.count[0] = 0
         dividing.count[0] = 0
@@ -124,48 +130,69 @@ def _collect_contact(
     separation: wp.float64,
 ):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
-    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
+    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS):
+        return
+    near = int(contacts.status[i]) == FREE  # only
+    if near and not motion.distances.radius:
         return
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
-        if bodies_meet(motion, corners):
+        if not near and bodies_meet(motion, corners):
             if not crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
                 wp.atomic_add(progress.status.body_hits, 0, 1)
                 for j in range(4):
                     vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
+    least = wp.float64(0.0)
+    crossed = bool(False)
+    if motion.distances.radius:
+        start, kept = distances_at_start(motion, corners, contacts.kind)
+        least = kept
+        crossed = start <= wp.float64(0.0)
     may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
-    if may_cross and crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
-        wp.atomic_add(progress.status.crossed_hits, 0, 1)
+    if may_cross and not crossed and contacts.kind <= EDGE_EDGE:
+        crossed = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i])
+    if crossed:
+        wp.atomic_add(progress.status.crossed_hits, 0, wp.where(near, 0, 1))
         return
     world = motion.world[corners[0]]
-    count_contact(progress, world)
-    for j in range(4):
-        vertices.changed[corners[j]] = 1
     iteration = progress.status.iteration[0]
-    slow = is_slow(motion, corners, contacts.edges)
-    weights = contact_weights(contacts.edges, contacts.coordinates[i])
+    slow = is_slow(motion, corners, contacts.kind)
+    weights = contact_weights(contacts.kind, contacts.coordinates[i])
     normal = contacts.normal[i]
-    if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal)):
-        progress.fast[world] = 1
+    if not near:
+        count_contact(progress, world)
+        for j in range(4):
+            vertices.changed[corners[j]] = 1
+        if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal, least)):
+            progress.fast[world] = 1
     multiplier = wp.vec3d()
+    if near and is_dividing(progress, world, iteration):
+        return
     if is_dividing(progress, world, iteration):
         for j in range(4):
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing, True)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, least, dividing, True)
         multiplier = TOUCH * normal
     else:
-        progress.status.projecting[0] = 1
+        if not near:
+            progress.status.projecting[0] = 1
         if iteration == 0 and contacts.edges == 1:
             if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
                 return  # the next detection finds it, if it is still there
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = widened(separation, progress)
     if slow == 1:
-        target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+        start = wp.dot(normal, relative(weights, corners, motion.x0)) - least
+        target = feasible(target, start, separation, longest_path(motion, corners))
     target += sagitta(motion, vertices, corners, _MOST_SAGITTA * separation)
+    target += least
+    if near and wp.dot(normal, relative(weights, corners, vertices.x1)) < target:
+        progress.status.near[0] = 1
+        progress.status.projecting[0] = 1
+        progress.contact_iteration[world] = iteration
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     add_constraint(
         motion,
@@ -181,6 +208,7 @@ def _collect_contact(
         contacts.within_tolerance[i],
         contacts.toi[i],
         multiplier,
+        least,
     )
 
 
@@ -234,7 +262,8 @@ def divide_near_pairs(
     if not divides_near_pairs(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
+    least = least_distance(constraints, i)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
 
@@ -274,6 +303,7 @@ def decide(
     overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and status.undetected[0] == 0:
         status.undetected[0] = 1
+        status.near[0] = 0
         status.hits[0] = 0
         status.crossed_hits[0] = 0
         status.body_hits[0] = 0
@@ -294,7 +324,9 @@ def decide(
     status.newly_frozen[0] = 0
     status.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
     status.undetected[0] = wp.where(overflowed, 1, 0)
-    status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
+    finished = hits == 0 and status.near[0] == 0
+    status.near[0] = 0
+    status.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
     status.rounds[0] = status.rounds[0] + status.active[0]
     status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)

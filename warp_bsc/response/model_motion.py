@@ -171,6 +171,8 @@ class ModelMotion:
             setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
         vertices.is_lost = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
         vertices.inverse_mass, vertices.friction, vertices.world = mesh.inverse_masses, friction, mesh.device_world
+        if mesh.distances is not None:
+            vertices.distances = mesh.distances
         self.planes = planes = MovingPlanes()
         planes.friction, planes.world = plane_friction, mesh.device_planes.world
         for name in ("start", "end"):

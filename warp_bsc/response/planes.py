@@ -21,6 +21,8 @@ _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
 _MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
+_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
+"""Share of its distance at the start that a vertex keeps."""
 _ZERO = wp.constant(wp.float64(0.0))
 
 _KERNEL = {"enable_backward": False}
@@ -71,6 +73,19 @@ def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
     return wp.min(wp.max(before, _ZERO) / wp.max(before - after, _TINY), wp.float64(1.0))
 
 
+@wp.func
+def _distances_from_plane(motion: Motion, vertex: int, plane: wp.vec4d):
+    """Returns the distance that a vertex is to keep from a plane, and how much farther away it is near [m].
+
+    Like a pair, a vertex may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
+    """
+    if not motion.distances.radius:
+        return _ZERO, _ZERO
+    before, error = signed_distance(plane, motion.x0[vertex])
+    least = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
+    return wp.max(least, _ZERO), motion.distances.reach
+
+
 @wp.kernel(**_KERNEL)
 def collect_penetrations(
     motion: Motion,
@@ -95,7 +110,11 @@ def collect_penetrations(
         if planes.world[i] >= 0 and planes.world[i] != world:
             continue
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
-        if not (after <= error_after):  # nor where the plane is not finite
+        least, reach = _distances_from_plane(motion, vertex, planes.start[i])
+        if not (after <= least + wp.max(reach, error_after)):  # nor where the plane is not finite
+            continue
+        near = after > least + error_after  # only
+        if near and not ahead:
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
         if before < -error_before:
@@ -103,7 +122,7 @@ def collect_penetrations(
                 wp.atomic_add(progress.status.crossed_hits, 0, 1)
             continue
         if ahead:
-            wp.atomic_add(progress.status.first_hits, 0, 1)
+            wp.atomic_add(progress.status.first_hits, 0, wp.where(near, 0, 1))
         else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
@@ -111,12 +130,12 @@ def collect_penetrations(
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         multiplier = wp.vec3d()
         if is_dividing(progress, world, progress.status.iteration[0]):
-            update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)
+            update_first_contact(vertices, vertex, time_of_entry(before - least, after - least), PLANE_CONTACT, i)
             if not dividing.first:
                 continue
             margin = _MARGIN * separation
-            least = plane[3] + wp.min(wp.float64(2.0) * error_after, margin)
-            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, least, margin)
+            offset = plane[3] + least + wp.min(wp.float64(2.0) * error_after, margin)
+            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, offset, margin, _ZERO)
             multiplier = TOUCH * normal
         else:
             progress.status.projecting[0] = 1
@@ -127,11 +146,12 @@ def collect_penetrations(
             wp.vec4i(vertex),
             wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
             normal,
-            plane[3] + widened(separation, progress),
+            plane[3] + least + widened(separation, progress),
             wp.sqrt(motion.friction[vertex] * planes.friction[i]),
             1,
             PLANE_CONTACT,
             True,
             _ZERO,
             multiplier,
+            least,
         )

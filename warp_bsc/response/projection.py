@@ -5,7 +5,7 @@ import warp as wp
 from ..kernels.pipeline.queues import take_slot
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_final_velocity
-from .constraints import PLANE_CONTACT, gap, is_projecting, relative, to_double, to_single
+from .constraints import PLANE_CONTACT, gap, is_projecting, least_distance, relative, to_double, to_single
 from .step_record import StepRecord, end_sweep, is_recording, record_entry
 
 __all__ = [
@@ -270,7 +270,7 @@ def activate_position_constraints(
         return
     distance = gap(vertices, constraints, i)
     if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
-        tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * constraints.separation[i])
+        tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * (constraints.separation[i] - least_distance(constraints, i)))
     tolerance = _tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
     if not active and is_reversible(constraints, progress, i):
@@ -420,7 +420,7 @@ def activate_velocity_constraints(
     if wp.length_sq(multiplier) == _ZERO:
         if not has_pushed(constraints, i):
             return
-        if gap(vertices, constraints, i) > constraints.separation[i]:
+        if gap(vertices, constraints, i) > constraints.separation[i] - least_distance(constraints, i):
             return
     tolerance = _tolerance_of(motion, constraints, i, tolerance) / dt
     normal = constraints.normal[i]

@@ -126,8 +126,8 @@ class SolverReport:
         invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
         if not self._responds:
             invalid |= self._motion.vertices.is_lost.numpy() != 0
-        faces = self._mesh.faces
-        listed[faces[invalid[faces].any(axis=1)]] = True
+        for elements in (self._mesh.faces, self._mesh.edges):
+            listed[elements[invalid[elements].any(axis=1)]] = True
         return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
 
     @property

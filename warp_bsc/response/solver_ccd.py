@@ -137,6 +137,11 @@ class _Arrays(NamedTuple):
     body_qd: wp.array | None
 
 
+def _numpy(values):
+    """Returns a number or an array as a NumPy array."""
+    return values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+
+
 def _arrays(state):
     return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
 
@@ -197,6 +202,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         restitution: float | None = None,
         coupling: int | None = None,
         bodies: bool | None = None,
+        min_distance: float | None = None,
+        radius: float | np.ndarray | wp.array | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -220,19 +227,27 @@ class SolverCCD(SolverBase, CouplingHooks):
                 inner solver that reads ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Kinematic
                 bodies, bodies without mass, static shapes and infinite planes are never pushed, and bodies are not kept
                 out of infinite planes. Bodies that are all kinematic at construction stay so.
+            min_distance: Distance that pairs keep [m], vertices from faces and edges from edges, and vertices from
+                infinite planes: a pair that started farther apart stays so, and one that started nearer does not come
+                nearer. Neighbours, elements that an edge of the mesh joins, only do not touch. The stage moves pairs
+                apart to this distance and ``separation``. Springs and particles that no face has take part. None or 0:
+                pairs do not touch.
+            radius: Radius of each particle [m], shape [particle_count], or one for all, such as
+                ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
+                a face is the largest one of its vertices, that of a shape 0.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
                 ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
                 velocity; separation, friction, restitution, coupling and bodies then have no meaning, and must not be
-                given.
+                given. With a minimum distance, it counts the pairs that come nearer than they may.
 
         Raises:
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
                 argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver, or one that moves bodies, is to be differentiated.
+                solver, one that moves bodies, or one with a minimum distance is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -257,11 +272,16 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"coupling takes at least 2 substeps, not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
-        self.mesh = mesh = ModelMesh(model)
+        keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
+        if keeps_distances and respond and model.requires_grad:
+            raise NotImplementedError("steps that keep a distance carry no gradients: omit min_distance and radius")
+        self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
+        if keeps_distances:
+            mesh.keep_distances(min_distance or 0.0, radius, reach=separation if respond else 0.0)
         self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(
             mesh, *self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
@@ -323,7 +343,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._response.status.recount.fill_(1)
 
     def _median_edge(self):
-        """Returns the median edge length of cloth and soft bodies at rest [m]; 1 if they have no edges."""
+        """Returns the median edge length of cloth, soft bodies and ropes at rest [m]; 1 if they have no edges."""
         particle_q = self.model.particle_q
         rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
         edges = self.mesh.edges[self.mesh.edges[:, 1] < self.model.particle_count]
