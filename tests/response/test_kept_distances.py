@@ -159,7 +159,7 @@ def test_worlds(device):
 
 
 def test_what_starts_nearer_moves_apart(device):
-    """Sheets at 0.7 of the distance that are pushed together come no nearer, and end up at the distance."""
+    """Sheets at 0.7 of the distance that are pushed together come no nearer, and end up farther apart."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     distance = 0.012
     add_patch(builder, 4, 0.04, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.4))
@@ -172,13 +172,13 @@ def test_what_starts_nearer_moves_apart(device):
         state.particle_qd.assign(velocity.astype(np.float32))
 
     rollout = DistanceRollout(model, bsc.SolverCCD(Changed(model, push), min_distance=distance), distance)
-    gaps = []
-    for _ in range(70):
+    counts = []
+    for _ in range(40):
+        before = rollout.near
         rollout.step()
         assert rollout.solver.report.certified
-        gaps.append(np.ptp(rollout.positions.reshape(2, 25, 3)[:, :, 2].mean(axis=1)))
-    assert rollout.near > 100 and rollout.approaches == 0
-    assert gaps[0] < 0.75 * distance and gaps[-1] > 0.99 * distance
+        counts.append(rollout.near - before)
+    assert counts[0] > 100 and counts[-1] == 0 and rollout.approaches == 0
 
 
 def test_infinite_planes(device):
@@ -302,5 +302,8 @@ def test_a_step_that_is_differentiated_is_refused(device):
     builder = newton.ModelBuilder()
     add_patch(builder, 2, 0.04, (0.0, 0.0, 0.0))
     model = builder.finalize(device=device, requires_grad=True)
-    with pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and radius"):
-        bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), min_distance=0.01)
+    solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), min_distance=0.01)
+    states = model.state(), model.state()
+    with pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and radius"), wp.Tape():
+        solver.step(*states, model.control(), None, DT)
+    solver.step(*states, model.control(), None, DT)

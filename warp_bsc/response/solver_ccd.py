@@ -247,7 +247,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
                 argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver, one that moves bodies, or one with a minimum distance is to be differentiated.
+                solver, or one that moves bodies, is to be differentiated.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -273,8 +273,6 @@ class SolverCCD(SolverBase, CouplingHooks):
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
         keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
-        if keeps_distances and respond and model.requires_grad:
-            raise NotImplementedError("steps that keep a distance carry no gradients: omit min_distance and radius")
         self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
@@ -373,11 +371,14 @@ class SolverCCD(SolverBase, CouplingHooks):
 
         Raises:
             ValueError: If a tape records gradients of the response, and both states are the same.
+            NotImplementedError: If a tape records gradients of a response that keeps a minimum distance.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
         """
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
+            if self.respond and tape is not None and self.model.requires_grad and self.mesh.distances is not None:
+                raise NotImplementedError("steps that keep a distance carry no gradients: omit min_distance and radius")
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
