@@ -180,7 +180,8 @@ def _collect_contact(
         if not near:
             progress.status.projecting[0] = 1
         if iteration == 0 and contacts.edges == 1:
-            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
+            time = wp.where(near, wp.float64(0.0), contacts.toi[i])
+            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, time):
                 return  # the next detection finds it, if it is still there
     friction = wp.sqrt(motion.friction[corners[0]] * motion.friction[corners[3]])
     target = widened(separation, progress)
