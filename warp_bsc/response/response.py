@@ -377,7 +377,7 @@ class Response:
             self.launch_over_constraints(activate_position_constraints, [*inputs, *options])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
-        self._launch_over_particles(update_positions, [*inputs, last])
+        self._launch_over_particles(update_positions, [*inputs, last], finishes=True)
         self._launch_over_bodies(move_bodies, last)
         self._launch_over_shape_vertices(place_vertices)
 
@@ -394,7 +394,7 @@ class Response:
 
     def _update_velocities(self, last=True):
         inputs = [self._motion.vertices, self.vertices, self.constraints, self.progress, self._record, last]
-        self._launch_over_particles(update_velocities, inputs)
+        self._launch_over_particles(update_velocities, inputs, finishes=True)
         self._launch_over_bodies(change_body_velocities, last)
         self._launch_over_shape_vertices(set_vertex_velocities)
 
@@ -579,8 +579,9 @@ class Response:
         """Launches a kernel over the constraints, see :meth:`_launch_over`."""
         self._launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
 
-    def _launch_over_particles(self, kernel, inputs):
-        wp.launch(kernel, self._movable, inputs=inputs, device=self.device)
+    def _launch_over_particles(self, kernel, inputs, finishes=False):
+        """Launches a kernel over the particles; one that finishes a sweep runs even if there are none."""
+        wp.launch(kernel, max(self._movable, int(finishes)), inputs=inputs, device=self.device)
 
     def _launch_over_bodies(self, kernel, *options):
         if self._bodies:
