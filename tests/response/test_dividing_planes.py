@@ -120,7 +120,7 @@ def test_plates_that_close_on_cloth(iterations, device):
 
 
 def test_a_pile_takes_few_rounds(device):
-    """All near pairs are divided at once: one layer after the other would take up to 14 rounds."""
+    """Near pairs at rest are divided at once: else most steps take 4 rounds, and one layer after the other up to 14."""
     builder = newton.ModelBuilder()
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
     for layer in range(16):
@@ -134,7 +134,7 @@ def test_a_pile_takes_few_rounds(device):
     report = rollout.solver.report
     assert report.uncertified_steps == report.truncated_steps == 0
     assert rollout.collisions == 0 and report.hits > 50
-    assert max(rounds) <= 4, rounds
+    assert max(rounds) <= 4 and np.median(rounds[3:]) <= 2, rounds
 
 
 @wp.kernel(enable_backward=False)

@@ -27,8 +27,9 @@ __all__ = [
 ]
 
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
-"""Bits of the outcome of a vertex: constraints moved it, dividing planes did, its path was cut, it was left where it
-was, it was left there because its wanted position was not finite, it was divided from contacts without constraints."""
+"""Bits of the outcome of a vertex: constraints moved it or may change its velocity, dividing planes moved it, its path
+was cut, it was left where it was, it was left there because its wanted position was not finite, it was divided from
+contacts without constraints."""
 
 NEVER = wp.constant(wp.int64(2**62))
 """The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""

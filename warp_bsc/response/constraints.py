@@ -30,6 +30,7 @@ __all__ = [
     "contact_weights",
     "count_contact",
     "distances_at_start",
+    "divides_all_near_pairs",
     "divides_near_pairs",
     "feasible",
     "feasible_in_contact",
@@ -73,7 +74,7 @@ TOUCH = wp.constant(wp.float64(1e-100))
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
 _DIVISIONS_OF_CONTACTS = wp.constant(2)
-"""Iterations that divide contacts alone: mostly they are enough, and planes between all near pairs cost more."""
+"""Iterations that divide contacts alone, before planes between near pairs that move: these stop what they divide."""
 _SHARE = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes."""
 _WIDENING = wp.constant(wp.float64(1.25))
@@ -131,11 +132,20 @@ def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
 
 @wp.func
 def divides_near_pairs(progress: Progress, world: int) -> bool:
-    """Returns whether near pairs of a world without fast contacts are divided in this iteration, as contacts are."""
+    """Returns whether near pairs of a world without fast contacts are divided in this iteration, as contacts are.
+
+    Those at rest are after the last projection, all of them where planes between contacts have not been enough.
+    """
     last = progress.status.iteration[0] - 1
     if progress.contact_iteration[world] != last or progress.fast[world] == 1:
         return False
-    return last == progress.max_slow_iterations + _DIVISIONS_OF_CONTACTS
+    return last == progress.max_slow_iterations - 1 or divides_all_near_pairs(progress)
+
+
+@wp.func
+def divides_all_near_pairs(progress: Progress) -> bool:
+    """Returns whether near pairs that move are divided too in this iteration."""
+    return progress.status.iteration[0] - 1 == progress.max_slow_iterations + _DIVISIONS_OF_CONTACTS
 
 
 @wp.func

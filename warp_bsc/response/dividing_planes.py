@@ -1,11 +1,11 @@
 """Dividing planes: what projection cannot keep apart, a plane between the two elements keeps apart for certain.
 
 If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
-at all times of a linear motion. After the last projection, each contact that is left gets a plane across the shortest
-vector between its elements at the start, and every vertex of the two is projected onto its side. If contacts are left
-even so, near pairs that could become contacts get planes too. Vertices that stand still are on their sides, so that
-there is a solution for the vertices of all pairs at once, each by itself. What slides along a plane goes on sliding,
-unlike what is truncated.
+at all times of a linear motion. After the last projection, near pairs at rest get a plane across the shortest vector
+between their elements at the start, as does each contact that is left, and every vertex of the two is projected onto
+its side. If contacts are left even so, near pairs that move get planes too. Vertices that stand still are on their
+sides, so that there is a solution for the vertices of all pairs at once, each by itself. What slides along a plane goes
+on sliding, unlike what is truncated.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -63,6 +63,7 @@ class DividingPlanes:
     split: wp.array[wp.int8]  # the first corner that stays below
     next: wp.array[int]  # the next node in the list of the same vertex, or the end
     first: wp.array[int]  # node of a vertex, or the end
+    kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
 
 
 def allocate_dividing_planes(
@@ -78,6 +79,7 @@ def allocate_dividing_planes(
     planes.split = wp.empty(capacity, dtype=wp.int8, device=device)
     planes.next = wp.empty(4 * capacity, dtype=int, device=device)
     planes.first = wp.full(vertices, int(_NONE), dtype=int, device=device)
+    planes.kept = wp.full(vertices, int(_NONE), dtype=int, device=device)
     return planes
 
 

@@ -7,7 +7,19 @@ from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE
 from ..kernels.signs import FREE
 from .bodies import sagitta
-from .buffers import DIVIDED, FROZEN, LOST, NEVER, TRUNCATED, UNCONSTRAINED, Constraints, Motion, Progress, Vertices
+from .buffers import (
+    DIVIDED,
+    FROZEN,
+    LOST,
+    NEVER,
+    PROJECTED,
+    TRUNCATED,
+    UNCONSTRAINED,
+    Constraints,
+    Motion,
+    Progress,
+    Vertices,
+)
 from .constraints import (
     EDGE_EDGE_CONTACT,
     EDGE_EDGE_PROXIMITY,
@@ -23,6 +35,7 @@ from .constraints import (
     contact_weights,
     count_contact,
     distances_at_start,
+    divides_all_near_pairs,
     divides_near_pairs,
     feasible,
     has_overflowed,
@@ -58,6 +71,10 @@ __all__ = [
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _MOST_SAGITTA = wp.constant(wp.float64(4.0))
 """Most that the turn of a body adds to the separation of a contact, in separations."""
+
+_RESTING = wp.constant(wp.float64(4.0))
+"""Longest path, in separations, of near pairs that are divided before the next detection. Planes stand still: what
+moves farther together, they would stop, and what slides, push apart."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -116,6 +133,7 @@ def begin_step(
     vertices.changed[i] = 0
     vertices.outcome[i] = wp.where(motion.is_lost[i] != 0, LOST, 0)
     dividing.first[i] = -1
+    dividing.kept[i] = -1
 
 
 @wp.func
@@ -248,7 +266,7 @@ def divide_near_pairs(
     progress: Progress,
     separation: wp.float64,
 ):
-    """Adds dividing planes for the proximities of worlds where planes between contacts have not been enough.
+    """Adds dividing planes for proximities, see :func:`.constraints.divides_near_pairs`.
 
     In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
     A constraint whose elements would meet changes velocities too.
@@ -263,10 +281,16 @@ def divide_near_pairs(
     if not divides_near_pairs(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
+    if not divides_all_near_pairs(progress) and longest_path(motion, corners) > _RESTING * separation:
+        return
     least = least_distance(constraints, i)
     meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
+        for j in range(4):
+            vertex = corners[j]
+            if motion.inverse_mass[vertex] > 0.0:
+                vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
 
 @wp.kernel(**_KERNEL)
@@ -358,9 +382,14 @@ def _record_truncation(
 
 @wp.func
 def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes, vertex: int):
-    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided."""
-    if motion.inverse_mass[vertex] == 0.0 or dividing.first[vertex] < 0:
+    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided.
+
+    One without a new plane is there, as no projection follows the first planes of its world.
+    """
+    first = dividing.first[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or first < 0 or first == dividing.kept[vertex]:
         return
+    dividing.kept[vertex] = first
     x1 = vertices.x1[vertex]
     end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
     if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
