@@ -307,3 +307,34 @@ def test_a_step_that_is_differentiated_is_refused(device):
     with pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and radius"), wp.Tape():
         solver.step(*states, model.control(), None, DT)
     solver.step(*states, model.control(), None, DT)
+
+
+def test_bodies_alone(device):
+    """Boxes that fall onto each other and onto a table, in a model without particles, keep the distance."""
+    distance = 0.01
+    builder = newton.ModelBuilder()
+    table = wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity())
+    builder.add_shape_box(-1, xform=table, hx=0.3, hy=0.3, hz=0.1)
+    for i in range(2):
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.3 * i)
+        body = builder.add_body(xform=wp.transform(wp.vec3(0.01 * i, 0.02 * i, 0.06 + 0.1 * i), turn))
+        builder.add_shape_box(body, hx=0.04, hy=0.05, hz=0.03)
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=distance, bodies=True)
+    states, mesh = (model.state(), model.state()), solver.mesh
+    x = wp.empty(mesh.vertex_count, dtype=wp.vec3, device=device)
+    finder, rounds = bsc.CollisionDetector(mesh), 0
+    for step in range(60):
+        states[0].clear_forces()
+        solver.step(*states, model.control(), None, DT)
+        states = states[::-1]
+        rounds += solver.report.rounds
+        assert solver.report.certified
+        if step % 20 == 19:
+            mesh.positions(states[0].particle_q, states[0].body_q, x)
+            near = finder.find_proximities(x, distance)
+            of_edges = mesh.shape_vertices.body[mesh.edges[:, 0]]
+            first = mesh.shape_vertices.body[near.vertex_face[:, 0]], of_edges[near.edge_edge[:, 0]]
+            second = mesh.shape_vertices.body[mesh.faces[near.vertex_face[:, 1], 0]], of_edges[near.edge_edge[:, 1]]
+            assert (np.concatenate(first) == np.concatenate(second)).all()
+    assert rounds > 20
