@@ -52,6 +52,8 @@ class SolverReport:
     def certified(self) -> bool:
         """Whether a complete detection found the motion of the last step, as stored, to be free of collisions.
 
+        With minimum distances, a collision is a pair that comes nearer than it may, here and in what follows.
+
         Contacts that :attr:`excluded` counts, and contacts of which no vertex can be moved, are not part of this. A
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.

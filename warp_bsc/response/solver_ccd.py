@@ -177,6 +177,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     times the separation; the arcs themselves are not certified. A body whose wanted pose or velocity is not finite is
     left to the inner solver, and the step is not certified.
 
+    With ``min_distance`` or ``radius`` the certificate is of distances: no pair that started farther apart comes within
+    its minimum distance, and none that started nearer comes nearer than it was, beyond the rounding of 2^-30 of that.
+    Elements that touch at the start are set aside, and elements that an edge of the mesh joins only do not touch.
+
     With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
     tape then records what the inner solver records.
 
