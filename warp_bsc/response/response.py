@@ -116,9 +116,9 @@ class Response:
     Bodies that can be moved are projected with the particles, each by its pose, see :mod:`.bodies`. One whose vertices
     are to be divided or frozen goes back along its path as one, and collides with what is left in the next iteration.
 
-    Where the mesh has minimum distances, see :meth:`.model_mesh.ModelMesh.keep_distances`, a contact is a pair that comes
-    nearer than it may. The first detection also adds constraints for pairs that come within the separation of that: the
-    distance by which these are moved apart goes to zero where a pair only just comes near.
+    Where the mesh has minimum distances, see :meth:`.model_mesh.ModelMesh.keep_distances`, a contact is a pair that
+    comes nearer than it may. The first detection also adds constraints for pairs that come within the separation of
+    that: the distance by which these are moved apart goes to zero where a pair only just comes near.
 
     If the response is differentiable, paths are truncated before their first contact instead of divided, and a
     detection whose queues are too small freezes all vertices, uncertified.
