@@ -67,6 +67,10 @@ _UNITS = wp.constant(wp.float64(2.0**40))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 
+_NEAR = wp.constant(wp.float64(0.1))
+"""Distance of near edges at the start, as a share of their separation, below which they are projected in any case:
+planes keep a share of the distance, which becomes ever smaller where something presses."""
+
 _KERNEL = {"enable_backward": False}
 
 
@@ -270,14 +274,17 @@ def activate_position_constraints(
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
     Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities of edges where planes divide
-    all near pairs afterwards: a stack has four times as many as of vertices and faces, which hold it as well.
+    near pairs afterwards, unless they are too near: a stack has four times as many as of vertices and faces, which hold
+    it as well.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
     if constraints.kind[i] == EDGE_EDGE_PROXIMITY and is_dividing(progress, world, progress.status.iteration[0]):
-        return
+        start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
+        if wp.dot(constraints.normal[i], start) >= _NEAR * constraints.separation[i]:
+            return
     past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
         return
