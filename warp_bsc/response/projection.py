@@ -283,7 +283,8 @@ def activate_position_constraints(
     world = motion.world[constraints.vertices[i][0]]
     if constraints.kind[i] == EDGE_EDGE_PROXIMITY and is_dividing(progress, world, progress.status.iteration[0]):
         start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
-        if wp.dot(constraints.normal[i], start) >= _NEAR * constraints.separation[i]:
+        least = least_distance(constraints, i)
+        if wp.dot(constraints.normal[i], start) - least >= _NEAR * (constraints.separation[i] - least):
             return
     past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
