@@ -11,7 +11,7 @@ from .gradients import with_gradients
 from .min_distance import min_distance_impact
 from .motion import all_finite, doubles, motion_and_distance, relative_motion
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
-from .signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
+from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from .time_of_impact import Impact, impact
 
 _TOLERANCE = wp.constant(wp.float64(2.0**-20))
@@ -208,12 +208,7 @@ def impact_at_distance(
         return result
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     motion, distance = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, min_distance, roundoff)
-    result = min_distance_impact(kind, motion, distance, timed, tolerance)
-    if motion.size == _ZERO:  # the features are one point, at any distance of at least 0
-        result.status = HIT
-        result.within_tolerance = 1
-        result.toi = _ZERO
-    return result
+    return min_distance_impact(kind, motion, distance, timed, tolerance)
 
 
 @wp.func

@@ -425,6 +425,113 @@ def closest_at(kind: int, motion: Motion, time: wp.float64):
     return coordinates, normal
 
 
+@wp.struct
+class Search:
+    """How far the search through a step is."""
+
+    near: wp.float64  # what is at most this far apart is a HIT
+    far: wp.float64  # what is farther apart is free
+    length: wp.float64  # tolerance of the time of impact
+    start: wp.float64  # of the part that is next: what is before is free
+    width: wp.float64  # of that part
+    limit: wp.float64  # end of what is to be searched
+    found: bool  # whether the distance is certainly reached at the limit
+    aimed: bool  # whether the part ends within the tolerance before the limit
+    visits: int
+    status: int  # FREE if the whole step is free, else UNSURE
+    ended: bool
+
+
+@wp.func
+def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) -> Search:
+    """Returns the search of :func:`min_distance_impact`, whose arguments these are, before its first part."""
+    search = Search()
+    search.length = clamped_tolerance(tolerance)
+    search.near = wp.where(distance >= _SMALLEST, distance, _ZERO)
+    search.far = wp.max(distance, _SMALLEST)
+    if motion.roundoff == _ZERO:
+        search.near = distance
+        search.far = distance
+    search.width = _ONE
+    search.limit = _ONE
+    search.status = UNSURE
+    return search
+
+
+@wp.func
+def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
+    """Returns a search after its next part; it has ended if nothing is left to do."""
+    search = before
+    start = search.start
+    limit = search.limit
+    end = wp.min(start + search.width, limit)
+    span = end - start
+    time = start + SHORTEST * wp.floor(_HALF * span / SHORTEST)
+    at, gap = _nearest_at(motion, time)
+    if _is_within(motion, gap, search.near):
+        search.limit = time
+        search.found = True
+        search.aimed = False
+        search.ended = time == start  # in a shortest part
+    else:
+        part = restrict_motion(motion, start, end)
+        if _direction_clears(part, _unit_scale(gap), search.far) or _polygon_clears(kind, part, at, search.far):
+            search.start = end
+            search.width = _TWO * search.width
+            search.aimed = False
+            search.ended = end == limit
+            if search.ended and not search.found:
+                search.status = FREE
+        elif span <= SHORTEST:
+            search.ended = True
+        else:
+            reached = _about_reached(motion, distance, start, limit, time, at, gap)
+            if reached < limit:
+                reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
+                at, gap = _nearest_at(motion, reached)
+                if _is_within(motion, gap, search.near):
+                    search.found = True
+                    search.limit = reached
+            if search.visits == 0:
+                at, gap = _nearest_at(motion, _ONE)
+                search.found = search.found or _is_within(motion, gap, search.near)
+                at, gap = _nearest_at(motion, _ZERO)
+                if _is_within(motion, gap, search.near):
+                    search.found = True
+                    search.limit = _ZERO
+                    search.ended = True
+            aim = search.limit - _AHEAD * search.length - start
+            aim = SHORTEST * wp.floor(aim / SHORTEST)
+            search.aimed = search.found and not search.aimed and aim > _ZERO and aim < span
+            search.width = wp.where(search.aimed, aim, wp.max(_HALF * power_of_two(span), SHORTEST))
+    search.visits += 1
+    if search.found and (not timed or search.limit - search.start <= search.length):
+        search.ended = True
+    search.ended = search.ended or search.visits == MAX_VISITS
+    return search
+
+
+@wp.func
+def end_search(kind: int, motion: Motion, search: Search) -> Impact:
+    """Returns what a search that has ended has found."""
+    result = Impact()
+    if search.status == FREE:
+        result.status = FREE
+        result.toi = wp.float64(2.0)
+        return result
+    result.status = wp.where(search.found, HIT, UNSURE)
+    result.within_tolerance = wp.where(search.found and search.limit - search.start <= search.length, 1, 0)
+    result.toi = search.start
+    coordinates, normal = closest_at(kind, motion, wp.where(search.found, search.limit, search.start))
+    result.coordinates = coordinates
+    result.normal = normal
+    if motion.size == _ZERO:  # the features are one point, at any distance of at least 0
+        result.status = HIT
+        result.within_tolerance = 1
+        result.toi = _ZERO
+    return result
+
+
 @wp.func
 def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: bool, tolerance: wp.float64) -> Impact:
     """Returns the status of a query with a minimum distance and, if ``timed``, the first time at which it is reached.
@@ -439,73 +546,7 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
     Returns:
         Coordinates and normal are those of :func:`closest_at`, at the contact.
     """
-    result = Impact()
-    length = clamped_tolerance(tolerance)
-    near = wp.where(distance >= _SMALLEST, distance, _ZERO)
-    far = wp.max(distance, _SMALLEST)
-    if motion.roundoff == _ZERO:
-        near = distance
-        far = distance
-    start = _ZERO
-    width = _ONE
-    limit = _ONE  # end of what is to be searched
-    found = bool(False)  # whether the distance is certainly reached at the limit
-    aimed = bool(False)  # whether the part ends within the tolerance before the limit
-    status = int(UNSURE)
-    for visit in range(MAX_VISITS):
-        end = wp.min(start + width, limit)
-        span = end - start
-        time = start + SHORTEST * wp.floor(_HALF * span / SHORTEST)
-        at, gap = _nearest_at(motion, time)
-        if _is_within(motion, gap, near):
-            limit = time
-            found = True
-            aimed = False
-            if time == start:  # in a shortest part
-                break
-        else:
-            part = restrict_motion(motion, start, end)
-            if _direction_clears(part, _unit_scale(gap), far) or _polygon_clears(kind, part, at, far):
-                start = end
-                width = _TWO * width
-                aimed = False
-                if end == limit:
-                    if not found:
-                        status = FREE
-                    break
-            elif span <= SHORTEST:
-                break
-            else:
-                reached = _about_reached(motion, distance, start, limit, time, at, gap)
-                if reached < limit:
-                    reached = wp.min(SHORTEST * wp.floor((reached + _HALF * length) / SHORTEST), limit)
-                    at, gap = _nearest_at(motion, reached)
-                    if _is_within(motion, gap, near):
-                        found = True
-                        limit = reached
-                if visit == 0:
-                    at, gap = _nearest_at(motion, _ONE)
-                    found = found or _is_within(motion, gap, near)
-                    at, gap = _nearest_at(motion, _ZERO)
-                    if _is_within(motion, gap, near):
-                        found = True
-                        limit = _ZERO
-                        break
-                width = wp.max(_HALF * power_of_two(span), SHORTEST)
-                before = limit - _AHEAD * length - start
-                before = SHORTEST * wp.floor(before / SHORTEST)
-                aimed = found and not aimed and before > _ZERO and before < span
-                width = wp.where(aimed, before, width)
-        if found and (not timed or limit - start <= length):
-            break
-    if status == FREE:
-        result.status = FREE
-        result.toi = wp.float64(2.0)
-        return result
-    result.status = wp.where(found, HIT, UNSURE)
-    result.within_tolerance = wp.where(found and limit - start <= length, 1, 0)
-    result.toi = start
-    coordinates, normal = closest_at(kind, motion, wp.where(found, limit, start))
-    result.coordinates = coordinates
-    result.normal = normal
-    return result
+    search = begin_search(motion, distance, tolerance)
+    while not search.ended:
+        search = visit_part(kind, motion, distance, timed, search)
+    return end_search(kind, motion, search)

@@ -144,3 +144,43 @@ def test_a_time_is_checked_once(tmp_path):
 def test_some_times_alone(stage):
     found = find(stage, "--min-distance", "0.3", "--frames", "0:2")
     assert [row["distance"] for row in found["intervals"][-1]["near_pairs_at_end"]] == [0.125]
+
+
+def test_what_is_near_is_new_against_a_baseline(stage, tmp_path, capsys):
+    path, before = save(stage), tmp_path / "before.json"
+    arguments = ["replay", path, "--device", "cpu", "--fail-on", "new", "--baseline", str(before)]
+    assert main(["replay", path, "--device", "cpu", "--json", str(before)]) == 0
+    assert main([*arguments, "--min-distance", "0.3"]) == 2  # nothing is known of distances then
+    assert "before.json: its replay had no --min-distance" in capsys.readouterr().err
+    assert main(arguments) == 0
+    assert main(["replay", path, "--device", "cpu", "--json", str(before), "--min-distance", "0.2"]) == 0
+    capsys.readouterr()
+    assert main([*arguments, "--min-distance", "0.3"]) == 2
+    assert "its replay had --min-distance 0.2, and does not say what was near at 0.3" in capsys.readouterr().err
+    assert main([*arguments, "--min-distance", "0.2"]) == main([*arguments, "--min-distance", "0.15"]) == 0
+    falling = stage.GetPrimAtPath("/World/Falling")
+    falling.GetAttribute("points").Set(moved(FALLING, (0, 0, 0.1875)), 1)
+    save(stage)
+    capsys.readouterr()
+    assert main([*arguments, "--min-distance", "0.2"]) == 1
+    new = capsys.readouterr().out.split("New against the baseline: 1 interval or time.\n")[1]
+    assert new.startswith("  /World/Falling with /World/Floor is near at 1\n")
+
+
+def test_since_when_and_until_when(stage, tmp_path):
+    found = find(stage, "--min-distance", "0.3")
+    assert found["proximity_spans"] == [
+        {"meshes": ["/World/Falling", "/World/Floor"], "since": 1, "until": 2, "distance": 0.125, "nearest_at": 2}
+    ]
+    # where they crossed they were nearer than any distance
+    before, path = tmp_path / "before.json", save(stage)
+    falling = stage.GetPrimAtPath("/World/Falling").GetAttribute("points")
+    falling.Set(moved(FALLING, (0, 0, -0.125)), 1)
+    falling.Set(moved(FALLING, (0, 0, -0.125)), 2)
+    save(stage)
+    options = ["--device", "cpu", "--min-distance", "0.05"]
+    assert main(["replay", path, *options, "--json", str(before)]) == 0
+    falling.Set(moved(FALLING, (0, 0, 0.03125)), 1)
+    falling.Set(moved(FALLING, (0, 0, 0.03125)), 2)
+    save(stage)
+    assert main(["replay", path, *options, "--baseline", str(before), "--fail-on", "new"]) == 0

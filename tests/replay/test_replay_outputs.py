@@ -25,7 +25,7 @@ import pytest
 from chromium import CHROMIUM, Browser
 from progress_lines import without_progress
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, falling, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc import _atomic_file
@@ -150,7 +150,7 @@ def test_overlay_emits_light_and_is_a_guide(stage, tmp_path):
         shader, _, _ = material.ComputeSurfaceSource()
         assert shader.GetShaderId() == "UsdPreviewSurface"
         assert tuple(shader.GetInput("emissiveColor").Get()) == pytest.approx(COLORS[name])
-    assert len(set(COLORS.values())) == 4
+    assert len(set(COLORS.values())) == len(COLORS)
 
 
 @pytest.mark.parametrize("suffix", ["usda", "usdc"])
@@ -209,6 +209,52 @@ def test_overlay_has_the_curves_along_which_surfaces_cut(tmp_path):
         api = UsdGeom.PrimvarsAPI(overlay.GetPrimAtPath("/Collisions/Intersections"))
         names = {prims[value] for name in ("primA", "primB") for value in api.GetPrimvar(name).Get(1)}
         assert names == {"/World/Floor", "/World/Falling"}
+
+
+@pytest.fixture
+def near_and_inside(tmp_path):
+    """A triangle comes near a floor, in two intervals; a small cube is in a large one all the time."""
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    heights = enumerate([1, 0.25, 0.125])
+    add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, height)) for time, height in heights})
+    for name, size in (("Case", 1.0), ("Inside", 0.25)):
+        cube = UsdGeom.Cube.Define(stage, f"/World/{name}")
+        cube.CreateSizeAttr(size)
+        animate(cube, (0, 0, 3))
+    return stage
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_overlay_has_what_is_near_and_inside(near_and_inside, tmp_path, suffix):
+    path = tmp_path / f"overlay.{suffix}"
+    arguments = ["replay", save(near_and_inside), "--device", "cpu", "--overlay", str(path)]
+    assert main([*arguments, "--min-distance", "0.3"]) == 0
+    overlay = Usd.Stage.Open(str(path))
+    assert errors_of(overlay) == []
+    names = overlay.GetPrimAtPath("/Collisions").GetAttribute("prims").Get()
+    near, inside = (UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"/Collisions/{name}")) for name in ("Near", "Inside"))
+    places = [[*map(tuple, near.GetPositionsAttr().Get(time))] for time in (0, 0.5, 1, 1.5, 2)]
+    assert places == [[], [], [(0.5, -0.5, 0.125)], [(0.5, -0.5, 0.125)], [(0.5, -0.5, 0.0625)]]
+    primvars = UsdGeom.PrimvarsAPI(near)
+    values = {name: primvars.GetPrimvar(name).Get(2)[0] for name in ("distance", "primA", "primB", "elementA")}
+    assert values["distance"] == 0.125 and tuple(values["elementA"]) == (0, -1)
+    assert [names[values[name]] for name in ("primA", "primB")] == ["/World/Falling", "/World/Floor"]
+    for time in (0, 1.5, 2):
+        (place,) = inside.GetPositionsAttr().Get(time)
+        np.testing.assert_allclose(np.abs(np.subtract(place, (0, 0, 3))), 0.125, atol=1e-6)
+        numbers = [UsdGeom.PrimvarsAPI(inside).GetPrimvar(name).Get(time)[0] for name in ("primA", "primB")]
+        assert [names[number] for number in numbers] == ["/World/Inside", "/World/Case"]
+    for path in ("Near/Marker", "Inside/Marker"):
+        prim = overlay.GetPrimAtPath(f"/Collisions/{path}")
+        assert UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
+        assert tuple(prim.GetAttribute("primvars:displayColor").Get()[0]) == pytest.approx(
+            COLORS[path[: path.index("/")]]
+        )
+    assert main([*arguments, "--no-intersections"]) == 0
+    overlay = Usd.Stage.Open(str(tmp_path / f"overlay.{suffix}"))
+    overlay.Reload()
+    assert not overlay.GetPrimAtPath("/Collisions/Near") and not overlay.GetPrimAtPath("/Collisions/Inside")
 
 
 def test_overlay_shows_nothing_between_its_samples(tmp_path):
@@ -299,9 +345,9 @@ def test_overlay_and_page_of_a_still_stage(tmp_path):
         ends = read_curves(overlay, time).reshape(-1, 3)
         assert (ends[:, 0].min(), ends[:, 0].max()) == pytest.approx((0.75, 1.25), abs=1e-6)
     page = Page((tmp_path / "page.html").read_text())
-    (start, end, *hits), ((time, crossings, touches),) = page.data["intervals"][0], page.data["rest"]
+    (start, end, *hits), ((time, crossings, touches, _),) = page.data["intervals"][0], page.data["rest"]
     assert start == end == time and hits == [0, 0] and crossings + touches > 0
-    assert page.data["rows"] == [[0, crossings + touches], [0, 0]]
+    assert page.data["rows"] == [[0, crossings + touches, 0], [0, 0, 0]]
     assert page.blocks == {"rest-0", "view-0", "faces-0"}
 
 
@@ -796,12 +842,13 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     data = page.data
     assert data["intervals"] == [[0, 1, 0, 0], [1, 2, 0, 0], [2, 3, 1, 0], [3, 4, 0, 0]]
     assert [at for at, *_ in data["rest"]] == [0, 1, 2, 3, 4]
-    assert [crossings > 0 for _, crossings, _ in data["rest"]] == [False, False, False, True, True]
-    assert data["rows"] == [[0, 0], [0, 0], [1, 0], [0, data["rest"][3][1]], [0, data["rest"][4][1]]]
+    assert [crossings > 0 for _, crossings, *_ in data["rest"]] == [False, False, False, True, True]
+    at_rest = [[0, data["rest"][time][1], 0] for time in (3, 4)]
+    assert data["rows"] == [[0, 0, 0], [0, 0, 0], [1, 0, 0], *at_rest] and data["near"] == []
     assert sum(data["toi"]) == 1 and data["toi"][9] + data["toi"][10] == 1
     (pair,) = data["pairs"]
     assert (pair["meshes"], pair["hits"]) == (["/World/Floor", "/World/Falling"], 1)
-    assert pair["spans"] == [[2, 3, 1]] and pair["rest"] == [[3, 4, data["rest"][3][1], "stays"]]
+    assert pair["spans"] == [[2, 3, 1]] and pair["rest"] == [[3, 4, data["rest"][3][1], "stays", ""]]
     assert data["up_axis"] == "Z" and data["validation"]["disagreements"] == []
     assert page.blocks == {"view-0", "faces-0", "hits-2", "view-2", "rest-3", "view-3", "rest-4"}
     center = np.array(data["center"])
@@ -826,7 +873,7 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     *_, last = bsc.replay(scene, device="cpu")
     for index, at_rest in ((3, last.intersections[0]), (4, last.intersections[1])):
         block = page.block(f"rest-{index}")
-        assert (block["crosses"] == at_rest.crosses).all()
+        assert (block["kind"] == np.where(at_rest.crosses, 4, 5)).all()
         np.testing.assert_allclose(block["curves"].reshape(-1, 2, 3) + center, at_rest.cuts.points, atol=1e-6)
 
 
@@ -836,7 +883,24 @@ def test_page_without_collisions(tmp_path):
     replay(stage)
     page = Page((tmp_path / "page.html").read_text())
     assert page.blocks == {"view-0", "faces-0"}  # the scene is there to be seen
-    assert page.data["rows"] == [[0, 0], [0, 0]] and page.data["pairs"] == []
+    assert page.data["rows"] == [[0, 0, 0], [0, 0, 0]] and page.data["pairs"] == []
+
+
+def test_page_has_what_is_near_and_inside(near_and_inside, tmp_path):
+    found = json.loads(replay(near_and_inside, "--min-distance", "0.3")[0].read_text())
+    page = Page((tmp_path / "page.html").read_text())
+    data = page.data
+    assert data["near"] == [[0, 0], [1, 1], [2, 1]] and [at[3] for at in data["rest"]] == [1, 1, 1]
+    assert data["rows"] == [[0, 1, 0], [0, 1, 1], [0, 1, 1]]
+    block = page.block("near-2")
+    assert (block["kind"][0], block["distance"][0]) == (7, 0.125) and page.block("rest-2")["kind"][0] == 6
+    (row,) = found["intervals"][-1]["near_pairs_at_end"]
+    np.testing.assert_allclose(block["position"] + data["center"], row["position"], atol=1e-6)
+    inside, near = data["pairs"]
+    assert (inside["rest"], near["near"]) == ([[0, 2, 1, "stays", "/World/Inside"]], [[1, 2, 0.125]])
+    assert ["0.125", "least distance"] in data["tiles"]
+    replay(near_and_inside, "--min-distance", "0.1")
+    assert ["> 0.1", "least distance"] in Page((tmp_path / "page.html").read_text()).data["tiles"]
 
 
 def test_page_without_intersections(stage, tmp_path):
@@ -881,10 +945,12 @@ def test_page_says_what_it_leaves_out(tmp_path, monkeypatch):
     stage = many_hits(tmp_path / "scene.usda")
     found = json.loads(replay(stage)[0].read_text())
     page = Page((tmp_path / "page.html").read_text())
-    listed = sum(hits for hits, _ in page.data["rows"])
-    assert [hits for hits, _ in page.data["rows"][:3]] == [6, 6, 6] and found["hits"] > 300
+    listed = sum(hits for hits, *_ in page.data["rows"])
+    assert [hits for hits, *_ in page.data["rows"][:3]] == [6, 6, 6] and found["hits"] > 300
     (note, rest) = page.data["notes"][-2:]
-    assert note.startswith(f"The table has {listed} of {found['hits']} collisions: ") and "edges at rest" in rest
+    assert (
+        note.startswith(f"The table has {listed} of {found['hits']} collisions: ") and "intersections at rest" in rest
+    )
     for index in range(3):
         block = page.block(f"hits-{index}")
         assert block["of"] == found["intervals"][index]["hits"]
@@ -955,6 +1021,23 @@ def test_page_in_chromium(tmp_path, browser):
 
 
 @pytest.mark.browser
+def test_near_and_inside_in_chromium(near_and_inside, tmp_path, browser):
+    browser.open(replay(near_and_inside, "--min-distance", "0.3")[3])
+    assert browser.value("document.getElementById('viewer-title').textContent").endswith(
+        "; 1 part inside at the start, 1 at the end; 1 pair near at the start, 1 at the end"
+    )
+    legend = browser.value("document.getElementById('viewer-legend').textContent")
+    assert "part of a mesh inside another" in legend and "near pair" in legend
+    kinds = "[...document.querySelectorAll('#rows tr[data-at] td.kind')].map((cell) => cell.textContent)"
+    assert browser.value(kinds) == ["inside", "inside", "near", "inside", "near"]
+    browser.click("#rows tr[data-at]", 4)
+    browser.wait("!document.getElementById('selected').hidden")
+    assert browser.value("document.getElementById('selected').textContent").startswith("near at time 2: ")
+    assert "0.125 apart" in browser.value("document.getElementById('rows').textContent")
+    assert browser.console == []
+
+
+@pytest.mark.browser
 def test_intervals_are_gone_through_in_chromium(stage, tmp_path, browser):
     browser.open(replay(stage)[3])
     heading = "document.getElementById('viewer-heading').textContent"
@@ -990,7 +1073,7 @@ def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
     found = json.loads(replay(many_hits(tmp_path / "scene.usda"))[0].read_text())
     page = tmp_path / "page.html"
     browser.open(page)
-    total = sum(hits + rest for hits, rest in Page(page.read_text()).data["rows"])
+    total = sum(map(sum, Page(page.read_text()).data["rows"]))
     count = "document.getElementById('rows-count').textContent"
     assert browser.value(count) == f"{total:,} of {total:,} rows"
     assert (

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from pxr import Gf, Usd
+from pxr import Gf, Usd, UsdGeom
 from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
@@ -66,3 +66,14 @@ print(*(error.GetName() for error in validator.Validate(Usd.Stage.Open({stage.Ge
     environment = os.environ | {"PXR_PLUGINPATH_NAME": rules.PLUGIN_FOLDER}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split()[-3:] == ["Collision", "Intersection", "Intersection"]
+
+
+def test_a_mesh_inside_another_is_a_warning(tmp_path):
+    stage = new_stage(tmp_path / "boxes.usda")
+    for name, size in (("Case", 2.0), ("Inside", 1.0)):
+        UsdGeom.Cube.Define(stage, f"/World/{name}").CreateSizeAttr(size)
+    stage = Usd.Stage.Open(save(stage))
+    validator = UsdValidation.ValidationRegistry().GetOrLoadValidatorByName(rules.NAME)
+    (error,) = validator.Validate(stage)
+    assert (error.GetName(), error.GetType()) == ("Inside", UsdValidation.ValidationErrorType.Warn)
+    assert error.GetMessage() == "/World/Inside is inside /World/Case from time 0 to 0"

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Ts, UsdGeom, Vt
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, moved, new_stage, save
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli import replay as replay_command
@@ -57,7 +57,8 @@ def waves(tmp_path_factory):
 def troubled(tmp_path_factory):
     """The same with all that makes an interval depend on those before it.
 
-    Two meshes break at different times, one jumps, one appears, two share a seam, and an instancer places some.
+    Two meshes break at different times, one jumps, one appears, two share a seam, an instancer places some, and one
+    comes to be inside another.
     """
     stage = new_stage(tmp_path_factory.mktemp("troubled") / "troubled.usda")
     add_sheet(stage, "/World/A", 0.0)
@@ -82,6 +83,9 @@ def troubled(tmp_path_factory):
     add_mesh(stage, "/World/Instances/Prototype", FALLING)
     positions = {0: [(0, 0, 0.5), (0.2, 0.2, 0.3)], FRAMES - 1: [(0, 0, -0.5), (0.2, 0.2, -0.6)]}
     add_instancer(stage, "/World/Instances", positions, ["/World/Instances/Prototype"])
+    case = UsdGeom.Cube.Define(stage, "/World/Case")
+    animate(case, (6, 6, 6))
+    animate(add_mesh(stage, "/World/Enters", FALLING), (3, 6, 6), (6, 6, 6), times=[0, FRAMES - 1])
     return save(stage)
 
 
@@ -117,12 +121,13 @@ def test_two_workers_write_the_same_files(troubled, tmp_path, capsys):
         "from time 8 on: /World/Breaks: vertex 3",
         "from time 16 on: /World/BreaksLater: vertex 3",
     ]
+    assert [span["meshes"] for span in found["intersections"] if span["inside"]] == [["/World/Enters", "/World/Case"]]
     assert any("/World/Jumps jumps 2 times" in warning for warning in found["warnings"])
     capsys.readouterr()
     together = run(troubled, tmp_path / "2", "--workers", "2", *OPTIONS, status=LEFT_OUT)
     assert not say_where(together, alone)
     printed = capsys.readouterr().out
-    assert len(re.findall(r"^  \S+:\d+: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
+    assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
 def test_workers_compare_with_a_baseline(tmp_path, waves):
@@ -315,6 +320,7 @@ def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
     ("name", "number", "gpus", "device"),
     [
         (None, 3, 2, "cuda:1"),
+        ("cuda", 1, 1, "cuda:0"),
         ("cuda", 4, 4, "cuda:0"),
         ("cuda:1", 0, 4, "cuda:1"),
         ("cpu", 1, 4, "cpu"),

@@ -212,6 +212,20 @@ def test_no_room(device):
         assert end.tolist() == list(START) and cut
 
 
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), room=st.sampled_from([1e-9, 1e-10, 1e-11, 1e-12]))
+def test_elements_nearer_than_coordinates_are_precise(seed, room, device):
+    """A vertex slides along the plane all the same: its end is rounded upwards."""
+    rng = np.random.default_rng(seed)
+    x0 = np.float32(rng.uniform(0.001, 0.2, 3))
+    n = unit(*(rng.choice([-1.0, 1.0], 3) * rng.uniform(0.05, 1.0, 3)))
+    slide = 1e-5 * unit(*np.cross(n, rng.standard_normal(3)))
+    end, cut = divide([(n, n @ x0.astype(float) - room, 0.9 * room)], x0, np.float32(x0 + slide - 1e-6 * n), device)
+    assert not cut
+    assert n @ end > n @ x0.astype(float) - room
+    np.testing.assert_allclose(end, x0 + slide, rtol=0.0, atol=3e-8)
+
+
 _NUMBER = st.integers(-8, 8).map(lambda i: i / 8.0)  # of few bits, so that planes are symmetric and equally far
 
 

@@ -50,12 +50,16 @@ def load_detector(
     *,
     intersections: bool = False,
     proximities: bool = False,
+    strands: bool = False,
 ) -> None:
     """Loads the detector's kernels for one type of position, other finders' if wanted; may compile them."""
     triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)
     detector = CollisionDetector(triangles, method=method)
     detector.detect(points, points)
+    if strands:
+        rope = CollisionMesh([[0, 1, 2]], 6, edges=[[3, 4]], points=[5], radius=1.0, device=device)
+        CollisionDetector(rope, method=method).detect(points, points)
     if intersections:
         detector.find_intersections(points)
     if proximities:

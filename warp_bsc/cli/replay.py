@@ -50,9 +50,11 @@ Find the collisions of the meshes of a USD scene, with themselves and with each
 other, between each two consecutive time samples; vertices move straight from
 sample to sample. Meshes that never move are obstacles: contacts between
 obstacles are excluded, and so are contacts of a mesh with itself if only its
-transform moves it. Rotations are sampled at every whole time code as well.
-At the time samples themselves, find the edges that pass through faces, those
-of obstacles included; where nothing moves, this is done at one time.
+transform moves it. Linear curves and points take part, with half their widths
+as radii. Rotations are sampled at every whole time code as well.
+At the time samples themselves, find the edges that pass through faces and the
+meshes that are wholly inside closed ones, obstacles included; where nothing
+moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
 finished intervals, marked partial."""
@@ -125,7 +127,8 @@ def add_to(commands: Commands) -> None:
         "--intersections",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="find the edges that pass through faces or touch them at the time samples themselves (default: yes)",
+        help="find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "
+        "are wholly inside others (default: yes)",
     )
     which.add_argument(
         "--min-distance",
@@ -156,7 +159,8 @@ def add_to(commands: Commands) -> None:
     which.add_argument(
         "--ignore-initial",
         action="store_true",
-        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then",
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; of those "
+        "that are inside others then, ignore only that they are inside",
     )
     which.add_argument(
         "--purpose",
@@ -209,16 +213,16 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--baseline",
         metavar="FILE",
-        help="compare with the JSON file of an earlier replay: print which meshes collide or cross at times at which "
-        "they did not",
+        help="compare with the JSON file of an earlier replay: print which meshes collide, cross, are inside others "
+        "or, with --min-distance, near each other at times at which they were not",
     )
     out.add_argument(
         "--fail-on",
         type=_reasons,
         default=frozenset(),
         metavar="WHAT",
-        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces), "
-        "collisions, distance (what --min-distance finds), new (what --baseline does not have)",
+        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces, "
+        "meshes inside others), collisions, distance (what --min-distance finds), new (what --baseline does not have)",
     )
     run = command.add_argument_group("running")
     run.add_argument(
@@ -227,7 +231,7 @@ def add_to(commands: Commands) -> None:
         default=1,
         metavar="N",
         help="check intervals in N processes on this machine, which share its cores, or use a GPU each, in turns, "
-        "unless --device names one (default: 1)",
+        "unless --device names one, such as cuda:0; more processes than GPUs share these (default: 1)",
     )
     run.add_argument(
         "--scheduler",
@@ -259,6 +263,7 @@ def _run(arguments: argparse.Namespace) -> int:
             device,
             intersections=arguments.intersections,
             proximities=arguments.min_distance is not None,
+            strands=scene.has_strands,
         )
     return run_replay(scene, arguments, str(device))
 
@@ -339,7 +344,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
     """
     settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
-    baseline = Baseline(arguments.baseline) if arguments.baseline else None
+    baseline = Baseline(arguments.baseline, arguments.min_distance) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
         earlier = None
         if arguments.resume and os.path.exists(arguments.json):
@@ -375,7 +380,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
             try:
                 written.wait()
             except Exception as error:
-                problems += [] if interrupt else [_explain(error, scene)]
+                problem = _explain(error, scene)  # a change of the scene's files is found by all that read or write
+                problems += [] if interrupt or problem in problems else [problem]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
@@ -407,7 +413,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
     if summary.validation and summary.validation.disagreements:
         return _DISAGREES
     fails = {
-        "intersections": any(sample.crossings for sample in summary.intersections),
+        "intersections": any(sample.crossings or sample.inside for sample in summary.intersections),
         "collisions": summary.hits > 0,
         "distance": bool(summary.nearest),
         "new": baseline is not None and bool(baseline.new_in(summary)),
@@ -463,7 +469,7 @@ def _open_outputs(
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
-        (arguments.json, lambda path: HitsJson(path, facts=facts)),
+        (arguments.json, lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands)),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
@@ -538,7 +544,7 @@ def _track(
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
     """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
     selection = asdict(scene.selection)
-    del selection["ignored_names"]  # found, not chosen
+    del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
     names = "frames", "subdivide", "strict", "intersections", "ignore_initial", "validate"
     options = {name: getattr(arguments, name) for name in names}
     return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}

@@ -5,7 +5,8 @@ from collections import defaultdict
 from rich.console import Console
 from rich.text import Text
 
-from ..replay.results import IntervalSummary, Work
+from ..replay.baseline import NewFinding
+from ..replay.results import IntersectionSummary, IntervalSummary, Work
 from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .tables import LONGEST, count, make_table, say
@@ -72,7 +73,7 @@ def print_replay(console: Console, summary: Summary) -> None:
             f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
         )
     if summary.validation:
-        _print_validation(console, summary.validation)
+        _print_validation(console, summary.validation, scene.has_strands)
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
@@ -100,7 +101,7 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
     )
     by_worker = defaultdict(list)
     for work in done:
-        by_worker[work.worker].append(work.reading + work.checking)
+        by_worker[work.worker and f"{work.worker} on {work.device}"].append(work.reading + work.checking)
     if "" in by_worker:  # this process alone
         return
     for worker, seconds in sorted(by_worker.items())[:LONGEST]:
@@ -109,15 +110,16 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
         say(console, f"  and {len(by_worker) - LONGEST} more workers.")
 
 
-def print_new(console: Console, new: list[tuple[tuple[str, str], float, float]]) -> None:
-    """Prints what is new against a baseline: names of two meshes, start and end each."""
+def print_new(console: Console, new: list[NewFinding]) -> None:
+    """Prints what is new against a baseline."""
     if not new:
         say(console, "Nothing is new against the baseline.")
         return
     say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
-    for meshes, start, end in new[:LONGEST]:
-        says = f"crosses at {start:g}" if start == end else f"collides from {start:g} to {end:g}"
-        say(console, f"  {_pair(meshes)} {says}")
+    for what, meshes, start, end in new[:LONGEST]:
+        says = " is inside ".join(meshes) if what == "is inside" else f"{_pair(meshes)} {what}"
+        when = f"at {start:g}" if start == end else f"from {start:g} to {end:g}"
+        say(console, f"  {says} {when}")
     if len(new) > LONGEST:
         say(console, f"  and {len(new) - LONGEST} more.")
 
@@ -132,7 +134,7 @@ def _print_certificate(console: Console, summary: Summary) -> None:
             f"{count(len(intervals), 'interval')}.",
         )
     elif summary.method == "conservative":
-        unsure = sum(interval.stats.vertex_face.unsure + interval.stats.edge_edge.unsure for interval in intervals)
+        unsure = sum(interval.unsure for interval in intervals)
         say(
             console,
             f"Certified for {CERTIFIED_FOR}: no collision is missing. Pairs tested that floating point could not "
@@ -180,12 +182,13 @@ def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
 def _print_collisions(console: Console, summary: Summary) -> None:
     """Prints the number of pairs that collide, in all and by meshes, and the first contact."""
     colliding = summary.colliding
-    vertex_face = sum(interval.vertex_face_hits for interval in colliding)
-    edge_edge = sum(interval.edge_edge_hits for interval in colliding)
+    kinds = ["vertex_face", "edge_edge"] + ["vertex_edge", "vertex_vertex"] * summary.scene.has_strands
+    numbers = [sum(getattr(interval, f"{kind}_hits") for interval in colliding) for kind in kinds]
+    texts = [f"{number:,} {kind.replace('_', '-')}" for number, kind in zip(numbers, kinds, strict=True)]
     say(
         console,
         f"Collisions in {len(colliding)} of {count(len(summary.intervals), 'interval')}: "
-        f"{vertex_face:,} vertex-face and {edge_edge:,} edge-edge pairs.",
+        f"{', '.join(texts[:-1])} and {texts[-1]} pairs.",
     )
     spans = defaultdict(list)
     for span in summary.collision_spans:
@@ -210,21 +213,22 @@ def _print_intersections(console: Console, summary: Summary) -> None:
     samples, spans = summary.intersections, summary.intersection_spans
     times = count(len(samples), "time")
     if not spans:
-        say(console, f"No edge meets a face at rest, at {times}.")
+        say(console, f"No edge meets a face at rest, and no mesh is inside another, at {times}.")
         return
     first = samples[0]
-    if first.crossings or first.touches:
-        says = "Already crosses" if first.crossings else "Already touches"
-        say(console, f"{says} at {first.time:g}: {_edges(first.crossings, first.touches)}.")
-    worst = max(samples, key=lambda sample: (sample.crossings, sample.touches))
-    intersecting = sum(bool(sample.mesh_pairs) for sample in samples)
+    if not first.is_empty:
+        says = "Already crosses" if first.crossings else "Already touches" if first.touches else "Already inside"
+        say(console, f"{says} at {first.time:g}: {_intersecting(first)}.")
+    worst = max(samples, key=lambda sample: (sample.crossings, sum(sample.inside.values()), sample.touches))
+    intersecting = sum(not sample.is_empty for sample in samples)
     say(
         console,
-        f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: "
-        f"{_edges(worst.crossings, worst.touches)}.",
+        f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: {_intersecting(worst)}.",
     )
     for span in spans[:LONGEST]:
-        say(console, f"  {_pair(span.meshes)}: {_history(span)}")
+        first, second = span.meshes
+        says = f"{first} inside {second}" if span.inside else _pair(span.meshes)
+        say(console, f"  {says}: {_history(span)}")
     if len(spans) > LONGEST:
         say(console, f"  and {len(spans) - LONGEST} more; --json has all.")
     if summary.colliding:
@@ -267,11 +271,14 @@ def _print_proximities(console: Console, summary: Summary, min_distance: float) 
         say(console, f"  and {len(nearest) - LONGEST} more pairs of meshes; --json has all.")
 
 
-def _edges(crossings: int, touches: int) -> str:
-    """Returns in words how many edges pass through faces and touch them."""
-    through = f"{count(crossings, 'edge')} through faces"
-    touching = f"{count(touches, 'edge')} touching faces"
-    return f"{through}, {touching}" if crossings and touches else touching if touches else through
+def _intersecting(found: IntersectionSummary) -> str:
+    """Returns in words how many edges pass through faces and touch them, and how many parts are inside others."""
+    numbers = [
+        (found.crossings, "edge", "through faces"),
+        (found.touches, "edge", "touching faces"),
+        (sum(found.inside.values()), "part", "inside"),
+    ]
+    return ", ".join(f"{count(number, one)} {how}" for number, one, how in numbers if number)
 
 
 def _pair(meshes: tuple[str, str]) -> str:
@@ -281,16 +288,17 @@ def _pair(meshes: tuple[str, str]) -> str:
 
 def _history(span: IntersectionSpan) -> str:
     """Returns in words since when and until when two meshes intersect."""
-    says = "touches only" if not span.crossings else span.trend
+    says = "touches only" if not span.inside and not span.crossings else span.trend
+    one = "part" if span.inside else "edge"
     if span.since == span.until:
-        return f"at {span.since:g}, {count(span.first, 'edge')}, {says}"
-    numbers = f"{count(span.first, 'edge')} at first, {span.last:,} at last"
+        return f"at {span.since:g}, {count(span.first, one)}, {says}"
+    numbers = f"{count(span.first, one)} at first, {span.last:,} at last"
     if span.most > max(span.first, span.last):
         numbers += f", {span.most:,} at {span.most_at:g}"
     return f"from {span.since:g} to {span.until:g}, {numbers}: {says}"
 
 
-def _print_validation(console: Console, found: ValidationSummary) -> None:
+def _print_validation(console: Console, found: ValidationSummary, has_strands: bool) -> None:
     """Prints how the answers compare with the exact checker's."""
     wrong = found.disagreements
     say(
@@ -298,6 +306,8 @@ def _print_validation(console: Console, found: ValidationSummary) -> None:
         f"Validated by the exact checker: {count(found.hits, 'collision')} and "
         f"{count(found.others, 'other pair')}, {count(len(wrong), 'disagreement')}.",
     )
+    if has_strands:
+        say(console, "Collisions of curves and points are not validated.")
     for line in wrong[:LONGEST]:
         say(console, f"  {line}")
     if len(wrong) > LONGEST:

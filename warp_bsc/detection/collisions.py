@@ -1,8 +1,9 @@
 """The results of a detection."""
 
 import functools
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from .differentiable import CollisionArrays
 from .settings import Counts, DistanceKind, PairCounts
 from .stage_timer import StageTimer
 
-__all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts"]
+__all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts", "add_stats"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,17 @@ class DetectionStats:
     vertex_edge: StageCounts
     vertex_vertex: StageCounts
     milliseconds: dict[str, float]
+
+
+def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
+    """Returns the counts and times of two detections together."""
+    stages = {}
+    for kind in DistanceKind:
+        one, other = asdict(getattr(first, kind.label)), asdict(getattr(second, kind.label))
+        stages[kind.label] = StageCounts(**{name: one[name] + other[name] for name in one})
+    milliseconds = Counter(first.milliseconds)
+    milliseconds.update(second.milliseconds)
+    return DetectionStats(**stages, milliseconds=dict(milliseconds))
 
 
 @dataclass(frozen=True, eq=False)

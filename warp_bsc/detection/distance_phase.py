@@ -12,16 +12,15 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from ..kernels.ccd import impact_at_distance
-from ..kernels.min_distance import clears_at_once, closest_at
-from ..kernels.motion import motion_and_distance, relative_motion
+from ..kernels.min_distance import Search, begin_search, clears_at_once, closest_at, end_search, visit_part
+from ..kernels.motion import all_finite, motion_and_distance, relative_motion
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .contact_buffer import HostContacts
 from .kernels import PairStages
-from .launch import launch_over_queue
+from .launch import launch_over, launch_over_queue
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings
 from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
@@ -35,6 +34,9 @@ __all__ = [
     "pair_distances",
     "run_distance_phases",
 ]
+
+_BLOCK, _THREADS_OF_MULTIPROCESSOR = 64, 256
+"""Threads of a block, and of a multiprocessor, that search: as many as run at once. On a CPU a thread has one pair."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -75,6 +77,31 @@ def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) ->
     if kind == EDGE_EDGE:
         return wp.max(a, b) + other
     return a + wp.max(b, other)
+
+
+@wp.func
+def _add_contact(kind: int, pair: wp.vec2i, motion: Motion, search: Search, timed: bool, stages: PairStages):
+    """Adds a pair to the contacts, if it fits, after a search that has not found it free."""
+    result = end_search(kind, motion, search)
+    slot = take_slot(stages.counts, _CONTACTS)
+    take_slot(stages.counts, _FOUND)
+    if result.status == UNSURE:
+        take_slot(stages.counts, _UNSURE)
+    if result.status == UNSURE or (timed and result.within_tolerance == 0):
+        take_slot(stages.counts, _FOR_EXACT)
+        take_slot(stages.counts, _TOO_WIDE)
+    contacts = stages.contacts
+    if slot < wp.int64(contacts.pairs.shape[0]):
+        k = wp.int32(slot)
+        contacts.pairs[k] = pair
+        contacts.status[k] = wp.int8(result.status)
+        contacts.decided[k] = wp.int8(result.status)
+        contacts.within_tolerance[k] = result.within_tolerance == 1
+        contacts.toi[k] = result.toi
+        contacts.coordinates[k] = result.coordinates
+        contacts.normal[k] = result.normal
+        stages.order[k] = k
+        stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
 
 
 @functools.cache
@@ -119,39 +146,34 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         roundoff: wp.float64,
         timed: bool,
         tolerance: wp.float64,
+        threads: wp.int64,
         # in and out
         stages: PairStages,
     ):
-        i = first + wp.tid()
-        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
-            return
-        pair = stages.survivors[i]
-        v = points_of_pair(kind, stages.elements, pair)
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        distance = distance_of_corners(kind, v, radius)
-        result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff, timed, tolerance)
-        if result.status == FREE:
-            return
-        slot = take_slot(stages.counts, _CONTACTS)
-        take_slot(stages.counts, _FOUND)
-        if result.status == UNSURE:
-            take_slot(stages.counts, _UNSURE)
-        if result.status == UNSURE or (timed and result.within_tolerance == 0):
-            take_slot(stages.counts, _FOR_EXACT)
-            take_slot(stages.counts, _TOO_WIDE)
-        contacts = stages.contacts
-        if slot < wp.int64(contacts.pairs.shape[0]):
-            k = wp.int32(slot)
-            contacts.pairs[k] = pair
-            contacts.status[k] = wp.int8(result.status)
-            contacts.decided[k] = wp.int8(result.status)
-            contacts.within_tolerance[k] = result.within_tolerance == 1
-            contacts.toi[k] = result.toi
-            contacts.coordinates[k] = result.coordinates
-            contacts.normal[k] = result.normal
-            stages.order[k] = k
-            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+        filled = wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0]))
+        i = wp.int64(first + wp.tid())
+        pair = wp.vec2i()
+        motion = Motion()
+        scaled = wp.float64(0.0)
+        search = Search()
+        search.ended = True
+        # the threads of a warp go through parts together, whatever the pairs that these belong to
+        while not search.ended or i < filled:
+            if search.ended:
+                pair = stages.survivors[wp.int32(i)]
+                i += threads
+                v = points_of_pair(kind, stages.elements, pair)
+                a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+                a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+                points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+                distance = distance_of_corners(kind, v, radius)
+                motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
+                search = begin_search(motion, scaled, tolerance)
+                search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)
+            if not search.ended:
+                search = visit_part(kind, motion, scaled, timed, search)
+            if search.ended and search.status != FREE:
+                _add_contact(kind, pair, motion, search, timed, stages)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_closest(
@@ -213,11 +235,15 @@ def run_distance_phases(
             stages = phase.stages(elements)
             launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
     with timer.stage("classify"):
+        device = x0.device
         for phase, elements in phases:
-            inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance]
             stages = phase.stages(elements)
-            queue, places = stages.survivors, Count.SURVIVORS
-            launch_over_queue(decide, queue, phase.counts, places, inputs=inputs, outputs=[stages], block_dim=64)
+            entries = threads = _THREADS_OF_MULTIPROCESSOR * device.sm_count
+            if device.is_cpu:
+                entries = min(len(stages.survivors), int(phase.counts.numpy()[Count.SURVIVORS]))
+                threads = 2**31
+            inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance, threads]
+            launch_over(decide, entries, inputs=inputs, outputs=[stages], device=device, block_dim=_BLOCK)
 
 
 def pair_distances(

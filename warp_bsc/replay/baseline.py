@@ -2,68 +2,109 @@
 
 import os
 from collections import defaultdict
+from typing import NamedTuple
 
 import orjson
 
 from .summary import Summary
 
-__all__ = ["Baseline"]
+__all__ = ["Baseline", "NewFinding"]
+
+
+class NewFinding(NamedTuple):
+    """What two meshes do in an interval, or at a time, in which they did not do it in an earlier replay.
+
+    Attributes:
+        what: ``"collides"``, ``"crosses"``, ``"is inside"`` or ``"is near"``.
+        meshes: Names of the two.
+        start: Start of the interval, or the time, as a time code.
+        end: End of the interval, or the time.
+    """
+
+    what: str
+    meshes: tuple[str, str]
+    start: float
+    end: float
 
 
 class Baseline:
-    """The times at which meshes collided and intersected in an earlier replay."""
+    """The times at which meshes collided, intersected and were near each other in an earlier replay."""
 
-    def __init__(self, path: str | os.PathLike):
+    def __init__(self, path: str | os.PathLike, min_distance: float | None = None):
         """Reads the JSON file of an earlier replay.
 
         Args:
             path: The file.
+            min_distance: As of :class:`Summary`, of the replays that will be compared with it.
 
         Raises:
             OSError: If it cannot be read.
-            ValueError: If it is not such a file.
+            ValueError: If it is not such a file, or its replay did not look for distances as large.
         """
-        self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {}
+        self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
+            what: defaultdict(list) for what in ("collides", "crosses", "is inside", "is near")
+        }
         try:
-            sums = _read_sums(path)
-            for name in ("collision_spans", "intersections"):
-                spans = self._spans[name] = defaultdict(list)
-                for span in sums[name]:
-                    if span.get("crossings") == 0:  # it only touches
-                        continue
-                    spans[tuple(sorted(span["meshes"]))].append((span["since"], span["until"]))
+            found = _read(path)
+            distance = found["min_distance"]
+            for span in found["collision_spans"]:
+                self._add("collides", span)
+            for span in found["intersections"]:
+                if span["inside"]:
+                    self._add("is inside", span)
+                elif span["crossings"]:  # others only touch
+                    self._add("crosses", span)
+            for span in found["proximity_spans"]:
+                self._add("is near", span)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
+        if min_distance is not None and (distance is None or distance < min_distance):
+            had = "no --min-distance" if distance is None else f"--min-distance {distance:g}"
+            raise ValueError(f"{path}: its replay had {had}, and does not say what was near at {min_distance:g}")
 
-    def new_in(self, summary: Summary) -> list[tuple[tuple[str, str], float, float]]:
-        """Returns which meshes collide or cross in a replay and did not in the earlier one at that time.
+    def new_in(self, summary: Summary) -> list[NewFinding]:
+        """Returns what meshes do in a replay and did not do in the earlier one at that time.
 
-        Returns:
-            Names of two meshes, the start and the end of an interval in which they collide, or one time twice at which
-            they cross.
+        Meshes that crossed at a time, or of which one was inside the other, count as near each other then.
         """
-        collisions, intersections = self._spans["collision_spans"], self._spans["intersections"]
         new = [
-            (meshes, interval.start, interval.end)
+            NewFinding("collides", meshes, interval.start, interval.end)
             for interval in summary.intervals
             for meshes in interval.mesh_pairs
             if not any(
-                since < interval.end and interval.start < until for since, until in collisions[tuple(sorted(meshes))]
+                since < interval.end and interval.start < until
+                for since, until in self._spans["collides"][tuple(sorted(meshes))]
             )
         ]
-        new += [
-            (meshes, sample.time, sample.time)
-            for sample in summary.intersections
-            for meshes, (crossings, _) in sample.mesh_pairs.items()
-            if crossings
-            and not any(since <= sample.time <= until for since, until in intersections[tuple(sorted(meshes))])
-        ]
+        for sample in summary.intersections:
+            crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
+            new += self._new_at(sample.time, "crosses", crossing)
+            new += self._new_at(sample.time, "is inside", sample.inside)
+        for sample in summary.proximities:
+            near = [nearest.meshes for nearest in sample.nearest]
+            new += self._new_at(sample.time, "is near", near, ("is near", "crosses", "is inside"))
         return new
 
+    def _add(self, what: str, span: dict) -> None:
+        self._spans[what][tuple(sorted(span["meshes"]))].append((span["since"], span["until"]))
 
-def _read_sums(path) -> dict:
-    """Returns the members after the intervals. The file that a replay writes has them in its last line."""
+    def _new_at(self, time, what, pairs, before=()) -> list[NewFinding]:
+        """Returns what pairs of meshes do at a time at which they did nothing of ``before``, default: the same."""
+        return [
+            NewFinding(what, meshes, time, time)
+            for meshes in pairs
+            if not any(
+                since <= time <= until
+                for other in before or (what,)
+                for since, until in self._spans[other][tuple(sorted(meshes))]
+            )
+        ]
+
+
+def _read(path) -> dict:
+    """Returns the members before and after the intervals. The file that a replay writes has them in its ends."""
     with open(path, "rb") as file:
+        first = file.readline().rstrip()
         size = file.seek(0, os.SEEK_END)
         length = 1 << 16
         while True:
@@ -73,6 +114,6 @@ def _read_sums(path) -> dict:
                 break
             length *= 2
         if lines and lines[-1].startswith(b'"complete":'):
-            return orjson.loads(b"{" + lines[-1])
+            return orjson.loads(first + b"]}") | orjson.loads(b"{" + lines[-1])
         file.seek(0)  # another program has written the same content
         return orjson.loads(file.read())

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..detection.collisions import Collisions
+from ..detection.collisions import Collisions, add_stats
+from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
@@ -15,7 +16,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .results import IntervalResult, Work, summarize, summarize_intersections
-from .scene_contacts import find_contacts
+from .scene_contacts import SceneContacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
@@ -32,7 +33,7 @@ class Checks:
         selection: Which pairs of meshes count.
         method: Method of detection.
         device: Name of the Warp device; None for Warp's default.
-        intersections: Whether to find the intersections at each time.
+        intersections: Whether to find the intersections at each time, and what is inside what.
         min_distance: Distance up to which elements are near each other, None to look for none.
         validate_most: Number of hits, and of other pairs, that the exact checker decides again; None for all.
     """
@@ -67,14 +68,21 @@ class IntervalChecker:
         """
         for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
             started = time.perf_counter()
-            result = self._at(interval).check(interval)
-            yield replace(result, work=Work(self._worker, reading, time.perf_counter() - started))
+            checker = self._at(interval)
+            result = checker.check(interval)
+            yield replace(result, work=Work(self._worker, checker.device, reading, time.perf_counter() - started))
 
-    def initial_crossings(self) -> frozenset[tuple[str, str]]:
-        """Returns the names of the meshes that cross at the first time, each pair sorted."""
+    def selection_without_initial(self) -> Selection:
+        """Returns the selection that also ignores what crosses, and that something is inside, at the first time."""
         interval = self.scene.interval(0)
         found = summarize_intersections(self._at(interval).find(interval.x0, interval.start))
-        return frozenset((min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings)
+        crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
+        selection = self._checks.selection
+        return replace(
+            selection,
+            ignored_names=selection.ignored_names | crossing,
+            ignored_inside=selection.ignored_inside | found.inside.keys(),
+        )
 
     def _at(self, interval: Interval) -> "_SegmentChecker":
         if self._of_segment is None or interval.segment is not self._of_segment.segment:
@@ -92,11 +100,20 @@ class _SegmentChecker:
         self._checks = checks
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
         self._detector = CollisionDetector(self._mesh, method=checks.method)
-        self._finder = self._detector.intersection_finder() if checks.intersections else None
+        self._finder = self._containment = None
+        if checks.intersections:
+            self._finder = self._detector.intersection_finder()
+            self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
+        self._strands = _StrandDetector(segment, checks) if segment.has_strands else None
         self._last: SceneIntersections | None = None  # those found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
         self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
+
+    @property
+    def device(self) -> str:
+        """Name of the Warp device."""
+        return self._mesh.device.alias
 
     def check(self, interval: Interval) -> IntervalResult:
         """Returns the collisions of an interval."""
@@ -117,6 +134,11 @@ class _SegmentChecker:
             near = self._find_near(interval.x0, interval.start)
             proximities = near, self._find_near(interval.x1, interval.end)
         contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection, intersections)
+        certified, stats = collisions.certified, collisions.stats
+        if self._strands and not self._is_still:
+            more, of_strands = self._strands.find(interval, self._checks.selection, bool(intersections))
+            contacts, stats = join_contacts(contacts, more), add_stats(stats, of_strands.stats)
+            certified &= of_strands.certified
         validation = None
         if most != 0:
             validation = validate(
@@ -132,8 +154,8 @@ class _SegmentChecker:
             contacts,
             intersections,
             proximities,
-            certified=collisions.certified,
-            stats=collisions.stats,
+            certified=certified,
+            stats=stats,
             validation=validation,
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
@@ -148,9 +170,16 @@ class _SegmentChecker:
         """
         last = self._last
         if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
-            assert self._finder
+            assert self._finder and self._containment
+            selection, meshes = self._checks.selection, self.segment.meshes
             found = self._finder.find(x, is_end=is_end)
-            self._last = last = name_intersections(self.segment, self._mesh, found, x, time, self._checks.selection)
+
+            def are_wanted(pairs: np.ndarray) -> np.ndarray:
+                ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
+                return selection.counted_pairs(meshes, pairs) & ~ignored
+
+            inside = self._containment.find(x, found, are_wanted)
+            self._last = last = name_intersections(self.segment, self._mesh, found, inside, x, time, selection)
         return last
 
     def _find_near(self, x: np.ndarray, time: float) -> SceneProximities:
@@ -164,6 +193,33 @@ class _SegmentChecker:
         found = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
         self._last_near = x, found
         return found
+
+
+class _StrandDetector:
+    """Finds the collisions of the curves and points of a segment, with each other and with its meshes."""
+
+    def __init__(self, segment: Segment, checks: Checks):
+        self._mesh = CollisionMesh(
+            segment.faces,
+            segment.vertex_count,
+            edges=segment.free_edges,
+            points=segment.points,
+            radius=segment.radius,
+            device=checks.device,
+        )
+        self._detector = CollisionDetector(self._mesh, method=checks.method)
+
+    def find(self, interval: Interval, selection: Selection, is_compared: bool) -> tuple[SceneContacts, Collisions]:
+        """Returns the contacts in an interval, and the detection in which they are.
+
+        Args:
+            interval: The interval.
+            selection: Which pairs of meshes count.
+            is_compared: Whether contacts of meshes are compared with intersections.
+        """
+        collisions = self._detector.detect(interval.x0, interval.x1)
+        assert isinstance(collisions, Collisions)  # nothing is captured here
+        return find_strand_contacts(interval, self._mesh, collisions, selection, is_compared), collisions
 
 
 def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:

@@ -105,8 +105,12 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
     intersections = proximities = None
     if "edges_through_faces" in record:
         intersections = (
-            _rebuild_intersections(interval, record["edges_through_faces"], interval.start, interval.x0),
-            _rebuild_intersections(interval, at_end("edges_through_faces"), interval.end, interval.x1),
+            _rebuild_intersections(
+                interval, record["edges_through_faces"] + record["inside"], interval.start, interval.x0
+            ),
+            _rebuild_intersections(
+                interval, at_end("edges_through_faces") + at_end("inside"), interval.end, interval.x1
+            ),
         )
     if "near_pairs" in record:
         proximities = (
@@ -114,7 +118,7 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
             _rebuild_proximities(interval, at_end("near_pairs"), interval.end),
         )
     contacts = _rebuild_contacts(interval, record, bool(intersections))
-    # a scene has no points, so that their pairs have no record
+    # a scene without curves and points has no record of their pairs
     counts = {kind.label: StageCounts(**record["stages"].get(kind.label, {})) for kind in DistanceKind}
     validation = record["validation"]
     if validation:
@@ -131,7 +135,7 @@ def _rebuild(interval: Interval, record: dict, following: dict | None) -> Interv
 
 
 def _rebuild_contacts(interval: Interval, record: dict, is_compared: bool) -> SceneContacts:
-    rows = record["contacts"]
+    rows, phases = record["contacts"], {None: -1} | {phase: number for number, phase in enumerate(PHASES)}
     return SceneContacts(
         **_rebuild_pairs(interval, rows),
         interval=interval,
@@ -142,7 +146,7 @@ def _rebuild_contacts(interval: Interval, record: dict, is_compared: bool) -> Sc
         counted=np.ones(len(rows), dtype=bool),
         ignored={(first, second): hits for (first, second), hits in (pair.values() for pair in record["ignored"])},
         separate=np.array([row["separate"] for row in rows], dtype=bool) if is_compared else None,
-        phase=np.array([PHASES.index(row["phase"]) for row in rows], dtype=np.int64) if is_compared else None,
+        phase=np.array([phases[row["phase"]] for row in rows], dtype=np.int64) if is_compared else None,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import orjson
 
 from .. import __version__
+from ..detection.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
 from .outputs import RecordFile
 from .results import IntersectionSummary, IntervalResult
@@ -58,25 +59,27 @@ def replay_facts(
 class HitsJson(RecordFile):
     """A JSON file: facts of the replay, every interval with its contacts and intersections, then the sums.
 
-    An interval lists the intersections and proximities at its start, and where the next interval may start elsewhere,
-    or there is none, those at its end as well. Every interval is in a line of its own.
+    An interval lists what intersects, is inside and is near at its start, and where the next interval may start
+    elsewhere, or there is none, at its end as well. Every interval is in a line of its own.
 
     The file holds no measured times, so that it is the same whoever has found the results.
     :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it.
     """
 
-    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any]):
+    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], has_strands: bool):
         """Opens the file.
 
         Args:
             path: The file's place.
             facts: What :func:`replay_facts` returns.
+            has_strands: Whether the scene has curves or points.
 
         Raises:
             OSError: If it cannot be written.
         """
         super().__init__(path)
         self._facts = facts
+        self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
 
     def head(self) -> str:
         """Returns the text before the first interval."""
@@ -92,13 +95,12 @@ class HitsJson(RecordFile):
             "end": interval.end,
             "pairs_tested": interval.pairs_tested,
             "hits": interval.hits,
-            "vertex_face_hits": interval.vertex_face_hits,
-            "edge_edge_hits": interval.edge_edge_hits,
+            **{f"{kind}_hits": getattr(interval, f"{kind}_hits") for kind in self._kinds},
             "earliest": asdict(interval.earliest) if interval.earliest else None,
             "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
             "ignored": _mesh_pairs_to_list(interval.ignored.items()),
             "certified": interval.certified,
-            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in ("vertex_face", "edge_edge")},
+            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in self._kinds},
             "validation": asdict(interval.validation) if interval.validation else None,
         }
         if interval.intersections:
@@ -112,9 +114,11 @@ class HitsJson(RecordFile):
         yield from _list("contacts", contacts, _contact_rows)
         if result.intersections:
             start, end = result.intersections
-            yield from _list("edges_through_faces", start, _intersection_rows)
+            yield from _list("edges_through_faces", start, _intersection_rows, start.edge_rows)
+            yield from _list("inside", start, _intersection_rows, start.inside_rows)
             if not is_joined:
-                yield from _list("edges_through_faces_at_end", end, _intersection_rows)
+                yield from _list("edges_through_faces_at_end", end, _intersection_rows, end.edge_rows)
+                yield from _list("inside_at_end", end, _intersection_rows, end.inside_rows)
         if result.proximities:
             start, end = result.proximities
             yield from _list("near_pairs", start, _proximity_rows)
@@ -137,6 +141,7 @@ class HitsJson(RecordFile):
             "collision_spans": [asdict(span) for span in summary.collision_spans],
             "ignored": _mesh_pairs_to_list(summary.ignored),
             "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
+            "proximity_spans": [asdict(span) for span in summary.proximity_spans],
             "nearest": [asdict(nearest) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
@@ -147,7 +152,9 @@ class HitsCsv(RecordFile):
     """A CSV file: a row for each contact, intersection and proximity, and a last line with # if some are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
-    start, in the last interval its end too. The same holds for proximities, which have the phase "near" and a distance.
+    start, in the last interval its end too. Parts of a mesh that are inside another have the phase "inside", and the
+    kind "vertex-face": a vertex of the part and a face of the other. The same holds for proximities, which have the
+    phase "near" and a distance.
     """
 
     _COLUMNS = (
@@ -174,7 +181,7 @@ class HitsCsv(RecordFile):
         """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
         where = [interval.index, interval.start, interval.end]
-        times = 2 if interval.index == self._last_index else 1
+        times = 2 if interval.index == self._last_index and interval.end > interval.start else 1
         yield from _csv_rows(where, [contacts], _contact_rows)
         yield from _csv_rows(where, (result.intersections or ())[:times], _intersection_rows)
         yield from _csv_rows(where, (result.proximities or ())[:times], _proximity_rows)
@@ -189,10 +196,12 @@ class HitsCsv(RecordFile):
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)
 
 
-def _list(name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]]) -> Iterator[str | bytes]:
-    """Yields a member of a JSON object: the list of all pairs."""
+def _list(
+    name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]], which: slice = slice(None)
+) -> Iterator[str | bytes]:
+    """Yields a member of a JSON object: the list of all pairs, or of some rows of them."""
     yield f', "{name}": ['
-    for number, rows in enumerate(pairs.chunks()):
+    for number, rows in enumerate(pairs.chunks(which)):
         yield (b", " if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
     yield "]"
 
@@ -215,21 +224,26 @@ def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
         "normal": contacts.normal[rows].tolist(),
     }
     if contacts.phase is not None and contacts.separate is not None:
-        fields["phase"] = [PHASES[phase] for phase in contacts.phase[rows].tolist()]
-        fields["separate"] = contacts.separate[rows].tolist()
+        phases, separate = contacts.phase[rows].tolist(), contacts.separate[rows].tolist()
+        fields["phase"] = [PHASES[phase] if phase >= 0 else None for phase in phases]
+        fields["separate"] = [one if phase >= 0 else None for phase, one in zip(phases, separate, strict=True)]
     return _to_rows(fields)
 
 
 def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[dict]:
     """Returns the fields of some intersections."""
-    crosses = intersections.crosses[rows].tolist()
+    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
+    insides = [row >= edges for row in range(*rows.indices(len(intersections)))]
     return _to_rows(
         {
-            "kind": ["edge-face"] * len(crosses),
+            "kind": ["vertex-face" if inside else "edge-face" for inside in insides],
             **_names(intersections, rows),
             "time": [intersections.time] * len(crosses),
             "position": intersections.position[rows].tolist(),
-            "phase": ["crosses" if passes else "touches" for passes in crosses],
+            "phase": [
+                "inside" if inside else "crosses" if passes else "touches"
+                for inside, passes in zip(insides, crosses, strict=True)
+            ],
         }
     )
 
@@ -289,7 +303,8 @@ def _numbers(found: IntersectionSummary) -> dict:
         {"meshes": meshes, "crossings": crossings, "touches": touches}
         for meshes, (crossings, touches) in found.mesh_pairs.items()
     ]
-    return asdict(found) | {"mesh_pairs": pairs}
+    inside = [{"meshes": meshes, "parts": parts} for meshes, parts in found.inside.items()]
+    return asdict(found) | {"mesh_pairs": pairs, "inside": inside}
 
 
 def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:

@@ -26,6 +26,7 @@ from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ScenePairs
+from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["ReportPage"]
@@ -39,11 +40,14 @@ _SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 _MAX_PAIRS = 10_000  # of meshes
 _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
+_CROSSES, _TOUCHES, _INSIDE, _NEAR = range(4, 8)  # kinds of rows, after those of collisions: see data.js
 _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
+
+_AtRest = SceneIntersections | SceneProximities
 
 
 class ReportPage(RecordFile):
-    """A page with a timeline, every interval in 3D, and a table of all collisions and intersections."""
+    """A page with a timeline, every interval in 3D, and a table of all collisions, intersections and proximities."""
 
     def __init__(self, path: str | os.PathLike, *, scene: Scene):
         """Opens the file.
@@ -82,16 +86,19 @@ class ReportPage(RecordFile):
         self._moves: list[bool] = []  # whether each moves
         self._faces: tuple[Any, int] | None = None  # the segment whose faces are all in the page, and their block
         self._center: np.ndarray | None = None  # of all positions in the page
-        self._rows: list[tuple[int, int]] = []  # number of rows by interval: collisions, intersections at its start
-        self._last: SceneIntersections | None = None  # at the end of the last complete interval
+        self._rows: list[
+            tuple[int, int, int]
+        ] = []  # by interval: collisions, intersections and proximities at its start
+        self._last: list[tuple[str, _AtRest]] = []  # what is at the end of the last complete interval
         self._without_view = 0
+        self._some_strands = 0  # number of views without all curves and points
 
     def head(self) -> str:
         """Returns the page up to the first interval."""
         return self._before
 
     def record(self, result: IntervalResult) -> Iterator[str]:
-        """Yields the blocks of an interval: those of its collisions, of the intersections at its start, of its view."""
+        """Yields the blocks of an interval: collisions, what intersects and is near at its start, and the view."""
         interval, contacts = result.contacts.interval, result.contacts
         index = interval.index
         if self._center is None:
@@ -105,26 +112,27 @@ class ReportPage(RecordFile):
             if contacts.phase is not None and contacts.separate is not None:
                 arrays |= {"phase": contacts.phase[rows], "separate": contacts.separate[rows]}
             yield _block(f"hits-{index}", {"of": len(contacts)}, arrays)
-        at_rest = result.intersections or ()
-        rest_rows = 0
-        if at_rest and len(at_rest[0]):
-            rest_rows, text = self._rest(index, at_rest[0], numbers)
-            yield text
-        places = [contacts.position, *(found.position for found in at_rest)]
+        at_rest, near = result.intersections or (), result.proximities or ()
+        rest_rows, text = self._at_rest("rest", index, at_rest[0], numbers) if at_rest else (0, "")
+        near_rows, more = self._at_rest("near", index, near[0], numbers) if near else (0, "")
+        yield text + more
+        places = [contacts.position, *(found.position for found in (*at_rest, *near))]
         if index == 0 or sum(map(len, places)):
             yield from self._view(result, np.concatenate(places), numbers)
-        self._rows[index:] = [(len(rows), rest_rows)]
-        self._last = at_rest[1] if at_rest else None
+        self._rows[index:] = [(len(rows), rest_rows, near_rows)]
+        self._last = [(name, found[1]) for name, found in (("rest", at_rest), ("near", near)) if found]
 
     def tail(self, summary: Summary) -> str:
         """Returns the block of the intersections at the end, the data of the whole replay, and the page's script."""
-        rows, text = 0, ""
-        last, intervals = self._last, summary.intervals
-        if last is not None and len(last) and intervals and last.time == intervals[-1].end > intervals[-1].start:
-            numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
-            rows, text = self._rest(len(intervals), last, numbers)
+        counts, text = {"rest": 0, "near": 0}, ""
+        intervals = summary.intervals
+        for name, last in self._last:
+            if intervals and last.time == intervals[-1].end > intervals[-1].start:
+                numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
+                counts[name], more = self._at_rest(name, len(intervals), last, numbers)
+                text += more
         data = _data(summary)
-        data["rows"] = [*self._rows[: len(intervals)], (0, rows)]
+        data["rows"] = [*self._rows[: len(intervals)], (0, counts["rest"], counts["near"])]
         data["meshes"] = [{"name": name, "moves": moves} for name, moves in zip(self._meshes, self._moves, strict=True)]
         data["center"] = self._center.tolist() if self._center is not None else [0, 0, 0]
         data["notes"] += self._notes(summary, data["rows"])
@@ -132,7 +140,7 @@ class ReportPage(RecordFile):
 
     def shrink(self) -> bool:
         """Drops the last intervals."""
-        self._last = None
+        self._last = []
         return super().shrink()
 
     def _number_meshes(self, contacts: SceneContacts) -> np.ndarray:
@@ -149,19 +157,32 @@ class ReportPage(RecordFile):
         columns = (meshes[:, 0], meshes[:, 1], 4 * elements[:, 0] + elements[:, 1], *indices.reshape(-1, 4).T)
         return dict(zip(_COLUMNS, columns, strict=True)) | {"position": self._placed(pairs.position[rows])}
 
-    def _rest(self, index: int, found: SceneIntersections, numbers: np.ndarray) -> tuple[int, str]:
-        """Returns the number of rows and the block of the intersections at one time."""
+    def _at_rest(self, name: str, index: int, found: _AtRest, numbers: np.ndarray) -> tuple[int, str]:
+        """Returns the number of rows and the block of what intersects, or is near, at one time; no block for none."""
+        if not len(found):
+            return 0, ""
         rows = _choose_rows(found, self._most_rows)
-        arrays = self._pairs(found, rows, numbers) | {"crosses": found.crosses[rows]}
-        curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
-        spread = np.linspace(0, len(curves) - 1, min(len(curves), self._most_rows)).astype(int)
-        arrays["curves"] = self._placed(curves[spread])
-        return len(rows), _block(f"rest-{index}", {"of": len(found), "curves": len(curves)}, arrays)
+        arrays = self._pairs(found, rows, numbers)
+        facts = {"of": len(found)}
+        if isinstance(found, SceneProximities):
+            arrays |= {"kind": np.full(len(rows), _NEAR), "distance": found.distance[rows]}
+        else:
+            kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
+            curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
+            arrays |= {
+                "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
+                "curves": self._placed(curves[_spread(len(curves), self._most_rows)]),
+            }
+            facts["curves"] = len(curves)
+        return len(rows), _block(f"{name}-{index}", facts, arrays)
 
     def _view(self, result: IntervalResult, places: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
-        """Yields the blocks of the triangles that move in an interval: all, or those around the given places."""
+        """Yields the blocks of the triangles that move in an interval: all, or those around the given places.
+
+        Edges of curves, and points, are among them, at most as many of each as triangles.
+        """
         interval, segment = result.contacts.interval, result.contacts.segment
-        if not len(segment.faces):
+        if not len(segment.faces) and not segment.has_strands:
             return
         if self._view_bytes > _VIEW_BYTES:
             self._without_view += 1
@@ -169,12 +190,18 @@ class ReportPage(RecordFile):
         lit = result.contacts.colliding_faces
         shown = choose_faces(interval.x0[segment.faces[:, 0]], places, lit, self._most_faces)
         texts = []
+        self._some_strands += max(len(segment.free_edges), len(segment.points)) > self._most_faces
         if len(shown) == len(segment.faces) and self._faces and self._faces[0] is segment:
             vertices, number = np.arange(segment.vertex_count), self._faces[1]
         else:
-            vertices, corners = np.unique(segment.faces[shown], return_inverse=True)
+            elements = [segment.faces[shown]]
+            if segment.has_strands:
+                elements += [own[_spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
+            vertices, places = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
+            parts = np.split(places, np.cumsum([own.size for own in elements])[:-1])
             number = interval.index
-            arrays = {"faces": corners, "mesh_of_vertex": numbers[segment.locate_vertices(vertices)[0]]}
+            arrays: dict[str, np.ndarray] = dict(zip(("faces", "edges", "points"), parts, strict=False))
+            arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
             texts.append(_block(f"faces-{number}", {}, arrays))
             if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:
                 self._faces = segment, number
@@ -192,19 +219,22 @@ class ReportPage(RecordFile):
         assert self._center is not None  # since the first interval
         return (positions.astype(np.float64) - self._center).astype(np.float32)
 
-    def _notes(self, summary: Summary, rows: list[tuple[int, int]]) -> list[str]:
+    def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
         """Returns sentences on all that is not in the page."""
         notes = []
-        hits, rest = (sum(column) for column in zip(*rows, strict=True))
-        found = sum(at.crossings + at.touches for at in summary.intersections)
         most = f"an interval has at most {self._most_rows:,} rows, spread evenly, with at least one for each two meshes"
-        if hits < summary.hits:
-            notes.append(f"The table has {hits:,} of {summary.hits:,} collisions: {most}. --json and --csv have all.")
-        if rest < found:
-            notes.append(f"The table has {rest:,} of {found:,} edges at rest: {most}. --json and --csv have all.")
+        rest = sum(at.crossings + at.touches + sum(at.inside.values()) for at in summary.intersections)
+        near = sum(at.pairs for at in summary.proximities)
+        names = "collisions", "intersections at rest", "near pairs"
+        for name, found, shown in zip(names, (summary.hits, rest, near), zip(*rows, strict=True), strict=True):
+            if sum(shown) < found:
+                notes.append(f"The table has {sum(shown):,} of {found:,} {name}: {most}. --json and --csv have all.")
+        if self._some_strands:
+            notes.append(f"{self._some_strands:,} views in 3D have only some of the curves or points, spread evenly.")
         if self._without_view:
             notes.append(f"{self._without_view:,} intervals have no view in 3D, as the page is full.")
-        pairs = len({span.meshes for span in [*summary.collision_spans, *summary.intersection_spans]})
+        spans = [*summary.collision_spans, *summary.intersection_spans, *summary.proximity_spans]
+        pairs = len({tuple(sorted(span.meshes)) for span in spans})
         if pairs > _MAX_PAIRS:
             notes.append(f"The page has {_MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
         if ignored := summary.ignored:
@@ -218,7 +248,7 @@ def _data(summary: Summary) -> dict:
     scene = summary.scene
     displayed = scene.display_names
     looked = bool(summary.intersections)
-    intersecting = sum(bool(at.crossings + at.touches) for at in summary.intersections)
+    intersecting = sum(not at.is_empty for at in summary.intersections)
     tiles = [
         (f"{summary.hits:,}", "collisions"),
         (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
@@ -227,6 +257,9 @@ def _data(summary: Summary) -> dict:
         tiles.append((f"{first.time:.6g}", "time code of the first"))
     if looked:
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
+    if summary.min_distance is not None:
+        nearest = summary.nearest
+        tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.min_distance:g}", "least distance"))
     tiles += [
         (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
         (f"{scene.face_count:,}", "triangles"),
@@ -239,10 +272,17 @@ def _data(summary: Summary) -> dict:
         "partial": "",
         "tiles": tiles,
         "intervals": [
-            (interval.start, interval.end, interval.vertex_face_hits, interval.edge_edge_hits)
+            (
+                interval.start,
+                interval.end,
+                interval.vertex_face_hits,
+                interval.edge_edge_hits,
+                *([interval.vertex_edge_hits + interval.vertex_vertex_hits] * scene.has_strands),
+            )
             for interval in summary.intervals
         ],
-        "rest": [(at.time, at.crossings, at.touches) for at in summary.intersections],
+        "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
+        "near": [(at.time, at.pairs) for at in summary.proximities],
         "toi": summary.toi_counts,
         "pairs": _pairs_of_meshes(summary),
         "up_axis": scene.up_axis,
@@ -274,27 +314,43 @@ def _data(summary: Summary) -> dict:
 
 
 def _pairs_of_meshes(summary: Summary) -> list[dict]:
-    """Returns the meshes that collide or intersect: names, collisions, and when they collide and intersect.
+    """Returns the meshes that collide, intersect or are near: names, collisions, and when they do so.
 
-    Each has at most :data:`_MAX_ROWS` spans of time; ``more`` numbers count the others.
+    Each has at most :data:`_MAX_ROWS` spans of time of each kind; ``more`` numbers count the others.
     """
-    hits = dict(summary.mesh_pairs)
-    spans: dict[tuple[str, str], tuple[list, list]] = {}
+    hits = {tuple(sorted(meshes)): count for meshes, count in summary.mesh_pairs}
+    spans: dict[tuple[str, ...], tuple[tuple[str, str], list, list, list]] = {}
+
+    def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
+        return spans.setdefault(tuple(sorted(meshes)), (meshes, [], [], []))
+
     for span in summary.collision_spans:
-        spans.setdefault(span.meshes, ([], []))[0].append((span.since, span.until, span.hits))
+        spans_of(span.meshes)[1].append((span.since, span.until, span.hits))
     for span in summary.intersection_spans:
-        spans.setdefault(span.meshes, ([], []))[1].append((span.since, span.until, span.most, span.trend))
+        inner = span.meshes[0] if span.inside else ""
+        spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
+    for span in summary.proximity_spans:
+        spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
     return [
         {
             "meshes": meshes,
-            "hits": hits.get(meshes, 0),
+            "hits": hits.get(key, 0),
             "spans": collisions[:_MAX_ROWS],
             "more": max(0, len(collisions) - _MAX_ROWS),
             "rest": at_rest[:_MAX_ROWS],
             "more_rest": max(0, len(at_rest) - _MAX_ROWS),
+            "near": near[:_MAX_ROWS],
+            "more_near": max(0, len(near) - _MAX_ROWS),
         }
-        for meshes, (collisions, at_rest) in sorted(spans.items(), key=lambda item: -hits.get(item[0], 0))[:_MAX_PAIRS]
+        for key, (meshes, collisions, at_rest, near) in sorted(spans.items(), key=lambda item: -hits.get(item[0], 0))[
+            :_MAX_PAIRS
+        ]
     ]
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Returns the numbers below a count, or ``most`` of them, evenly."""
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
@@ -303,7 +359,7 @@ def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
         return np.arange(len(pairs))
     firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
     others = np.delete(np.arange(len(pairs)), firsts)
-    return np.union1d(firsts, others[np.linspace(0, len(others) - 1, most - len(firsts)).astype(int)])
+    return np.union1d(firsts, others[_spread(len(others), most - len(firsts))])
 
 
 def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:

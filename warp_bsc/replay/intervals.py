@@ -8,7 +8,7 @@ from typing import Any
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
-from .workers import Cluster, LocalWorkers, check_in_workers, initial_crossings_in_workers
+from .workers import Cluster, LocalWorkers, check_in_workers, selection_without_initial_in_workers
 
 __all__ = ["replay"]
 
@@ -30,7 +30,8 @@ def replay(
 
     Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
     if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end. The
-    edges that pass through faces at the times themselves are found as well, between obstacles too::
+    edges that pass through faces at the times themselves, and the meshes that are wholly inside others, are found as
+    well, between obstacles too. Curves and points are checked between the times only::
 
         import warp_bsc as bsc
 
@@ -43,15 +44,16 @@ def replay(
                     print(interval.summary.start, meshes, elements)
             print(contacts.toi, contacts.position, contacts.separate)
             start, end = interval.intersections
-            print(start.crossings, start.position[start.crosses], start.cuts.points)
+            print(start.crossings, start.position[start.crosses], start.cuts.points, end.mesh_names(end.inside_rows))
 
     Args:
         scene: The scene; its selection says which pairs count.
         method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default.
-        intersections: Whether to find the intersections at each time.
+        intersections: Whether to find the intersections at each time, and the meshes that are wholly inside others.
         ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
-            themselves then: their collisions and intersections are only counted.
+            themselves then: their collisions and intersections are only counted. Of a mesh that is inside another then,
+            it is ignored that it is inside that one, nothing else.
         min_distance: Distance up to which elements are found to be near each other at each time, in the scene's unit of
             length: a vertex and a face, or two edges, that share no vertex and that no edge joins. No such pair is
             missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found between the
@@ -95,10 +97,9 @@ def replay(
             stack.enter_context(contextlib.closing(processes))
         if ignore_initial:
             if processes:
-                crossing = initial_crossings_in_workers(scene, checks, processes)
+                selection = selection_without_initial_in_workers(scene, checks, processes)
             else:
-                crossing = IntervalChecker(scene, checks).initial_crossings()
-            selection = replace(scene.selection, ignored_names=scene.selection.ignored_names | crossing)
+                selection = IntervalChecker(scene, checks).selection_without_initial()
             checks = replace(checks, selection=selection)
         first = 0
         for result in earlier:

@@ -1,13 +1,15 @@
 """What a replay finds in one interval, and the numbers of it."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.collisions import DetectionStats
+from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import count_by_meshes
+from .scene_pairs import KINDS, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
 
@@ -47,20 +49,28 @@ class Contact:
 
 @dataclass(frozen=True)
 class IntersectionSummary:
-    """The edges that meet faces at one time of a scene, in numbers.
+    """The edges that meet faces at one time of a scene, and the parts of meshes that are inside others, in numbers.
 
     Attributes:
         time: Time code.
         crossings: Number of edges that pass through faces: pairs of an edge and a face.
         touches: Number of edges that only touch faces.
-        mesh_pairs: Both numbers for each two meshes that intersect, by their names, in order; a mesh that intersects
-            itself is there twice.
+        mesh_pairs: Both numbers for each two meshes of which an edge meets a face, by their names, in order; a mesh
+            that intersects itself is there twice.
+        inside: Number of connected parts of a mesh that are wholly inside another, by the name of the mesh and that of
+            the other.
     """
 
     time: float
     crossings: int
     touches: int
     mesh_pairs: dict[tuple[str, str], tuple[int, int]]
+    inside: dict[tuple[str, str], int]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing intersects."""
+        return not self.mesh_pairs and not self.inside
 
 
 @dataclass(frozen=True)
@@ -109,19 +119,22 @@ class IntervalSummary:
         end: Time code at which it ends.
         vertex_face_hits: Number of vertex-face pairs that collide.
         edge_edge_hits: Number of edge-edge pairs that collide.
+        vertex_edge_hits: Number of pairs of a point and an edge of a curve that collide.
+        vertex_vertex_hits: Number of pairs of points that collide.
         toi_counts: Number of pairs by their time of impact, in equal parts of the interval.
         mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
             with itself is there twice.
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
             move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes, and
+            where there are curves or points, all pairs of meshes twice.
         validation: The comparison with the exact checker, None if none was asked for.
         intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
         ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
-        phases: Number of pairs that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
+        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
         proximities: The proximities at the start and at the end, as ``intersections``; None if they were not looked
             for.
     """
@@ -131,6 +144,8 @@ class IntervalSummary:
     end: float
     vertex_face_hits: int
     edge_edge_hits: int
+    vertex_edge_hits: int
+    vertex_vertex_hits: int
     toi_counts: tuple[int, ...]
     mesh_pairs: dict[tuple[str, str], int]
     earliest: Contact | None
@@ -146,12 +161,21 @@ class IntervalSummary:
     @property
     def hits(self) -> int:
         """Number of pairs that collide."""
-        return self.vertex_face_hits + self.edge_edge_hits
+        return self.vertex_face_hits + self.edge_edge_hits + self.vertex_edge_hits + self.vertex_vertex_hits
 
     @property
     def pairs_tested(self) -> int:
         """Number of candidate pairs."""
-        return self.stats.vertex_face.candidates + self.stats.edge_edge.candidates
+        return sum(stage.candidates for stage in self._stages)
+
+    @property
+    def unsure(self) -> int:
+        """Number of candidate pairs that floating point could not certify."""
+        return sum(stage.unsure for stage in self._stages)
+
+    @property
+    def _stages(self) -> list[StageCounts]:
+        return [getattr(self.stats, kind.label) for kind in DistanceKind]
 
     @property
     def milliseconds(self) -> float:
@@ -165,11 +189,13 @@ class Work:
 
     Attributes:
         worker: The process that did it; empty for the one that writes the results.
+        device: Name of the Warp device that it used.
         reading: Time to read the scene's samples [s]; another interval may be checked meanwhile.
         checking: Time to find everything in them [s].
     """
 
     worker: str
+    device: str
     reading: float
     checking: float
 
@@ -222,14 +248,19 @@ def summarize(
     if proximities:
         start, end = map(_summarize_proximities, proximities)
         near = start, end
+    phases = None
+    if contacts.phase is not None:
+        phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
     hits_by_meshes = count_by_meshes(contacts.segment, contacts.meshes)
-    edge_edge = int(contacts.kind.sum())
+    by_kind = np.bincount(contacts.kind, minlength=len(KINDS)).tolist()
     return IntervalSummary(
         index=interval.index,
         start=interval.start,
         end=interval.end,
-        vertex_face_hits=len(contacts) - edge_edge,
-        edge_edge_hits=edge_edge,
+        vertex_face_hits=by_kind[0],
+        edge_edge_hits=by_kind[1],
+        vertex_edge_hits=by_kind[2],
+        vertex_vertex_hits=by_kind[3],
         toi_counts=tuple(np.histogram(contacts.toi, bins=TOI_BINS, range=(0.0, 1.0))[0].tolist()),
         mesh_pairs={names: hits for names, (hits,) in hits_by_meshes.items()},
         earliest=earliest,
@@ -239,16 +270,23 @@ def summarize(
         intersections=at_rest,
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
-        phases=None if contacts.phase is None else tuple(np.bincount(contacts.phase, minlength=len(PHASES)).tolist()),
+        phases=phases,
         proximities=near,
     )
 
 
 def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:
     """Returns the numbers of the intersections at one time."""
-    by_meshes = count_by_meshes(found.segment, found.meshes, np.stack([found.crosses, ~found.crosses], axis=1))
+    edges = found.edge_rows
+    crosses = found.crosses[edges]
+    by_meshes = count_by_meshes(found.segment, found.meshes[edges], np.stack([crosses, ~crosses], axis=1))
+    inside = Counter(found.mesh_names(found.inside_rows))
     return IntersectionSummary(
-        found.time, found.crossings, found.touches, {names: (a, b) for names, (a, b) in by_meshes.items()}
+        found.time,
+        found.crossings,
+        found.touches,
+        {names: (a, b) for names, (a, b) in by_meshes.items()},
+        dict(inside),
     )
 
 

@@ -11,7 +11,7 @@ from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
 
-__all__ = ["PHASES", "SceneContacts", "find_contacts"]
+__all__ = ["PHASES", "SceneContacts", "find_contacts", "find_strand_contacts", "join_contacts"]
 
 PHASES = ("passes", "enters", "leaves", "stays")
 """Whether the surfaces at two elements cross at the end of the interval, plus twice whether they do at its start.
@@ -33,9 +33,11 @@ class SceneContacts(ScenePairs):
         counted: Which of the pairs that the detector found are among these, vertex-face before edge-edge, bool.
         ignored: Number of pairs that collide and are to be ignored, by the names of their meshes, in order.
         separate: Whether the two meshes did not intersect at the start of the interval, nor touch, shape [n]; for a
-            mesh with itself, whether no part of it did. None if intersections were not looked for.
+            mesh with itself, whether no part of it did. None if intersections were not looked for. False where
+            ``phase`` is -1.
         phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it.
-            None if intersections were not looked for.
+            None if intersections were not looked for. -1 for pairs with an element of curves or points, which do not
+            cross anything at rest.
     """
 
     interval: Interval = field(repr=False)
@@ -136,6 +138,96 @@ def find_contacts(
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
     )
     return _compare(contacts, *intersections) if intersections else contacts
+
+
+def find_strand_contacts(
+    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection, is_compared: bool
+) -> SceneContacts:
+    """Names the pairs with an element of curves or points that a detection found and that count.
+
+    Excluded are the pairs that :func:`find_contacts` excludes, and edges of one curve that are near along it, as thick
+    curves always touch themselves there.
+
+    Args:
+        interval: The interval.
+        mesh: The mesh of the detection, made of the interval's segment with its curves and points.
+        collisions: Collisions of that mesh in the interval.
+        selection: Which pairs of meshes count.
+        is_compared: Whether contacts of meshes are compared with intersections.
+    """
+    segment, x0, x1 = interval.segment, interval.x0, interval.x1
+    is_free = np.ones(segment.vertex_count, dtype=bool)
+    is_free[segment.faces] = False
+    with_face = is_free[collisions.vertex_face[:, 0]]
+    ends = mesh.edges[collisions.edge_edge].astype(np.int64)
+    of_curves = np.isin(collisions.edge_edge, mesh.free_edges)
+    of_curve = of_curves.any(axis=1) & ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
+    vertices, faces = collisions.vertex_face[with_face].T.astype(np.int64)
+    ends = ends[of_curve]
+    points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
+    both = collisions.vertex_vertex.astype(np.int64)
+    named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
+    tois = (
+        collisions.vertex_face_toi[with_face],
+        collisions.edge_edge_toi[of_curve],
+        collisions.vertex_edge_toi,
+        collisions.vertex_vertex_toi,
+    )
+
+    def at_impact(corners: np.ndarray, times: np.ndarray) -> np.ndarray:
+        times = times[:, None, None]
+        return (1.0 - times) * x0[corners].astype(np.float64) + times * x1[corners].astype(np.float64)
+
+    on_edge = np.concatenate(
+        [collisions.edge_edge_coordinates[of_curve, :1], collisions.vertex_edge_coordinates[:, :1]]
+    )
+    edges = np.concatenate([at_impact(ends[:, 0], tois[1]), at_impact(point_ends, tois[2])])
+    position = [
+        np.einsum("ni,nij->nj", collisions.vertex_face_coordinates[with_face], at_impact(mesh.faces[faces], tois[0])),
+        (1.0 - on_edge) * edges[:, 0] + on_edge * edges[:, 1],
+        at_impact(both, tois[3]).mean(axis=1),
+    ]
+    normal = [
+        collisions.vertex_face_normal[with_face],
+        collisions.edge_edge_normal[of_curve],
+        collisions.vertex_edge_normal,
+        collisions.vertex_vertex_normal,
+    ]
+    meshes, toi = named["meshes"], np.concatenate(tois)
+    moves = np.array([part.moves for part in segment.meshes])
+    stiff = np.array([part.moves and not part.deforms for part in segment.meshes])
+    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
+    counted &= ~((meshes[:, 0] == meshes[:, 1]) & stiff[meshes[:, 0]])
+    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
+    counted &= ~ignored
+    arrays = named | {
+        "toi": toi,
+        "time": interval.start + toi * (interval.end - interval.start),
+        "position": np.concatenate(position),
+        "normal": np.concatenate(normal),
+    }
+    count = int(counted.sum())
+    return SceneContacts(
+        segment,
+        **{name: array[counted] for name, array in arrays.items()},
+        interval=interval,
+        counted=counted,
+        ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
+        separate=np.zeros(count, dtype=bool) if is_compared else None,
+        phase=np.full(count, -1) if is_compared else None,
+    )
+
+
+def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContacts:
+    """Returns the contacts of one interval and others of it after them; ``counted`` is that of the first ones."""
+    names = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position", "toi", "time", "normal")
+    names += ("separate", "phase") if contacts.phase is not None else ()
+    joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
+    ignored = {
+        meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)
+        for meshes in {**contacts.ignored, **others.ignored}
+    }
+    return replace(contacts, **joined, ignored=ignored)
 
 
 def _compare(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:

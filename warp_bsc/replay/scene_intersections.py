@@ -1,4 +1,4 @@
-"""The edges that meet faces at one time of a scene, and the curves along which its surfaces cut each other."""
+"""What intersects at one time of a scene: edges that meet faces, curves of cut surfaces, and parts inside others."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..detection.containment import Containment
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, ScenePairs
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs
 
 __all__ = ["Cuts", "SceneIntersections", "name_intersections"]
 
@@ -31,11 +32,15 @@ class Cuts(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneIntersections(ScenePairs):
-    """The edges that meet faces at one time of a scene: the first element is the edge, the second the face.
+    """What intersects at one time of a scene.
+
+    First come the edges that meet faces: the first element is the edge, the second the face. The others are the
+    connected parts of meshes that are wholly inside other meshes: the first element is a vertex of the part, where the
+    position is, the second a face of the outer mesh.
 
     Attributes:
         time: Time code.
-        crosses: Whether the edge passes through the face; other edges only touch theirs. Bool, shape [n].
+        crosses: Whether it is an edge that passes through the face; other edges only touch theirs. Bool, shape [n].
         x: Positions of all vertices at that time, shape [vertex_count, 3].
     """
 
@@ -51,7 +56,17 @@ class SceneIntersections(ScenePairs):
     @property
     def touches(self) -> int:
         """Number of edges that only touch faces."""
-        return len(self) - self.crossings
+        return self.edge_rows.stop - self.crossings
+
+    @cached_property
+    def edge_rows(self) -> slice:
+        """The rows of the edges that meet faces."""
+        return slice(0, int((self.elements[:, 0] != VERTEX).sum()))
+
+    @property
+    def inside_rows(self) -> slice:
+        """The rows of the parts of meshes that are inside other meshes."""
+        return slice(self.edge_rows.stop, len(self))
 
     @cached_property
     def cuts(self) -> Cuts:
@@ -61,7 +76,7 @@ class SceneIntersections(ScenePairs):
         the other, or the corner that both share.
         """
         segment = self.segment
-        rows, sides = segment.faces_of_edges(self.vertices[:, 0])
+        rows, sides = segment.faces_of_edges(self.vertices[self.edge_rows, 0])
         faces = np.sort(np.stack([sides, self.faces[rows, 1]], axis=1), axis=1)
         first, second = faces.T
         of_pair = segment.faces[faces]
@@ -92,22 +107,30 @@ class SceneIntersections(ScenePairs):
 
 
 def name_intersections(
-    segment: Segment, mesh: CollisionMesh, found: Intersections, x: np.ndarray, time: float, selection: Selection
+    segment: Segment,
+    mesh: CollisionMesh,
+    found: Intersections,
+    inside: Containment,
+    x: np.ndarray,
+    time: float,
+    selection: Selection,
 ) -> SceneIntersections:
     """Names the intersections that count.
 
-    Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
-    moves it: where its parts touch, rounding of its positions makes them cross. Meshes that never move are checked.
+    Excluded are edges and faces that the selection excludes or ignores, and those of a mesh with itself if only its
+    transform moves it: where its parts touch, rounding of its positions makes them cross. Meshes that never move are
+    checked.
 
     Args:
         segment: The segment.
         mesh: The detector's mesh, made of the segment.
         found: Its intersections.
+        inside: What is inside what, of the pairs that count.
         x: Positions of the segment's vertices, shape [vertex_count, 3].
         time: Time code.
         selection: Which pairs of meshes count.
     """
-    if not len(found.pairs):
+    if not len(found.pairs) + len(inside.bodies):
         return SceneIntersections(segment, **NO_PAIRS, time=time, crosses=found.crosses, x=x)
     ends = mesh.edges[found.pairs[:, 0]].astype(np.int64)
     faces = found.pairs[:, 1].astype(np.int64)
@@ -126,7 +149,28 @@ def name_intersections(
         "position": _meeting_points(x[ends].astype(np.float64), x[mesh.faces[faces]].astype(np.float64)),
         "crosses": found.crosses,
     }
-    return SceneIntersections(segment, **{name: array[counted] for name, array in arrays.items()}, time=time, x=x)
+    arrays = {name: array[counted] for name, array in arrays.items()}
+    if len(inside.bodies):
+        of_inside = _name_inside(segment, inside, x)
+        arrays = {name: np.concatenate([array, of_inside[name]]) for name, array in arrays.items()}
+    return SceneIntersections(segment, **arrays, time=time, x=x)
+
+
+def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the arrays of :class:`SceneIntersections` for what is inside what."""
+    count = len(inside.bodies)
+    nothing = np.full(count, -1)
+    points = segment.find_points(inside.bodies[:, 0], inside.vertices)
+    _, polygons = segment.locate_faces(inside.faces)
+    return {
+        "elements": np.tile([VERTEX, FACE], (count, 1)),
+        "meshes": inside.bodies,
+        "indices": np.stack([points, nothing, polygons, nothing], axis=1).reshape(-1, 2, 2),
+        "vertices": np.stack([inside.vertices, nothing, nothing, nothing], axis=1).reshape(-1, 2, 2),
+        "faces": np.stack([nothing, inside.faces], axis=1),
+        "position": x[inside.vertices].astype(np.float64),
+        "crosses": np.zeros(count, dtype=bool),
+    }
 
 
 def _meeting_points(edges: np.ndarray, faces: np.ndarray) -> np.ndarray:

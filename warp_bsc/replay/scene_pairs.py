@@ -20,8 +20,8 @@ __all__ = [
     "name_elements",
 ]
 
-KINDS = ("vertex-face", "edge-edge")
-"""Labels of the kinds of pair that collide or are near, by their numbers."""
+KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
+"""Labels of the kinds of pair that collide or are near, by their numbers; the last two are of points and curves."""
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
@@ -71,9 +71,10 @@ class ScenePairs:
     def __len__(self) -> int:
         return len(self.meshes)
 
-    def chunks(self) -> list[slice]:
-        """Returns all rows as slices of limited length: their text takes many times their memory."""
-        return [slice(start, start + _CHUNK) for start in range(0, len(self), _CHUNK)]
+    def chunks(self, rows: slice = slice(None)) -> list[slice]:
+        """Returns rows, default all, as slices of limited length: their text takes many times their memory."""
+        first, stop, _ = rows.indices(len(self))
+        return [slice(start, min(start + _CHUNK, stop)) for start in range(first, stop, _CHUNK)]
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the names of the two meshes of some pairs."""
@@ -110,8 +111,13 @@ class ScenePairs:
     def triangles(self, rows: slice) -> list[int | None]:
         """Returns which triangle of its polygon the face of some pairs is, from 0; None where no element is a face."""
         faces = self.faces[rows].max(axis=1)
-        places = self.segment.places_in_polygons(np.maximum(faces, 0))
-        return [place if face >= 0 else None for face, place in zip(faces.tolist(), places.tolist(), strict=True)]
+        places: list[int | None] = [None] * len(faces)
+        (of_faces,) = np.nonzero(faces >= 0)
+        for row, place in zip(
+            of_faces.tolist(), self.segment.places_in_polygons(faces[of_faces]).tolist(), strict=True
+        ):
+            places[row] = place
+        return places
 
     def _of_meshes(self, texts, rows) -> list[tuple[str, str]]:
         """Returns the texts of the two meshes of some pairs; pairs of the same meshes share them."""
@@ -148,34 +154,49 @@ def count_by_meshes(
     }
 
 
-def name_elements(segment: Segment, vertices: np.ndarray, faces: np.ndarray, ends: np.ndarray) -> dict[str, np.ndarray]:
-    """Names vertex-face pairs, then edge-edge pairs: all arrays of :class:`ScenePairs` but positions, and the kind.
+def name_elements(
+    segment: Segment,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    ends: np.ndarray,
+    points: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
+    """Names pairs kind by kind: all arrays of :class:`ScenePairs` but positions, and the kind.
 
     Args:
         segment: The segment.
         vertices: Vertices of the vertex-face pairs, shape [n].
         faces: Their faces, shape [n].
         ends: Vertices at both ends of both edges of the edge-edge pairs, the smaller first, shape [m, 2, 2].
+        points: Vertices of vertex-edge pairs, shape [k], vertices at both ends of their edges, the smaller first, shape
+            [k, 2], and vertices of vertex-vertex pairs, shape [l, 2]; None if there are none.
     """
-    n_vertex_face, n = len(vertices), len(vertices) + len(ends)
-    kind = np.repeat([0, 1], [n_vertex_face, len(ends)])
-    elements = np.where(kind[:, None] == 0, [VERTEX, FACE], [EDGE, EDGE])
-    meshes = np.zeros((n, 2), dtype=np.int64)
-    indices = np.full((n, 2, 2), -1, dtype=np.int64)
-    all_vertices = np.full((n, 2, 2), -1, dtype=np.int64)
+    blocks = [(VERTEX, vertices, FACE, faces), (EDGE, ends[:, 0], EDGE, ends[:, 1])]
+    if points:
+        of_edges, edges, both = points
+        blocks += [(VERTEX, of_edges, EDGE, edges), (VERTEX, both[:, 0], VERTEX, both[:, 1])]
+    counts = [len(first) for _, first, _, _ in blocks]
+    n = sum(counts)
+    elements, meshes = np.zeros((n, 2), dtype=np.int64), np.zeros((n, 2), dtype=np.int64)
+    indices, all_vertices = np.full((n, 2, 2), -1, dtype=np.int64), np.full((n, 2, 2), -1, dtype=np.int64)
     all_faces = np.full((n, 2), -1, dtype=np.int64)
-
-    rows = slice(0, n_vertex_face)
-    meshes[rows, 0], indices[rows, 0, 0] = segment.locate_vertices(vertices)
-    meshes[rows, 1], indices[rows, 1, 0] = segment.locate_faces(faces)
-    all_vertices[rows, 0, 0], all_faces[rows, 1] = vertices, faces
-    rows = slice(n_vertex_face, n)
-    for side in range(2):
-        meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(ends[:, side])
-        elements[rows, side][diagonal] = DIAGONAL
-    all_vertices[rows] = ends
+    stop = 0
+    for count, (*first, second_element, second) in zip(counts, blocks, strict=True):
+        rows, stop = slice(stop, stop + count), stop + count
+        for side, (element, own) in enumerate((first, (second_element, second))):
+            elements[rows, side] = element
+            if element == FACE:
+                all_faces[rows, side] = own
+                meshes[rows, side], indices[rows, side, 0] = segment.locate_faces(own)
+            elif element == VERTEX:
+                all_vertices[rows, side, 0] = own
+                meshes[rows, side], indices[rows, side, 0] = segment.locate_vertices(own)
+            else:
+                all_vertices[rows, side] = own
+                meshes[rows, side], indices[rows, side], diagonal = segment.locate_edges(own)
+                elements[rows, side][diagonal] = DIAGONAL
     return {
-        "kind": kind,
+        "kind": np.repeat(np.arange(len(blocks)), counts),
         "elements": elements,
         "meshes": meshes,
         "indices": indices,

@@ -7,7 +7,7 @@ from functools import cached_property
 from ..usd.scene import Scene
 from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 
-__all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "Summary", "ValidationSummary"]
+__all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "ProximitySpan", "Summary", "ValidationSummary"]
 
 CERTIFIED_FOR = "vertices that move straight between the times checked"
 """The motion that a certificate holds for."""
@@ -53,24 +53,29 @@ class CollisionSpan:
 
 @dataclass(frozen=True)
 class IntersectionSpan:
-    """Consecutive times of a scene at all of which two meshes intersect, or a mesh intersects itself.
+    """Consecutive times of a scene at all of which two meshes intersect, a mesh itself, or one is inside another.
 
     Attributes:
-        meshes: Names of the two.
+        meshes: Names of the two; the one that is inside first.
         since: The first of the times, as a time code.
         until: The last of the times.
         is_open: Whether no time after the last one was checked, so that the intersection may go on.
-        first: Number of edges that pass through faces or touch them at the first time.
+        inside: Whether parts of the first mesh are wholly inside the second; otherwise edges of one meet faces of the
+            other.
+        becomes: What the meshes do instead at the time after the last one, "inside" or "crosses"; empty if nothing.
+        first: Number of parts that are inside, or of edges that pass through faces or touch them, at the first time.
         last: The same at the last time.
         most: The same at the time at which there are the most.
         most_at: That time.
-        crossings: The most edges that pass through faces at one time; 0 if the meshes only touch.
+        crossings: The most edges that pass through faces at one time; 0 if the meshes only touch, or are inside.
     """
 
     meshes: tuple[str, str]
     since: float
     until: float
     is_open: bool
+    inside: bool
+    becomes: str
     first: int
     last: int
     most: int
@@ -79,10 +84,32 @@ class IntersectionSpan:
 
     @property
     def trend(self) -> str:
-        """What becomes of the intersection: "heals" if it ends, else "grows", "shrinks" or "stays" by the numbers."""
+        """What becomes of the intersection.
+
+        If it ends, "heals", or "then inside" or "then crosses"; else "grows", "shrinks" or "stays" by the numbers.
+        """
         if not self.is_open:
-            return "heals"
+            return f"then {self.becomes}" if self.becomes else "heals"
         return "grows" if self.last > self.first else "shrinks" if self.last < self.first else "stays"
+
+
+@dataclass(frozen=True)
+class ProximitySpan:
+    """Consecutive times of a scene at all of which two meshes are near each other, or a mesh is near itself.
+
+    Attributes:
+        meshes: Names of the two, sorted.
+        since: The first of the times, as a time code.
+        until: The last of the times.
+        distance: The least distance, in the scene's unit of length.
+        nearest_at: The first time at which they have it.
+    """
+
+    meshes: tuple[str, str]
+    since: float
+    until: float
+    distance: float
+    nearest_at: float
 
 
 @dataclass(frozen=True)
@@ -164,21 +191,48 @@ class Summary:
 
     @cached_property
     def intersection_spans(self) -> list[IntersectionSpan]:
-        """Which meshes intersect since when and until when, in order of time; then those with the most edges first."""
-        spans, running = [], {}
+        """Which meshes intersect since when and until when, in order of time.
+
+        Of the same time, edges in faces come before parts inside; then those with the most come first.
+        """
+        spans: list[IntersectionSpan] = []
+        running: dict[tuple[bool, tuple[str, str]], list[tuple[float, int, int]]] = {}
         for sample in self.intersections:
-            for meshes in [meshes for meshes in running if meshes not in sample.mesh_pairs]:
-                spans.append(_span(meshes, running.pop(meshes), False))
-            for meshes, numbers in sample.mesh_pairs.items():
-                running.setdefault(meshes, []).append((sample.time, *numbers))
-        spans += [_span(meshes, samples, True) for meshes, samples in running.items()]
-        return sorted(spans, key=lambda span: (span.since, -span.most))
+            found = {(False, meshes): numbers for meshes, numbers in sample.mesh_pairs.items()}
+            found |= {(True, meshes): (0, parts) for meshes, parts in sample.inside.items()}
+            for key in [key for key in running if key not in found]:
+                inside, meshes = key
+                both = meshes, (meshes[1], meshes[0])
+                if inside:
+                    becomes = "crosses" * any(sample.mesh_pairs.get(pair, (0, 0))[0] for pair in both)
+                else:
+                    becomes = "inside" * any(pair in sample.inside for pair in both)
+                spans.append(_span(inside, meshes, running.pop(key), False, becomes))
+            for key, numbers in found.items():
+                running.setdefault(key, []).append((sample.time, *numbers))
+        spans += [_span(inside, meshes, samples, True, "") for (inside, meshes), samples in running.items()]
+        return sorted(spans, key=lambda span: (span.since, span.inside, -span.most))
 
     @cached_property
     def proximities(self) -> list[ProximitySummary]:
         """The proximities at all times of the finished intervals, in order; empty if they were not looked for."""
         found = [interval.proximities for interval in self.intervals if interval.proximities]
         return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+    @cached_property
+    def proximity_spans(self) -> list[ProximitySpan]:
+        """Which meshes are near each other since when and until when, in order of time; then the nearest first."""
+        spans, running = [], {}
+        for sample in self.proximities:
+            found = {(min(near.meshes), max(near.meshes)): near.distance for near in sample.nearest}
+            for meshes in [meshes for meshes in running if meshes not in found]:
+                spans.append(running.pop(meshes))
+            for meshes, distance in found.items():
+                span = running.get(meshes, ProximitySpan(meshes, sample.time, sample.time, distance, sample.time))
+                if distance < span.distance:
+                    span = replace(span, distance=distance, nearest_at=sample.time)
+                running[meshes] = replace(span, until=sample.time)
+        return sorted([*spans, *running.values()], key=lambda span: (span.since, span.distance))
 
     @cached_property
     def nearest(self) -> list[Nearest]:
@@ -257,8 +311,8 @@ class Summary:
         return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "no room for more")
 
 
-def _span(meshes, samples, is_open) -> IntersectionSpan:
-    """Returns a span of samples: time, crossings and touches each."""
+def _span(inside, meshes, samples, is_open, becomes) -> IntersectionSpan:
+    """Returns a span of samples: time, crossings, and touches or parts inside each."""
     numbers = [crossings + touches for _, crossings, touches in samples]
     most = max(numbers)
     return IntersectionSpan(
@@ -266,6 +320,8 @@ def _span(meshes, samples, is_open) -> IntersectionSpan:
         since=samples[0][0],
         until=samples[-1][0],
         is_open=is_open,
+        inside=inside,
+        becomes=becomes,
         first=numbers[0],
         last=numbers[-1],
         most=most,

@@ -18,6 +18,7 @@ from .outputs import without_last_eighth
 from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
+from .scene_pairs import ScenePairs
 from .summary import Summary
 
 __all__ = ["COLORS", "LIFT", "SHOWN_BY", "Overlay"]
@@ -26,9 +27,14 @@ COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
     "VertexFace": (1.0, 0.9, 0.2),
     "EdgeEdge": (1.0, 0.5, 0.0),
+    "VertexEdge": (1.0, 0.7, 0.1),
+    "VertexVertex": (1.0, 0.8, 0.5),
     "Intersections": (0.6, 0.2, 1.0),
+    "Inside": (0.1, 0.5, 1.0),
+    "Near": (0.1, 0.85, 0.4),
 }
-"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut."""
+"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut, vertices of
+parts that are inside others, places between what is near."""
 
 LIFT = 2e-4
 """Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
@@ -43,15 +49,14 @@ _MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of
 _CURVE_WIDTH = 0.0015  # width of the curves, too
 
 _EXTENT = {"extent": "float3[]"}
-_CONTACTS = _EXTENT | {
-    "positions": "point3f[]",
-    "protoIndices": "int[]",
-    "primvars:toi": "float[]",
+_PLACES = _EXTENT | {"positions": "point3f[]", "protoIndices": "int[]"}
+_ELEMENTS = {
     "primvars:primA": "int[]",
     "primvars:primB": "int[]",
     "primvars:elementA": "int2[]",
     "primvars:elementB": "int2[]",
 }
+_CONTACTS = _PLACES | {"primvars:toi": "float[]"} | _ELEMENTS
 _PARTS: dict[str, tuple[str, dict[str, str]]] = {
     "Polygons": (
         "Mesh",
@@ -59,13 +64,20 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "VertexFace": ("PointInstancer", _CONTACTS),
     "EdgeEdge": ("PointInstancer", _CONTACTS),
+    "VertexEdge": ("PointInstancer", _CONTACTS),
+    "VertexVertex": ("PointInstancer", _CONTACTS),
     "Intersections": (
         "BasisCurves",
         _EXTENT
         | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
     ),
+    "Inside": ("PointInstancer", _PLACES | _ELEMENTS),
+    "Near": ("PointInstancer", _PLACES | {"primvars:distance": "float[]"} | _ELEMENTS),
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
+
+_ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "Inside", "Near"
+"""The prims that a layer has only if they are ever there."""
 
 
 class Overlay:
@@ -76,14 +88,20 @@ class Overlay:
     - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
       are lifted by :data:`LIFT` to both sides, move with the scene, and are there from the start of the interval to its
       end;
-    - ``VertexFace`` and ``EdgeEdge``, markers at the contact points of both kinds, from the start of their interval to
+    - ``VertexFace`` and ``EdgeEdge``, and if there are any, ``VertexEdge`` and ``VertexVertex``, which have curves and
+      points, markers at the contact points of these kinds, from the start of their interval to
       its end. Each is an instance with the primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the
       attribute ``prims`` of ``/Collisions``, which has their names; ``elementA`` and ``elementB``, the two elements in
       the prims' own numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of
       an edge;
     - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
       next. Each segment in which two triangles meet is a curve of its own, with ``primA`` and ``primB``. Elements that
-      only touch make no curve.
+      only touch make no curve;
+    - ``Inside``, if there is any, markers at a vertex of each part of a mesh that is wholly inside another mesh, which
+      hides them until it is hidden itself;
+    - ``Near``, if there is any, markers halfway between what is at most the minimum distance apart, with the primvar
+      ``distance``. Both are there from a time of the scene to the next, with the primvars of contact points but
+      ``toi``.
 
     All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
     points are instances of a mesh, as Blender binds no materials to USD's own points; it shows the curves grey, as it
@@ -122,7 +140,7 @@ class Overlay:
         self._scene = scene
         self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
         self._ends = []  # where each complete interval ends in the spool
-        self._last: SceneIntersections | None = None  # at the end of the last complete interval
+        self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh that is named, by its name
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
@@ -136,11 +154,12 @@ class Overlay:
         contacts = result.contacts
         interval = contacts.interval
         self._sample("Polygons", interval.start, *self._find_polygons(contacts))
-        for kind, name in enumerate(("VertexFace", "EdgeEdge")):
-            self._sample(name, interval.start, self._find_points(contacts, np.flatnonzero(contacts.kind == kind)))
-        if result.intersections:
-            self._sample("Intersections", interval.start, self._find_curves(result.intersections[0]))
-            self._last = result.intersections[1]
+        for kind, name in enumerate(("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")):
+            rows = np.flatnonzero(contacts.kind == kind)
+            self._sample(name, interval.start, self._find_points(contacts, rows, {"toi": contacts.toi}))
+        for name, arrays in self._find_at_rest(result, 0).items():
+            self._sample(name, interval.start, arrays)
+        self._last = result
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
@@ -148,9 +167,10 @@ class Overlay:
         del self._ends[len(summary.intervals) :]
         summary = summary.first(len(self._ends))
         end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
-        if self._last is not None and self._last.time == end > summary.intervals[-1].start:
-            last, self._last = self._last, None
-            self._sample("Intersections", end, self._find_curves(last), interval=len(self._ends) - 1)
+        last, self._last = self._last, None
+        if last and last.summary.end == end > last.summary.start:
+            for name, arrays in self._find_at_rest(last, 1).items():
+                self._sample(name, end, arrays, interval=len(self._ends) - 1)
         content = self._content(summary, end)
         if self._is_text:
             self.file.truncate(0)
@@ -206,16 +226,28 @@ class Overlay:
         step = LIFT * self._size * np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
         return np.concatenate([x + step, x - step])
 
-    def _find_points(self, contacts: SceneContacts, rows: np.ndarray):
-        """Returns some contacts as points, None if there are none."""
+    def _find_at_rest(self, result: IntervalResult, end: int) -> dict[str, dict[str, np.ndarray] | None]:
+        """Returns the samples of what intersects and is near at the start of an interval, 0, or at its end, 1."""
+        samples = {}
+        if result.intersections:
+            found = result.intersections[end]
+            rows = np.arange(found.inside_rows.start, found.inside_rows.stop)
+            samples = {"Intersections": self._find_curves(found), "Inside": self._find_points(found, rows, {})}
+        if result.proximities:
+            found = result.proximities[end]
+            samples["Near"] = self._find_points(found, np.arange(len(found)), {"distance": found.distance})
+        return samples
+
+    def _find_points(self, pairs: ScenePairs, rows: np.ndarray, values: dict[str, np.ndarray]):
+        """Returns some pairs as points with some values of each pair, None if there are none."""
         if not len(rows):
             return None
-        prims, indices = self._number_prims(contacts.segment, contacts.meshes[rows]), contacts.indices[rows]
+        prims, indices = self._number_prims(pairs.segment, pairs.meshes[rows]), pairs.indices[rows]
         return {
-            "extent": _box(contacts.position[rows], _MARKER_SIZE * self._size / 2),
-            "positions": contacts.position[rows],
+            "extent": _box(pairs.position[rows], _MARKER_SIZE * self._size / 2),
+            "positions": pairs.position[rows],
             "protoIndices": np.zeros(len(rows)),
-            "primvars:toi": contacts.toi[rows],
+            **{f"primvars:{name}": value[rows] for name, value in values.items()},
             "primvars:primA": prims[:, 0],
             "primvars:primB": prims[:, 1],
             "primvars:elementA": indices[:, 0],
@@ -277,11 +309,15 @@ class Overlay:
             raise RuntimeError("the spool of the overlay is cut off")
         return np.frombuffer(data, dtype).reshape((-1, width) if width > 1 else -1)
 
+    def _complete(self, name: str) -> "list[_Sample]":
+        """Returns the samples of a prim that belong to complete intervals."""
+        return [sample for sample in self._samples[name] if sample.interval < len(self._ends)]
+
     def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
         """Yields the time samples of an attribute up to the end of the last interval, in order."""
         value_type = _PARTS[name][1][attribute]
         empty = self._load(value_type, _Place(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
-        samples = [sample for sample in self._samples[name] if sample.interval < len(self._ends)]
+        samples = self._complete(name)
         for index, sample in enumerate(samples):
             if sample.is_empty:
                 yield sample.time, empty
@@ -317,6 +353,7 @@ class Overlay:
             prims=[
                 LayerPrim(name, kind, attributes, COLORS[name], widths[kind])
                 for name, (kind, attributes) in _PARTS.items()
+                if name not in _ONLY_IF_FOUND or any(not sample.is_empty for sample in self._complete(name))
             ],
             samples=lambda name, attribute: self._time_samples(name, attribute, end),
         )

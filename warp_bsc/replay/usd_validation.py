@@ -1,4 +1,4 @@
-"""A rule of OpenUSD's validation framework: meshes neither collide between time samples nor cross at them.
+"""A rule of OpenUSD's validation framework: meshes neither collide between time samples nor intersect at them.
 
 Programs that run the framework find the rule by the plugin in the folder ``plugin`` beside this module, which OpenUSD
 loads if the environment variable ``PXR_PLUGINPATH_NAME`` names it. In Python, importing this module is enough::
@@ -26,14 +26,15 @@ from .summary import Summary
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
 NAME = f"{__name__}:Collisions"
-"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked."""
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked; its
+warning is ``Inside``, for a mesh that is wholly inside another, which may be meant."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
 
 
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
-    """Returns an error for each time in which two meshes collide or cross, or a mesh collides with or crosses itself.
+    """Returns an error for each time in which two meshes collide or cross, and a warning where one is inside another.
 
     The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the
     session layer are not seen.
@@ -62,8 +63,11 @@ def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange)
         text = f"{_pair(span.meshes)} collide from time {span.since:g} to {span.until:g}: {span.hits:,} pairs"
         errors.append(_error("Collision", text, stage, prims))
     for span in summary.intersection_spans:
-        if span.crossings:
-            prims = [paths[name] for name in span.meshes]
+        prims = [paths[name] for name in span.meshes]
+        if span.inside:
+            text = f"{span.meshes[0]} is inside {span.meshes[1]} from time {span.since:g} to {span.until:g}"
+            errors.append(_error("Inside", text, stage, prims, UsdValidation.ValidationErrorType.Warn))
+        elif span.crossings:
             text = f"{_pair(span.meshes)} cross from time {span.since:g} to {span.until:g}: at most {span.most:,} edges"
             errors.append(_error("Intersection", text, stage, prims))
     return errors
@@ -74,9 +78,15 @@ def _pair(meshes: tuple[str, str]) -> str:
     return f"{first} and {'itself' if first == second else second}"
 
 
-def _error(name: str, text: str, stage: Usd.Stage, paths: list[str]) -> UsdValidation.ValidationError:
+def _error(
+    name: str,
+    text: str,
+    stage: Usd.Stage,
+    paths: list[str],
+    kind: UsdValidation.ValidationErrorType = UsdValidation.ValidationErrorType.Error,
+) -> UsdValidation.ValidationError:
     sites = [UsdValidation.ValidationErrorSite(stage, path) for path in dict.fromkeys(paths)]
-    return UsdValidation.ValidationError(name, UsdValidation.ValidationErrorType.Error, sites, text)
+    return UsdValidation.ValidationError(name, kind, sites, text)
 
 
 Plug.Registry().RegisterPlugins(PLUGIN_FOLDER)

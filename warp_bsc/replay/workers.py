@@ -35,6 +35,7 @@ from ..detection.start import find_device, gpu_count
 from ..usd.interval import ReadingNotes
 from ..usd.scene import Scene
 from ..usd.segment import Segment
+from ..usd.selection import Selection
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
 
@@ -45,7 +46,7 @@ __all__ = [
     "check_in_workers",
     "device_of_cluster",
     "device_of_worker",
-    "initial_crossings_in_workers",
+    "selection_without_initial_in_workers",
 ]
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
@@ -191,14 +192,14 @@ class Cluster:
         self._client.close()
 
 
-def initial_crossings_in_workers(scene: Scene, checks: Checks, workers: Workers) -> frozenset[tuple[str, str]]:
-    """Returns the names of the meshes that cross at the first time, each pair sorted.
+def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
+    """Returns what :meth:`~warp_bsc.replay.checking.IntervalChecker.selection_without_initial` does, in a worker.
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
-    call = _Call("checked the first time", _find_initial_crossings, (_pack(scene, checks),))
-    (crossing,) = _in_order(workers, deque([call]))
-    return crossing
+    call = _Call("checked the first time", _find_selection_without_initial, (_pack(scene, checks),))
+    (selection,) = _in_order(workers, deque([call]))
+    return selection
 
 
 def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int = 0) -> Iterator[IntervalResult]:
@@ -250,6 +251,8 @@ def device_of_cluster(address: str, name: str | None) -> str:
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
     """Returns the device that a worker on this machine uses: one GPU each, in turns, where no certain one is named.
+
+    Workers share GPUs if there are more of them.
 
     Args:
         name: The device that is wanted, None for Warp's default.
@@ -377,11 +380,11 @@ def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
     return stream.getvalue()
 
 
-def _find_initial_crossings(job: bytes) -> frozenset[tuple[str, str]]:
-    """Returns the names of the meshes that cross at the first time."""
+def _find_selection_without_initial(job: bytes) -> Selection:
+    """Returns the selection that also ignores what crosses or is inside at the first time."""
     try:
         with _ONE_CHUNK, cores(_core_count()):
-            return _open(job).initial_crossings()
+            return _open(job).selection_without_initial()
     except Exception as error:
         raise _portable(error) from None
 

@@ -46,6 +46,7 @@ _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _FAR = wp.constant(wp.float64(1.0e300))
+_SMALLEST = wp.constant(float(2.0**-149))
 
 
 @wp.struct
@@ -366,6 +367,37 @@ def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3
 
 
 @wp.func
+def _towards(x: float, exact: wp.float64, direction: wp.float64) -> float:
+    """Returns a rounded coordinate, or its neighbour if that is the one on the side of the exact one that is wanted."""
+    error = wp.float64(x) - exact
+    if error * direction >= _ZERO:
+        return x
+    if x == 0.0:
+        return wp.where(direction > _ZERO, _SMALLEST, -_SMALLEST)
+    bits = wp.cast(x, wp.int32)
+    return wp.cast(bits + wp.where((x > 0.0) == (direction > _ZERO), 1, -1), wp.float32)
+
+
+@wp.func
+def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
+    """Returns a position in single precision, rounded upwards from the plane that the nearest one is farthest below."""
+    end = to_single(x)
+    most = -_FAR
+    normal = wp.vec3d()
+    node = planes.first[vertex]
+    while node >= 0:
+        other, least, _margin = _half_space(planes, node)
+        missing = least - wp.dot(other, to_double(end))
+        if missing > most or (missing == most and _precedes(other, normal)):
+            most = missing
+            normal = other
+        node = planes.next[node]
+    for axis in range(3):
+        end[axis] = _towards(end[axis], x[axis], normal[axis])
+    return end
+
+
+@wp.func
 def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec3):
     """Returns an end of a vertex's path above all of its planes, near to ``x1``, and whether the path was cut for that.
 
@@ -374,7 +406,11 @@ def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.v
     x = to_double(x1)
     if _is_above(planes, vertex, x):
         return x1, False
-    end = to_single(_projected(planes, vertex, x))
+    x = _projected(planes, vertex, x)
+    end = to_single(x)
+    if _is_above(planes, vertex, to_double(end)):
+        return end, False
+    end = _rounded(planes, vertex, x)  # elements may be nearer to each other than their coordinates are precise
     if _is_above(planes, vertex, to_double(end)):
         return end, False
     start = to_double(x0)

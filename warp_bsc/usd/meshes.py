@@ -1,4 +1,4 @@
-"""Finds the meshes of a USD stage and reads one at a time. Imports pxr, which is slow: import this where it is used."""
+"""Finds meshes, curves and points of a USD stage and reads them. Imports pxr, which is slow: import this where used."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -26,6 +26,7 @@ from .selection import Selection
 from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
 from .skinning import Skin, find_bindings
 from .stage import LeftOut, UnreadableError, as_time_code, may_jump, reading, sample_times
+from .strands import Strands, is_strands
 from .triangulation import triangulate
 
 __all__ = ["UsdMesh", "find_meshes"]
@@ -89,7 +90,14 @@ def find_meshes(
         warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
     if finder.other:
         warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
-    if shapes := Counter(mesh.shape for mesh in meshes if mesh.shape):
+    if strands := Counter(mesh.type_name for mesh in meshes if mesh.is_strands):
+        how = "between the times alone, with half their widths as radii"
+        warnings.append(f"curves and points are checked {how}: {_listed(strands)}")
+    if varying := [mesh for mesh in meshes if mesh.may_thicken]:
+        warnings.append(
+            f"widths or scales that change count as the largest: {len(varying)}, the first {varying[0].name}"
+        )
+    if shapes := Counter(mesh.type_name for mesh in meshes if mesh.is_shape):
         warnings.append(f"shapes are checked as polyhedra, round ones as inscribed ones: {_listed(shapes)}")
     return meshes, warnings
 
@@ -148,10 +156,10 @@ class _Finder:
             elif prim.IsA(UsdSkel.Root):
                 if not self._find_bindings(prim):
                     prims.PruneChildren()
-            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim):
+            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim) or is_strands(prim):
                 self.places.append(_Place(prim, instance, self._bindings.get(prim.GetPath())))
             elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
-                self.other[prim.GetTypeName()] += 1
+                self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
 
     def _find_bindings(self, root) -> bool:
         """Returns whether the bindings below a ``SkelRoot`` can be read."""
@@ -175,7 +183,9 @@ class UsdMesh:
         name: The same, with the number of the instance if a point instancer places it.
         group: The same for all instances of a prim that one instancer places; empty if none places it.
         display_name: Display name in the file, empty if there is none.
-        shape: Type of the prim if it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`; empty for a mesh.
+        type_name: Type of the prim.
+        is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`.
+        is_strands: Whether it is no mesh, but :class:`~warp_bsc.usd.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
             is invisible, not there or empty, else a digest of its topology.
@@ -199,9 +209,13 @@ class UsdMesh:
         self._file = file
         self.path = place.path
         self.display_name = prim.GetDisplayName()
-        self.shape = "" if prim.IsA(UsdGeom.Mesh) else str(prim.GetTypeName())
+        self.type_name = str(prim.GetTypeName())
+        self.is_shape = is_shape(prim)
         self._prim = prim
-        self._polygons: Polygons = MeshPolygons(prim) if prim.IsA(UsdGeom.Mesh) else ShapePolygons(prim)
+        self._strands = Strands(prim) if is_strands(prim) else None
+        self.is_strands = self._strands is not None
+        shaped = ShapePolygons if self.is_shape else MeshPolygons
+        self._polygons: Polygons = self._strands or shaped(prim)
         self._skin = skin = Skin(*place.binding, where=f"{file}: {self.path}") if place.binding else None
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
@@ -275,6 +289,14 @@ class UsdMesh:
         self._placed_times = self._transform_times if self._moved[self.index] else []
         self.times = self._deformed_times | set(self._placed_times)
         self.turns = bool(self._placed_times) or bool(self._skin and self._skin.times)
+
+    @property
+    def may_thicken(self) -> bool:
+        """Whether the radii of curves or points may change."""
+        return self._strands is not None and (
+            self._strands.width_attribute.ValueMightBeTimeVarying()
+            or float(np.ptp(self._scales(self._placed_times))) > 0
+        )
 
     def turning_times(self, start: float, end: float) -> set[float]:
         """Returns the whole time codes between samples at which the mesh is off the straight way between them.
@@ -425,6 +447,8 @@ class UsdMesh:
         Raises:
             UnreadableError: If the faces are broken, or there are none.
         """
+        if self._strands:
+            return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64), 0
         with reading(self._where, self, time):
             is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
             code = self._time_code(time, False)
@@ -436,6 +460,39 @@ class UsdMesh:
             if key not in self._last_triangles:
                 self._last_triangles[key] = self._find_triangles(code, points, is_mirrored)
             return self._last_triangles[key]
+
+    def read_strands(self, times: list[float], point_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Reads the edges of curves, and the radii of curves and points; of a mesh, there are none.
+
+        Args:
+            times: Times, ascending, from the first to before the last of which the topology is the same.
+            point_count: Number of points.
+
+        Returns:
+            The points at both ends of each edge, shape [n, 2]; the curve of each point, -1 for none, shape
+            [point_count]; and radii in world space, the largest of all times, shape [point_count].
+
+        Raises:
+            UnreadableError: If the curves or widths are broken.
+        """
+        if not self._strands:
+            return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1), np.zeros(point_count)
+        with reading(self._where, self, times[0]):
+            counts, _, _ = self._read_topology(self._time_code(times[0], False))
+            edges, curves = self._strands.read_edges(counts, point_count, self._where)
+        own = sample_times(self._strands.width_attribute)
+        radius = np.zeros(point_count)
+        for time in sorted({*times, *(time for time in own if times[0] < time < times[-1])}) if own else times[:1]:
+            with reading(self._where, self, time):
+                code = self._time_code(time, time == times[-1] > times[0])
+                radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves, self._where))
+        return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
+
+    def _scales(self, times: list[float]) -> list[float]:
+        """Returns the largest factor by which the transform lengthens at each time, to nine digits; 1 for no times."""
+        found = [self._find_transform(self._time_code(time, False)) for time in times if not self.is_placed]
+        scales = [np.linalg.norm(transform[:3, :3], 2) for transform in found if transform is not None]
+        return [float(f"{scale:.9g}") for scale in scales] or [1.0]
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
         counts, indices, holes = self._read_topology(code)

@@ -3,7 +3,9 @@
 What is read
 ------------
 Every ``UsdGeom.Mesh`` that is loaded and selected is read, wherever references, payloads, variants, native instances
-and point instancers put it. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra. All meshes are
+and point instancers put it. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra; linear
+``UsdGeom.BasisCurves`` as edges, and ``UsdGeom.Points`` as points, with half their widths, lengthened as much as their
+transform lengthens most, as radii; without widths, radii are 0. In what follows, these are meshes too. All meshes are
 merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
 alike. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once; holes and
 points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel computes them.
@@ -38,7 +40,7 @@ Broken meshes and instances, and files that cannot be opened, are left out from 
 and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
 moves is read at one time.
 
-:attr:`Scene.warnings` names the contents that this module does not read (curves and other shapes without polygons,
+:attr:`Scene.warnings` names the contents that this module does not read (other curves and shapes without polygons,
 unselected meshes) and the changes that it makes to the motion.
 """
 
@@ -154,6 +156,7 @@ class Scene:
         vertex_count: Number of vertices of the first segment, welded.
         face_count: Number of triangles of the first segment.
         turning: Number of meshes that transforms or skeletons move, which is not straight between samples.
+        has_strands: Whether it has curves or points that are checked at some time.
     """
 
     times: list[float]
@@ -243,6 +246,7 @@ class Scene:
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
         self.names = [mesh.name for mesh in read]
         self.display_names = {mesh.name: mesh.display_name for mesh in read}
+        self.has_strands = any(mesh.is_strands for mesh in read)
         self.turning = sum(mesh.turns for mesh in read)
 
     @property

@@ -1,4 +1,4 @@
-"""A stretch of a scene's time over which the same meshes are there and keep their topology."""
+"""A stretch of a scene's time over which the same meshes, curves and points are there and keep their topology."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ __all__ = ["SceneMesh", "Segment"]
 
 @dataclass(frozen=True)
 class SceneMesh:
-    """The part of a segment that one mesh of the scene is.
+    """The part of a segment that one mesh of the scene is, or the curves or points of one prim.
 
     Attributes:
         path: The prim's path.
@@ -47,9 +47,14 @@ class SceneMesh:
 class Segment:
     """Meshes merged to one list of vertices and one of faces, and their positions at the times of the segment.
 
+    Curves are meshes whose edges no face has, and points are meshes of vertices alone.
+
     Attributes:
         meshes: The meshes, in the order of their vertices.
         faces: Vertices of each face, shape [face_count, 3], int32.
+        free_edges: Vertices of the edges of curves, shape [n, 2], int32.
+        points: Vertices of points, int32.
+        radius: Radius of each vertex, in the scene's unit of length; 0 where a face is; shape [vertex_count].
         vertex_count: Number of vertices of all meshes, welded.
         welded: Number of vertices that were welded to another.
         dtype: Type of the positions, float32 or float64.
@@ -81,16 +86,29 @@ class Segment:
         self._usd_meshes = usd_meshes
         self.dtype = dtype
         self.meshes, faces = [], []
+        edges, curves, points_alone, radius = [], [], [], []
         vertex_count = face_count = 0
         compact: dict[int, tuple] = {}  # triangles that instances share, and what is made of them, by their identity
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
             triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
-            if id(triangles) not in compact:
+            strands = mesh.read_strands(times, len(points)) if mesh.is_strands else None
+            if strands:
+                used, corners = np.arange(len(points)), triangles
+                own_edges, own_curves, own_radius = strands
+                edges.append(own_edges + vertex_count)
+                curves.append(np.where(own_curves < 0, -1, own_curves + vertex_count))  # unlike those of other prims
+                points_alone.append(vertex_count + np.flatnonzero(own_curves < 0))
+                radius.append(own_radius)
+                compact[id(triangles)] = used, corners, triangles
+            elif id(triangles) not in compact:
                 used, corners = np.unique(triangles, return_inverse=True)
                 compact[id(triangles)] = used, corners.reshape(-1, 3), triangles
             used, corners, _ = compact[id(triangles)]
-            if not mesh.group:
+            if not strands:
+                curves.append(np.full(len(used), -1))
+                radius.append(np.zeros(len(used)))
+            if not mesh.group or strands:
                 compact.clear()
             faces.append(corners + vertex_count)
             self.meshes.append(
@@ -112,7 +130,10 @@ class Segment:
             face_count += len(triangles)
         self._vertex_ends = np.array([mesh.vertices.stop for mesh in self.meshes])
         self._face_ends = np.array([mesh.faces.stop for mesh in self.meshes])
-        self._corners = np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64)
+        self._corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
+        self._unwelded_edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
+        curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
+        alone = np.concatenate([np.zeros(0, dtype=np.int64), *points_alone])
 
         self._start = np.zeros((vertex_count, 3), dtype)
         everything = np.arange(vertex_count)
@@ -122,11 +143,19 @@ class Segment:
         else:
             self._welded_to = everything
             self._welded_to[welds[0]] = welds[1]
-        self._kept, corners = np.unique(self._welded_to[self._corners], return_inverse=True)
-        self.faces = corners.reshape(-1, 3).astype(np.int32)
+        used = [self._welded_to[part].reshape(-1) for part in (self._corners, self._unwelded_edges, alone)]
+        self._kept, places = np.unique(np.concatenate(used), return_inverse=True)
+        corners, ends, points = np.split(places.astype(np.int32), np.cumsum([len(used[0]), len(used[1])]))
+        self.faces, self.free_edges, self.points = corners.reshape(-1, 3), ends.reshape(-1, 2), points
         self.vertex_count = len(self._kept)
+        self.radius = np.zeros(self.vertex_count)
+        self._curve_of_vertex = curve_of_vertex[self._kept].astype(np.int64)
+        if self.has_strands:
+            np.maximum.at(self.radius, np.searchsorted(self._kept, self._welded_to), radii)
+            self.radius[self.faces] = 0.0  # welded to a mesh, they would thicken its faces
         self.welded = vertex_count - self.vertex_count
         self._start = self._start[self._kept]
+        self._along, self._length = self._measure_curves()
         moving = [number for number, mesh in enumerate(self.meshes) if mesh.moves]
         jumping = [number for number in moving if usd_meshes[number].may_jump]
         self._moving = self._reader(self._kept, moving)
@@ -156,6 +185,11 @@ class Segment:
         return positions
 
     @property
+    def has_strands(self) -> bool:
+        """Whether there are curves or points."""
+        return bool(len(self.free_edges) + len(self.points))
+
+    @property
     def may_jump(self) -> bool:
         """Whether a mesh may have other positions just before a time than at that time."""
         return self._jumping is not None
@@ -165,6 +199,11 @@ class Segment:
         """The vertices that are welded to others, before they were welded, and those that they are welded to."""
         (welded,) = np.nonzero(self._welded_to != np.arange(len(self._welded_to)))
         return welded, self._welded_to[welded]
+
+    @property
+    def face_meshes(self) -> np.ndarray:
+        """Mesh of each face, shape [face_count]."""
+        return np.searchsorted(self._face_ends, np.arange(len(self.faces)), side="right")
 
     @property
     def vertex_meshes(self) -> np.ndarray:
@@ -185,8 +224,8 @@ class Segment:
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all meshes that have each edge, shape [n, 2], smaller vertex first: rows, and the meshes."""
-        rows, faces = self.faces_of_edges(ends)
-        return rows, np.searchsorted(self._face_ends, faces, side="right")
+        rows, sides = self._find_sides(ends)
+        return rows, np.searchsorted(self._vertex_ends, self._ends_of_sides(sides)[:, 0], side="right")
 
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
@@ -224,6 +263,15 @@ class Segment:
             vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
         return np.searchsorted(self._kept, self._welded_to[vertices])
 
+    def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Returns which points of given meshes' prims vertices are, the first if several were welded, shape [n]."""
+        unwelded, order = self._unwelded
+        wanted = self._kept[vertices]
+        rows, places = _expand(np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right"))
+        own_meshes, points = self._locate(order[places])
+        (own,) = np.nonzero(own_meshes == meshes[rows])
+        return points[own[np.unique(rows[own], return_index=True)[1]]]
+
     def locate_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the mesh of each edge, the indices of its ends among the prim's points, and which are diagonals.
 
@@ -237,16 +285,17 @@ class Segment:
         keys, sides = self._sides
         wanted = self._side_keys(ends)
         place = np.searchsorted(keys, wanted)
-        face, corner = np.divmod(sides[place], 3)
         # The face's own corners: the welded ends may belong to an earlier mesh.
-        unwelded = self._corners[face[:, None], np.stack([corner, (corner + 1) % 3], axis=1)]
-        meshes, points = self._locate(unwelded)
+        meshes, points = self._locate(self._ends_of_sides(sides[place]))
 
         # Triangles of one polygon are neighbours in the list.
         following = np.minimum(place + 1, max(0, len(keys) - 1))
-        other = sides[following] // 3
-        same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
-        diagonal = (keys[following] == wanted) & (following > place) & same.all(axis=0)
+        of_faces = sides[following] < self._corners.size
+        face, other = (np.where(of_faces, sides[where] // 3, 0) for where in (place, following))
+        diagonal = (keys[following] == wanted) & (following > place) & of_faces
+        if diagonal.any():
+            same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
+            diagonal &= same.all(axis=0)
         return meshes[:, 0], np.sort(points, axis=1), diagonal
 
     def faces_around(self, vertices: np.ndarray) -> np.ndarray:
@@ -257,10 +306,29 @@ class Segment:
 
     def faces_of_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all faces that have each edge, shape [n, 2], smaller vertex first, as a side: rows, and the faces."""
-        keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
-        return rows, sides[places] // 3
+        rows, sides = self._find_sides(ends)
+        of_faces = sides < self._corners.size
+        return rows[of_faces], sides[of_faces] // 3
+
+    def are_neighbours(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Returns which pairs of edges of one curve are near along it, and may always touch each other.
+
+        What is between them is at most twice as long as their radii together, at the segment's first time.
+
+        Args:
+            first: Vertices of an edge, shape [n, 2].
+            second: Vertices of the other edge, shape [n, 2].
+        """
+        curves = self._curve_of_vertex[first].max(axis=1), self._curve_of_vertex[second].max(axis=1)
+        (rows,) = np.nonzero((curves[0] >= 0) & (curves[0] == curves[1]))
+        first, second = first[rows], second[rows]
+        between = np.abs(self._along[first][:, :, None] - self._along[second][:, None, :])
+        between = np.minimum(between, self._length[first].min(axis=1)[:, None, None] - between)
+        between[np.isnan(between)] = np.inf  # welded to a mesh
+        reach = self.radius[first].max(axis=1) + self.radius[second].max(axis=1)
+        near = np.zeros(len(curves[0]), dtype=bool)
+        near[rows] = between.min(axis=(1, 2)) <= 2.0 * reach
+        return near
 
     def are_stiff(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
         """Returns which elements are paired with their own mesh, and that mesh moves and does not deform.
@@ -289,7 +357,8 @@ class Segment:
         marked = np.zeros(len(keys) + 1, dtype=np.int64)
         np.add.at(marked, first, 1)
         np.add.at(marked, last, -1)
-        return np.unique(sides[np.cumsum(marked[:-1]) > 0] // 3)
+        found = sides[np.cumsum(marked[:-1]) > 0]
+        return np.unique(found[found < self._corners.size] // 3)
 
     @cached_property
     def _unwelded(self):
@@ -299,11 +368,54 @@ class Segment:
 
     @cached_property
     def _sides(self):
-        """Keys of the sides of all faces, ascending, and the number of each side: 3 face + corner."""
+        """Keys of the sides of all faces and of free edges, ascending, and the number of each side.
+
+        That is 3 face + corner, or the number of the free edge after all of these.
+        """
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        if len(self.free_edges):
+            sides = np.concatenate([sides, np.sort(self.free_edges, axis=1)])
         keys = self._side_keys(sides)
         order = np.argsort(keys, kind="stable")
         return keys[order], order
+
+    def _find_sides(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the rows of edges, smaller vertex first, shape [n, 2], and all sides that each is."""
+        keys, sides = self._sides
+        wanted = self._side_keys(ends)
+        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
+        return rows, sides[places]
+
+    def _ends_of_sides(self, sides: np.ndarray) -> np.ndarray:
+        """Returns the vertices at both ends of sides, as their own mesh has them before welding, shape [n, 2]."""
+        face, corner = np.divmod(sides, 3)
+        of_faces = sides < self._corners.size
+        ends = np.zeros((len(sides), 2), dtype=np.int64)
+        rows = face[of_faces], corner[of_faces]
+        ends[of_faces] = np.stack([self._corners[rows], self._corners[rows[0], (rows[1] + 1) % 3]], axis=1)
+        ends[~of_faces] = self._unwelded_edges[sides[~of_faces] - self._corners.size]
+        return ends
+
+    def _measure_curves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Measures curves at the segment's first time, in the scene's unit of length.
+
+        Returns:
+            How far along its curve each vertex is, NaN for others, and the length of its curve where that is closed,
+            else infinity, each of shape [vertex_count].
+        """
+        ends, x = self._unwelded_edges, self._start.astype(np.float64)
+        lengths = np.linalg.norm(x[self.free_edges[:, 1]] - x[self.free_edges[:, 0]], axis=1)
+        is_next = ends[:, 1] == ends[:, 0] + 1  # other edges close a curve
+        steps = np.zeros(len(self._welded_to))
+        steps[ends[is_next, 1]] = lengths[is_next]
+        along = np.cumsum(steps)  # differences within a curve count
+        curves = self._curve_of_vertex
+        closed = np.full(int(curves.max(initial=-1)) + 2, np.inf)
+        first, last = ends[~is_next].T
+        places = np.searchsorted(self._kept, self._welded_to[first])
+        closed[curves[places]] = along[last] - along[first] + lengths[~is_next]
+        closed[-1] = np.inf
+        return np.where(curves >= 0, along[self._kept], np.nan), closed[curves]
 
     def _side_keys(self, ends):
         return np.asarray(ends, dtype=np.int64) @ np.array([self.vertex_count, 1])

@@ -40,6 +40,7 @@ class Selection:
         purposes: Purposes of the meshes that are checked.
         ignore: Pairs of patterns: pairs of a mesh of the first and a mesh of the second are not checked.
         ignored_names: Pairs of names of meshes that are not checked with each other, each pair sorted.
+        ignored_inside: Names of a mesh and of another one that it may be inside.
     """
 
     prims: tuple[str, ...] = ()
@@ -49,6 +50,7 @@ class Selection:
     purposes: tuple[str, ...] = ("default", "render")
     ignore: tuple[tuple[str, str], ...] = ()
     ignored_names: frozenset[tuple[str, str]] = frozenset()
+    ignored_inside: frozenset[tuple[str, str]] = frozenset()
 
     def includes(self, mesh: NamedMesh) -> bool:
         """Returns whether a mesh is checked at all, whatever its purpose."""
@@ -86,6 +88,12 @@ class Selection:
             (_matches(a, first) and _matches(b, second)) or (_matches(b, first) and _matches(a, second))
             for first, second in self.ignore
         )
+
+    def may_be_inside(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
+        """Returns for which pairs of an inner and an outer mesh that is ignored; arguments of :meth:`counted_pairs`."""
+        if not self.ignored_inside or not len(pairs):
+            return np.zeros(len(pairs), dtype=bool)
+        return np.array([(meshes[a].name, meshes[b].name) in self.ignored_inside for a, b in pairs.tolist()])
 
     def counted_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
         """Returns which pairs of meshes are checked, those to be ignored included.

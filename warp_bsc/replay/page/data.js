@@ -2,7 +2,8 @@
 "use strict";
 
 const data = JSON.parse(document.getElementById("data").textContent);
-const KINDS = ["vertex-face", "edge-edge", "edge through face", "edge touches face"];
+const KINDS = ["vertex-face", "edge-edge", "vertex-edge", "vertex-vertex", "edge through face", "edge touches face", "inside", "near"];
+const AT_REST = 4, INSIDE = 6, NEAR = 7; // AT_REST is the first kind that is not of collisions
 const ELEMENTS = ["vertex", "face", "edge", "diagonal"];
 
 // Returns the facts and the arrays of a block, or null if the page has no such block.
@@ -31,42 +32,44 @@ async function unpack(name) {
   return result;
 }
 
-// Returns all rows of the table as columns: collisions by interval, and intersections by time.
+// Returns all rows of the table as columns: collisions by interval, intersections and proximities by time.
 async function loadRows() {
-  const total = data.rows.reduce((sum, [hits, rest]) => sum + hits + rest, 0);
+  const total = data.rows.reduce((sum, counts) => sum + counts[0] + counts[1] + counts[2], 0);
   const rows = {
     count: total,
-    interval: new Int32Array(total), // of an intersection, the interval at whose start it is; the last one at its end
+    interval: new Int32Array(total), // of what is at a time, the interval that starts then; the last one at its end
     place: new Int32Array(total), // in its block
     kind: new Uint8Array(total),
     elements: new Uint8Array(total),
     time: new Float64Array(total),
-    toi: new Float32Array(total), // of an intersection, 0 or 1
+    toi: new Float32Array(total), // of what is at a time, 0 or 1
+    distance: new Float32Array(total), // of proximities
     phase: new Int8Array(total).fill(-1),
     separate: new Int8Array(total).fill(-1),
   };
   const numbers = ["first", "second", "first_0", "first_1", "second_0", "second_1"];
   for (const key of numbers) rows[key] = new Int32Array(total);
-  const wanted = data.rows.flatMap((counts, index) => ["hits", "rest"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
+  const wanted = data.rows.flatMap((counts, index) => ["hits", "rest", "near"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
   let at = 0;
   const together = 64; // blocks that are unpacked at the same time
   for (let first = 0; first < wanted.length; first += together) {
     const some = wanted.slice(first, first + together);
     const blocks = await Promise.all(some.map(({ name, index }) => unpack(`${name}-${index}`)));
     for (const [which, block] of blocks.entries()) {
-      const { name, index } = some[which], isRest = name === "rest";
+      const { name, index } = some[which], isRest = name !== "hits";
       const interval = Math.min(index, data.intervals.length - 1);
       const [start, end] = data.intervals[interval];
       const length = block.first.length;
       rows.interval.fill(interval, at, at + length);
       for (const key of numbers) rows[key].set(block[key], at);
       rows.elements.set(block.elements, at);
+      rows.kind.set(block.kind, at);
       for (let i = 0; i < length; i += 1) {
         rows.place[at + i] = i;
-        rows.kind[at + i] = isRest ? (block.crosses[i] ? 2 : 3) : block.kind[i];
         rows.toi[at + i] = isRest ? index - interval : block.toi[i];
         rows.time[at + i] = start + rows.toi[at + i] * (end - start);
       }
+      if (block.distance) rows.distance.set(block.distance, at);
       if (block.phase) rows.phase.set(block.phase, at);
       if (block.separate) rows.separate.set(block.separate, at);
       at += length;

@@ -100,9 +100,14 @@ function addBars(parent, bars, classes, width, xLabel, height = 230, least = 46)
 
 const state = { interval: -1, prims: [], text: "", kind: "", only: false };
 const LAST = data.intervals.length - 1;
-const restAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[index][2] : 0);
-const hitsIn = (index) => data.intervals[index][2] + data.intervals[index][3];
-const isBusy = (index) => hitsIn(index) + restAt(index) + (index === LAST ? restAt(index + 1) : 0) > 0;
+const edgesAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[index][2] : 0);
+const insideAt = (index) => (data.rest[index] ? data.rest[index][3] : 0);
+const restAt = (index) => edgesAt(index) + insideAt(index);
+const nearAt = (index) => (data.near[index] ? data.near[index][1] : 0);
+const ofPoints = (interval) => interval[4] || 0; // of points with edges of curves and with points
+const hitsIn = (index) => data.intervals[index][2] + data.intervals[index][3] + ofPoints(data.intervals[index]);
+const atStart = (index) => restAt(index) + nearAt(index);
+const isBusy = (index) => hitsIn(index) + atStart(index) + (index === LAST ? atStart(index + 1) : 0) > 0;
 let table = null, rows = null, viewer = null;
 
 function addressOf(interval, prims) {
@@ -139,7 +144,7 @@ function stepInterval(step, from = state.interval) {
 
 function mostInterval() {
   let best = 0;
-  const weight = (index) => hitsIn(index) * 1e6 + restAt(index);
+  const weight = (index) => hitsIn(index) * 1e6 + atStart(index);
   for (let index = 1; index <= LAST; index += 1) if (weight(index) > weight(best)) best = index;
   return best;
 }
@@ -151,11 +156,12 @@ let timeline = null, mark = null;
 function fillIntervals() {
   if (LAST < 0) return;
   addKey(byId("intervals-legend"), { class: "first" }, "vertex-face");
-  addKey(byId("intervals-legend"), { class: "second" }, "edge-edge");
-  if (data.rest.length) addKey(byId("intervals-legend"), { class: "third" }, "edges in faces, at rest");
+  addKey(byId("intervals-legend"), { class: "second" }, data.intervals[0].length > 4 ? "edge-edge, vertex-edge, vertex-vertex" : "edge-edge");
+  if (data.rest.length) addKey(byId("intervals-legend"), { class: "third" }, "edges in faces and parts inside, at rest");
+  if (data.near.length) addKey(byId("intervals-legend"), { class: "fourth" }, "near pairs, at rest");
   const width = Math.max(340, Math.min(1100, byId("intervals").clientWidth || 1100));
   const together = Math.ceil(data.intervals.length / (width / 2.5));
-  const bars = [], restBars = [];
+  const bars = [], restBars = [], nearBars = [];
   for (let at = 0; at < data.intervals.length; at += together) {
     const some = data.intervals.slice(at, at + together);
     const sum = (column) => some.reduce((total, interval) => total + interval[column], 0);
@@ -163,20 +169,27 @@ function fillIntervals() {
     const rest = data.rest.slice(at, at + together);
     const most = (column) => rest.reduce((largest, sample) => Math.max(largest, sample[column]), 0);
     let tip = `time ${short(from)} to ${short(to)}\n${count(sum(2))} vertex-face\n${count(sum(3))} edge-edge`;
+    const points = some.reduce((total, interval) => total + ofPoints(interval), 0);
+    if (points) tip += `\n${count(points)} of points with curves and points`;
     if (rest.length) tip += `\n${together > 1 ? "at most " : ""}${count(most(1))} edges through faces`;
-    if (most(2)) tip += `, ${count(most(2))} touch`;
+    if (rest.length && most(2)) tip += `, ${count(most(2))} touch`;
+    if (rest.length && most(3)) tip += `\n${plural(most(3), "part")} inside`;
+    const near = data.near.slice(at, at + together).reduce((largest, sample) => Math.max(largest, sample[1]), 0);
+    if (near) tip += `\n${together > 1 ? "at most " : ""}${plural(near, "near pair")}`;
     const click = () => {
       let best = at;
       for (let index = at; index < at + some.length; index += 1)
-        if (hitsIn(index) * 1e6 + restAt(index) > hitsIn(best) * 1e6 + restAt(best)) best = index;
+        if (hitsIn(index) * 1e6 + atStart(index) > hitsIn(best) * 1e6 + atStart(best)) best = index;
       showInterval(best);
     };
     const place = { from, to: to > from ? to : from + 1, tip, click };
-    bars.push({ ...place, parts: [sum(2), sum(3)] });
-    restBars.push({ ...place, parts: [most(1) + most(2)] });
+    bars.push({ ...place, parts: [sum(2), sum(3) + points] });
+    restBars.push({ ...place, parts: [most(1) + most(2) + most(3)] });
+    nearBars.push({ ...place, parts: [near] });
   }
   timeline = addBars(byId("intervals"), bars, ["first", "second"], width, "time code", 200, 64);
   if (data.rest.length) addBars(byId("intervals"), restBars, ["third"], width, "", 80, 64);
+  if (data.near.length) addBars(byId("intervals"), nearBars, ["fourth"], width, "", 80, 64);
   mark = add(timeline.chart, "rect", { class: "mark", y: 2, height: timeline.bottom - 1, rx: 3 });
 }
 
@@ -213,11 +226,13 @@ function fillTable() {
   const columns = [
     { title: "Time", number: true, class: "narrow", key: (row) => rows.time[row], fill: (cell, row) => { cell.textContent = short(rows.time[row]); } },
     { title: "Kind", class: "kind", key: (row) => rows.kind[row], fill: (cell, row) => {
-      addKey(cell, { class: ["first", "second", "third", "third"][rows.kind[row]] }, KINDS[rows.kind[row]]);
+      const kind = rows.kind[row];
+      addKey(cell, { class: kind === NEAR ? "fourth" : kind >= AT_REST ? "third" : kind ? "second" : "first" }, KINDS[kind]);
     } },
     side("First", "first", false),
     side("Second", "second", true),
-    { title: "Surfaces", class: "wide-only narrow", key: (row) => rows.phase[row] * 2 + rows.separate[row], fill: (cell, row) => {
+    { title: data.near.length ? "Surfaces, distance" : "Surfaces", class: "wide-only narrow", key: (row) => (rows.kind[row] === NEAR ? 100 + rows.distance[row] : rows.phase[row] * 2 + rows.separate[row]), fill: (cell, row) => {
+      if (rows.kind[row] === NEAR) cell.textContent = `${short(Number(rows.distance[row].toPrecision(6)))} apart`;
       if (rows.phase[row] >= 0) cell.textContent = PHASES[rows.phase[row]] + (rows.separate[row] === 1 ? ", separate before" : "");
     } },
   ];
@@ -227,8 +242,8 @@ function fillTable() {
 
 // Shows the interval of a row, with the row's place in the middle.
 function showRow(row) {
-  const isRest = rows.kind[row] > 1;
-  showInterval(rows.interval[row], { isRest, place: rows.place[row], time: rows.toi[row] });
+  const kind = rows.kind[row];
+  showInterval(rows.interval[row], { from: kind === NEAR ? "near" : kind >= AT_REST ? "rest" : "hits", place: rows.place[row], time: rows.toi[row] });
   const name = (isSecond) => `${data.meshes[rows[isSecond ? "second" : "first"][row]].name} ${elementText(rows, row, isSecond)}`;
   byId("selected").hidden = false;
   byId("selected").textContent = `${KINDS[rows.kind[row]]} at time ${short(rows.time[row])}: ${name(false)} and ${name(true)}`;
@@ -257,7 +272,7 @@ function filterRows() {
     found.push(row);
   }
   table.show(found);
-  const all = data.intervals.reduce((sum, interval) => sum + interval[2] + interval[3], 0) + data.rest.reduce((sum, at) => sum + at[1] + at[2], 0);
+  const all = data.intervals.reduce((sum, _, index) => sum + hitsIn(index), 0) + data.rest.reduce((sum, _, index) => sum + restAt(index), 0) + data.near.reduce((sum, at) => sum + at[1], 0);
   byId("rows-count").textContent = `${count(found.length)} of ${plural(rows.count, "row")}${rows.count < all ? `; ${count(all)} were found, see the notes` : ""}`;
 }
 
@@ -281,9 +296,14 @@ function fillPairs() {
     } },
     { title: "Intersections at rest", key: (row) => pairs[row].rest.reduce((most, span) => Math.max(most, span[2]), 0), fill: (cell, row) => {
       const { rest, more_rest } = pairs[row];
-      fillSpans(cell, rest.map(([since, until, most, trend]) => `${range(since, until)}: ${plural(most, "edge")}, ${trend}`), more_rest);
+      const what = (most, inner) => (inner ? `${inner} inside` : plural(most, "edge"));
+      fillSpans(cell, rest.map(([since, until, most, trend, inner]) => `${range(since, until)}: ${what(most, inner)}, ${trend}`), more_rest);
     } },
   ];
+  if (data.near.length) columns.push({ title: "Near at rest", key: (row) => pairs[row].near.reduce((least, span) => Math.min(least, span[2]), Infinity), fill: (cell, row) => {
+    const { near, more_near } = pairs[row];
+    fillSpans(cell, near.map(([since, until, distance]) => `${range(since, until)}: ${short(Number(distance.toPrecision(6)))}`), more_near);
+  } });
   byId("pairs-count").textContent = pairs.length ? plural(pairs.length, "pair") : "No meshes collide.";
   byId("pairs").hidden = !pairs.length;
   new LongTable(byId("pairs"), columns, 66, () => {}).show(pairs.map((_, index) => index));

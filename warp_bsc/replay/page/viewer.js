@@ -4,8 +4,10 @@
 const MESH_COLORS = [[0.52, 0.68, 0.86], [0.62, 0.78, 0.6], [0.8, 0.7, 0.55], [0.72, 0.62, 0.8], [0.55, 0.76, 0.76], [0.84, 0.66, 0.72]];
 const REST_COLOR = [0.62, 0.64, 0.67];
 const LIT_COLOR = [0.93, 0.28, 0.22];
-const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1]];
+const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1], [0.85, 0.75, 0.1], [0.6, 0.45, 0.2]]; // by kind
 const CURVE_COLOR = [0.55, 0.24, 0.92];
+const ROPE_COLOR = [0.12, 0.16, 0.2];
+const NEAR_COLOR = [0.05, 0.6, 0.35];
 const CHOSEN_COLOR = [0.05, 0.75, 0.95];
 
 const TRIANGLE_SHADER = `#version 300 es
@@ -27,6 +29,21 @@ void main() {
   float light = 0.42 + 0.5 * abs(dot(normal, normalize(vec3(0.25, 0.45, 0.85)))) + 0.08 * abs(normal.y);
   result = vec4(mix(tint, only.rgb, only.a) * light, 1.0);
 }`;
+// Points of the scene.
+const STRAND_SHADER = `#version 300 es
+in vec3 start; in vec3 end; in vec3 color;
+uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size;
+out vec3 tint;
+void main() {
+  tint = 0.4 * color;
+  gl_Position = projection * view * vec4(mix(start, end, time), 1.0);
+  gl_PointSize = size;
+}`;
+const STRAND_COLOR = `#version 300 es
+precision highp float;
+in vec3 tint;
+out vec4 result;
+void main() { result = vec4(tint, 1.0); }`;
 const POINT_SHADER = `#version 300 es
 in vec3 start; in vec3 color; in float toi;
 uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size; uniform float fade;
@@ -52,10 +69,10 @@ void main() {
 
 // A segment is drawn as a rectangle of some pixels' width: two triangles, of four corners.
 const CURVE_SHADER = `#version 300 es
-in vec3 start; in vec3 end;
-uniform mat4 view; uniform mat4 projection; uniform vec2 pixel;
+in vec3 start; in vec3 end; in vec3 start_1; in vec3 end_1; // its ends at the start of the interval, and at the end
+uniform mat4 view; uniform mat4 projection; uniform vec2 pixel; uniform float time;
 void main() {
-  vec4 a = projection * view * vec4(start, 1.0), b = projection * view * vec4(end, 1.0);
+  vec4 a = projection * view * vec4(mix(start, start_1, time), 1.0), b = projection * view * vec4(mix(end, end_1, time), 1.0);
   vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-6, 0.0));
   int corner = int[](0, 1, 2, 2, 1, 3)[gl_VertexID]; // two at a, two at b
   gl_Position = corner < 2 ? a : b;
@@ -130,17 +147,22 @@ const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_C
 
 // Returns the blocks of an interval as the arrays that are drawn.
 async function loadView(index) {
-  const [view, hits, ...rest] = await Promise.all(["view", "hits", "rest"].map((name) => unpack(`${name}-${index}`)).concat(unpack(`rest-${index + 1}`)));
+  const names = [`view-${index}`, `hits-${index}`, ...["rest", "near"].flatMap((name) => [`${name}-${index}`, `${name}-${index + 1}`])];
+  const [view, hits, ...atEnds] = await Promise.all(names.map(unpack));
   if (!view) return null;
   const topology = await unpack(`faces-${view.faces}`);
   const faces = topology.faces, lit = new Int32Array(3 * view.lit.length);
   view.lit.forEach((face, place) => lit.set(faces.subarray(3 * face, 3 * face + 3), 3 * place));
   const contacts = hits ? hits.position : NO_FLOATS;
   return {
+    edges: topology.edges || NO_INTS, alone: topology.points || NO_INTS,
     faces, lit, meshes: topology.mesh_of_vertex, start: view.start, end: view.end, of: view.of,
     contacts, toi: hits ? hits.toi : NO_FLOATS, kinds: hits ? hits.kind : NO_INTS,
-    rest: rest.map((block) => (block ? block.position : NO_FLOATS)),
-    curves: rest.map((block) => (block ? block.curves : NO_FLOATS)),
+    // at the start and at the end of the interval
+    rest: atEnds.slice(0, 2).map((block) => (block ? block.position : NO_FLOATS)),
+    curves: atEnds.slice(0, 2).map((block) => (block ? block.curves : NO_FLOATS)),
+    inside: atEnds.slice(0, 2).map((block) => (block ? block.position.filter((_, i) => block.kind[Math.floor(i / 3)] === INSIDE) : NO_FLOATS)),
+    close: atEnds.slice(2).map((block) => (block ? block.position : NO_FLOATS)),
   };
 }
 
@@ -155,6 +177,7 @@ function makeViewer() {
 
   const triangles = gl && program(gl, TRIANGLE_SHADER, TRIANGLE_COLOR);
   const points = gl && program(gl, POINT_SHADER, POINT_COLOR);
+  const strands = gl && program(gl, STRAND_SHADER, STRAND_COLOR);
   const lines = gl && program(gl, CURVE_SHADER, CURVE_COLOR_SHADER);
   // Up is the scene's: y in the view.
   const zUp = data.up_axis === "Z";
@@ -169,7 +192,7 @@ function makeViewer() {
     ask();
   }
 
-  // Shows an interval. `at`, if given, is a row of the table: {isRest, place, time}.
+  // Shows an interval. `at`, if given, is a row of the table: {from, place, time}, from "hits", "rest" or "near".
   async function show(index, at = null) {
     const isNew = index !== state.index;
     state.index = index;
@@ -195,14 +218,16 @@ function makeViewer() {
     [state.parts, state.shown, state.chosen] = [[], shown, null];
     const legend = byId("viewer-legend");
     legend.replaceChildren();
-    const [hits, rest] = [hitsIn(index), restAt(index)];
-    let title = plural(hits, "collision");
-    if (data.rest.length) title += `; ${plural(rest, "edge")} in faces at the start, ${count(restAt(index + 1))} at the end`;
+    let title = plural(hitsIn(index), "collision");
+    const atEnds = (numberAt, one, how) => { title += `; ${plural(numberAt(index), one)} ${how} at the start, ${count(numberAt(index + 1))} at the end`; };
+    if (data.rest.length) atEnds(edgesAt, "edge", "in faces");
+    if (insideAt(index) + insideAt(index + 1)) atEnds(insideAt, "part", "inside");
+    if (data.near.length) atEnds(nearAt, "pair", "near");
     const isEmpty = !shown;
     byId("viewer-title").textContent = title;
     byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
     if (isEmpty) {
-      say(hits + rest + restAt(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
+      say(hitsIn(index) + atStart(index) + atStart(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       return;
     }
@@ -218,8 +243,8 @@ function makeViewer() {
     present.slice(0, 6).forEach((mesh) => addKey(legend, { fill: css(meshColor(mesh)) }, data.meshes[mesh].name));
     if (present.length > 6) add(legend, "span", {}, `and ${count(present.length - 6)} more`);
     if (lit.length) addKey(legend, { fill: css(LIT_COLOR) }, "faces that collide");
-    ["vertex-face contact", "edge-edge contact"].forEach((text, kind) => {
-      if (kinds.includes(kind)) addKey(legend, { fill: css(CONTACT_COLORS[kind]), rx: 5 }, text);
+    CONTACT_COLORS.forEach((color, kind) => {
+      if (kinds.includes(kind)) addKey(legend, { fill: css(color), rx: 5 }, `${KINDS[kind]} contact`);
     });
     if (shown.curves.some((curves) => curves.length)) addKey(legend, { fill: css(CURVE_COLOR), y: 3, height: 4 }, "curves where surfaces cut");
 
@@ -227,12 +252,25 @@ function makeViewer() {
     shown.all = vertexArray(gl, triangles, positions, faces);
     shown.some = vertexArray(gl, triangles, positions, lit);
     shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
-    shown.cuts = shown.curves.map((curves) => vertexArray(gl, lines, [["start", curves, 3, [24, 0]], ["end", curves, 3, [24, 12]]]));
-    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts];
+    if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
+    if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "near pair");
+    // Marks of what is at the start, and at the end.
+    shown.marks = shown.inside.map((inside, end) => {
+      const places = new Float32Array([...inside, ...shown.close[end]]), markColors = new Float32Array(places.length);
+      for (let i = 0; i < places.length; i += 3) markColors.set(i < inside.length ? CURVE_COLOR : NEAR_COLOR, i);
+      return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
+    });
+    const segments = (values, stride, places) => vertexArray(gl, lines, ["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]));
+    shown.cuts = shown.curves.map((curves) => segments(curves, 24, [0, 12, 0, 12]));
+    const ropes = new Float32Array(6 * shown.edges.length);
+    shown.edges.forEach((vertex, i) => [start, end].forEach((values, when) => ropes.set(values.subarray(3 * vertex, 3 * vertex + 3), 12 * (i >> 1) + 6 * when + 3 * (i % 2))));
+    shown.ropes = segments(ropes, 48, [0, 12, 24, 36]);
+    shown.dust = vertexArray(gl, strands, positions, shown.alone);
+    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks, shown.ropes, shown.dust];
 
     const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
     shown.whole = boxOf(moving.some((values) => values.length) ? moving : [start]);
-    const places = [contacts, ...shown.rest].filter((values) => values.length);
+    const places = [contacts, ...shown.rest, ...shown.close].filter((values) => values.length);
     shown.near = places.length ? boxOf(places) : { ...shown.whole };
     shown.near.radius = Math.max(shown.near.radius * 1.2, shown.whole.radius * 0.12);
     shown.median = toi.length ? Array.from(toi).sort((a, b) => a - b)[toi.length >> 1] : 0;
@@ -245,9 +283,10 @@ function makeViewer() {
   }
 
   // Marks the place of a row, and moves the view to it.
-  function choose({ isRest, place, time }) {
-    const from = isRest ? state.shown.rest[Math.round(time)] : state.shown.contacts;
-    const point = from.slice(3 * place, 3 * place + 3);
+  function choose({ from, place, time }) {
+    const { contacts, rest, close } = state.shown;
+    const places = from === "hits" ? contacts : (from === "rest" ? rest : close)[Math.round(time)];
+    const point = places.slice(3 * place, 3 * place + 3);
     state.time = time;
     if (point.length < 3) return;
     state.chosen?.free();
@@ -307,17 +346,27 @@ function makeViewer() {
       gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
     }
     gl.disable(gl.POLYGON_OFFSET_FILL);
+    const pixel = [(2 * scale) / width, (2 * scale) / height];
+    set(lines, { pixel, time: state.time, color: [...ROPE_COLOR, 1] });
+    gl.bindVertexArray(shown.ropes.array);
+    gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.edges.length / 2);
+    set(strands, { time: state.time, size: 5 * scale });
+    gl.bindVertexArray(shown.dust.array);
+    gl.drawElements(gl.POINTS, shown.alone.length, gl.UNSIGNED_INT, 0);
     gl.depthMask(false);
     // What is behind a surface shines through it faintly. Cut curves belong to one end of the interval.
     const end = state.time < 0.5 ? 0 : 1;
     // Many contacts would hide one another, and all else.
-    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, shown.toi.length)) ** 1.4) * scale;
+    const marks = shown.marks[end], dots = shown.toi.length + marks.count;
+    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
-      set(lines, { pixel: [(2 * scale) / width, (2 * scale) / height], color: [...CURVE_COLOR, fade] });
+      set(lines, { pixel, time: 0, color: [...CURVE_COLOR, fade] });
       gl.bindVertexArray(shown.cuts[end].array);
       gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
-      set(points, { time: state.time, fade, size, core: shown.toi.length > 300 ? 2 : 0.68 });
+      set(points, { time: state.time, fade, size, core: dots > 300 ? 2 : 0.68 });
+      gl.bindVertexArray(marks.array);
+      gl.drawArrays(gl.POINTS, 0, marks.count);
       gl.bindVertexArray(shown.dots.array);
       gl.drawArrays(gl.POINTS, 0, shown.toi.length);
     }

@@ -1,0 +1,147 @@
+"""The edges of linear curves, and points, with their radii. Imports pxr, which is slow: import this where used."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import bisect
+from typing import Any
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from .stage import UnreadableError
+
+__all__ = ["Strands", "is_strands"]
+
+
+class Strands:
+    """The linear curves of a ``UsdGeom.BasisCurves`` prim, or the points of a ``UsdGeom.Points`` prim.
+
+    Attributes:
+        has_edges: Whether they are curves.
+        width_attribute: The attribute that holds their widths.
+    """
+
+    def __init__(self, prim: Usd.Prim):
+        """Finds the attributes."""
+        self.has_edges = prim.IsA(UsdGeom.BasisCurves)
+        self._id_times: list[float] = []  # of the samples of points whose ids change
+        self._schema = schema = UsdGeom.BasisCurves(prim) if self.has_edges else UsdGeom.Points(prim)
+        self.point_attributes = (schema.GetPointsAttr(),)
+        if self.has_edges:
+            self.topology_attributes = (schema.GetCurveVertexCountsAttr(),)
+        else:
+            self._ids = schema.GetIdsAttr()
+            self.topology_attributes = (schema.GetPointsAttr(), self._ids)
+            if self._ids.ValueMightBeTimeVarying():
+                self._id_times = schema.GetPointsAttr().GetTimeSamples()
+        # As the schema has it, the primvar comes before the attribute.
+        primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
+        self._widths = primvar if primvar and primvar.HasAuthoredValue() else None
+        self.width_attribute = self._widths.GetAttr() if self._widths else schema.GetWidthsAttr()
+
+    @property
+    def may_jump(self) -> bool:
+        """Whether value clips hold the points, as of :class:`~warp_bsc.usd.shapes.MeshPolygons`."""
+        return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
+
+    def read_points(self, time: Usd.TimeCode) -> Any:
+        """Returns the points.
+
+        Between two samples with different ids, points that have the same id in both move straight, where USD would hold
+        all of them if their number changes; the others stay in place.
+        """
+        held = self.point_attributes[0].Get(time)
+        if not self._id_times:
+            return held
+        earlier = bisect.bisect_left if time.IsPreTime() else bisect.bisect_right
+        place = earlier(self._id_times, time.GetValue())
+        if not 0 < place < len(self._id_times):
+            return held
+        first, last = self._id_times[place - 1 : place + 1]
+        ids, next_ids = (np.array(self._ids.Get(sample) or ()) for sample in (first, last))
+        points, next_points = (np.array(self.point_attributes[0].Get(sample) or ()) for sample in (first, last))
+        if np.array_equal(ids, next_ids) or len(ids) != len(points) or len(next_ids) != len(next_points):
+            return held
+        _, stays, comes = np.intersect1d(ids, next_ids, return_indices=True)
+        share = np.float32((time.GetValue() - first) / (last - first))
+        points[stays] = (np.float32(1.0) - share) * points[stays] + share * next_points[comes]
+        return points
+
+    def read_topology(self, time: Usd.TimeCode) -> list[Any]:
+        """Returns the numbers of points of the curves; of points, their number and their ids, which tell them apart."""
+        if self.has_edges:
+            return [self.topology_attributes[0].Get(time), None, None]
+        points = self.read_points(time)
+        return [
+            None if points is None else [len(points)] * bool(len(points)),
+            self._ids.Get(time),
+            None,
+        ]
+
+    def read_edges(self, counts: np.ndarray, point_count: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the edges of curves, and the curve of each point.
+
+        Args:
+            counts: Numbers of points of the curves, shape [curve_count].
+            point_count: Number of points.
+            where: File and prim, for messages.
+
+        Returns:
+            The points at both ends of each edge, shape [n, 2], and curves, shape [point_count].
+
+        Raises:
+            UnreadableError: If the numbers do not fit.
+        """
+        if not self.has_edges:
+            return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1)
+        if counts.min(initial=2) < 2:
+            curve = int(np.argmin(counts))
+            raise UnreadableError(f"{where}: curve {curve} has {counts[curve]} points; 2 are the fewest")
+        if counts.sum() != point_count:
+            raise UnreadableError(
+                f"{where}: curveVertexCounts add up to {counts.sum()}, but there are {point_count} points"
+            )
+        curves = np.repeat(np.arange(len(counts)), counts)
+        (first,) = np.nonzero(curves[1:] == curves[:-1])
+        edges = np.stack([first, first + 1], axis=1)
+        if self._schema.GetWrapAttr().Get() == UsdGeom.Tokens.periodic:
+            last = np.cumsum(counts) - 1
+            edges = np.concatenate([edges, np.stack([last - counts + 1, last], axis=1)[counts > 2]])
+        return edges, curves
+
+    def read_widths(self, time: Usd.TimeCode, curves: np.ndarray, where: str) -> np.ndarray:
+        """Returns the width at each point, 0 if the file has none, in the space of the prim.
+
+        Args:
+            time: Time code.
+            curves: Curve of each point, shape [point_count].
+            where: File and prim, for messages.
+
+        Raises:
+            UnreadableError: If there is another number of widths than their interpolation has, or one is negative or
+                not finite.
+        """
+        value = self._widths.ComputeFlattened(time) if self._widths else self.width_attribute.Get(time)
+        if value is None or len(value) == 0:
+            return np.zeros(len(curves))
+        widths = np.array(value, dtype=np.float64)
+        interpolation = self._widths.GetInterpolation() if self._widths else self._schema.GetWidthsInterpolation()
+        if interpolation == UsdGeom.Tokens.constant:
+            wanted, places = 1, np.zeros(len(curves), dtype=np.int64)
+        elif interpolation == UsdGeom.Tokens.uniform and self.has_edges:
+            wanted, places = int(curves.max(initial=-1)) + 1, curves
+        else:  # varying and vertex values are at the same points of linear curves
+            wanted, places = len(curves), np.arange(len(curves))
+        if widths.shape != (wanted,):
+            raise UnreadableError(f"{where}: {len(widths)} widths of interpolation {interpolation}, which has {wanted}")
+        if not (np.isfinite(widths) & (widths >= 0.0)).all():
+            raise UnreadableError(f"{where}: widths must be finite and at least 0")
+        return widths[places]
+
+
+def is_strands(prim: Usd.Prim) -> bool:
+    """Returns whether a prim is what :class:`Strands` reads."""
+    if prim.IsA(UsdGeom.BasisCurves):
+        return UsdGeom.BasisCurves(prim).GetTypeAttr().Get() == UsdGeom.Tokens.linear
+    return prim.IsA(UsdGeom.Points)
