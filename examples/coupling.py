@@ -6,7 +6,8 @@
 Three scenes in which contact works against elasticity: a cloth drapes over a sphere; a cylinder moves into a sleeve a
 third narrower than itself; two plates press two soft blocks to half their height. The first row of each scene is the
 stage without coupling at a small step, the reference. The second has twice that step, and shows how far the reference
-can be trusted. The others have larger steps, without and with coupling. Distances are root mean squares.
+can be trusted. The others have larger steps: without coupling, with a number of substeps, and with one that the stage
+chooses. Distances are root mean squares.
 """
 
 import argparse
@@ -188,7 +189,7 @@ class Run:
         edges = np.unique(np.sort(corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
         self.edges = edges[(model.particle_mass.numpy()[edges] > 0.0).all(axis=1)]  # without those that are held
         self.lengths = self.edge_lengths(rest)
-        self.largest, self.seconds = [], 0.0
+        self.largest, self.substeps, self.seconds = [], [], 0.0
 
     def edge_lengths(self, x):
         """Returns the lengths of the edges between movable particles [m]."""
@@ -220,6 +221,7 @@ class Run:
             self.solver.step(start, end, self.control, None, self.dt)
             self.states = [end, start]
             self.largest.append((self.edge_lengths(self.positions()) / self.lengths).max() - 1.0)
+            self.substeps.append(self.solver.report.substeps)
         self.seconds = time.perf_counter() - begin
         return self
 
@@ -248,17 +250,17 @@ def main():
     with wp.ScopedDevice(options.device or wp.get_preferred_device()):
         for name in options.scenes:
             scene = SCENES[name]()
-            columns = "distance [mm]", "uncertified", "time [s]"
+            columns = "substeps a step", "distance [mm]", "uncertified", "time [s]"
             table = Table("step", "coupling", *scene.measures, *columns, title=type(scene).__doc__)
             rows = [(REFERENCE, None), (2.0 * REFERENCE, None)]
             for dt in STEPS:
-                rows += [(dt, None), (dt, round(options.coupling * dt / STEPS[0]))]
+                rows += [(dt, None), (dt, round(options.coupling * dt / STEPS[0])), (dt, "auto")]
             reference = None
             for dt, coupling in rows:
                 run = Run(scene, dt, coupling).simulate()
                 reference = run.positions() if reference is None else reference
                 distance = 1e3 * np.sqrt(((run.positions() - reference) ** 2).sum(axis=1).mean())
-                values = [f"{value:.4g}" for value in (*scene.measure(run), distance)]
+                values = [f"{value:.4g}" for value in (*scene.measure(run), np.mean(run.substeps), distance)]
                 report = run.solver.report
                 values += [str(report.uncertified_steps), f"{run.seconds:.1f}"]
                 table.add_row(f"1/{1.0 / dt:.0f}", str(coupling or "-"), *values)

@@ -9,6 +9,7 @@ import warp as wp
 from newton_scenes import DT, SOFT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
+from warp_bsc.response.coupling import edges_at_rest
 
 
 def drape(device):
@@ -41,15 +42,119 @@ def largest_stretch(model, dt, duration=0.4, **options):
 
 
 def test_a_coupled_step_stretches_as_little_as_small_steps(device):
-    """At 1/60 s, coupled cloth stretches as at 1/480 s; without coupling, it stretches several times as much."""
+    """At 1/60 s, coupled cloth stretches as at 1/480 s; without coupling, it stretches several times as much.
+
+    That is so with a number of substeps, and where the stage chooses.
+    """
     model = drape(device)
     reference, _ = largest_stretch(model, 1.0 / 480.0)
     plain, report = largest_stretch(model, 1.0 / 60.0)
     assert report.coupled_steps == 0
-    coupled, report = largest_stretch(model, 1.0 / 60.0, coupling=8)
-    assert report.coupled_steps > 0.5 * report.steps
     assert plain > 3.0 * reference
-    assert coupled < 1.2 * reference
+    for coupling in (8, "auto"):
+        coupled, report = largest_stretch(model, 1.0 / 60.0, coupling=coupling)
+        assert report.coupled_steps > 0.5 * report.steps
+        assert coupled < 1.2 * reference
+
+
+def test_auto_is_the_least_number_that_keeps_the_strain_small(device):
+    """Each step is that with the number of substeps that the report names, bit by bit; a resting patch takes none."""
+    model = drape(device)
+    state, ends, control = model.state(), [model.state() for _ in range(2)], model.control()
+    inner = newton.solvers.SolverVBD(model, iterations=5)
+    solvers = {n: bsc.SolverCCD(inner, friction=0.5, coupling=n) for n in (None, 2, 4, 8, 16, 32, "auto")}
+    chosen = []
+    for dt in (1.0 / 480.0, 1.0 / 60.0):
+        state.assign(model.state())
+        for _ in range(round(0.15 / dt)):
+            start = wp.clone(state.particle_q), wp.clone(state.particle_qd)
+            solvers["auto"].step(state, ends[0], control, None, dt)
+            chosen.append(solvers["auto"].report.substeps)
+            state.particle_q.assign(start[0])
+            state.particle_qd.assign(start[1])
+            solvers[chosen[-1] or None].step(state, ends[1], control, None, dt)
+            for name in ("particle_q", "particle_qd"):
+                auto, fixed = (getattr(end, name).numpy().tobytes() for end in ends)
+                assert auto == fixed
+            state.assign(ends[0])
+    assert len(set(chosen)) >= 3
+    assert solvers["auto"].report.coupled_steps == np.count_nonzero(chosen)
+
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.001))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling="auto"))
+    for _ in range(10):
+        rollout.step()
+    assert rollout.solver.report.coupled_steps == 0
+    assert 0.0 < rollout.positions[:, 2].max() < 0.001  # it lies
+
+
+def test_soft_bodies_are_coupled_where_they_are_compressed(device):
+    """A plate presses a block at once by a tenth of a cell: cloth would buckle, but a solid is strained by a tenth."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_box(body, hx=0.2, hy=0.2, hz=0.05)
+    material = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 0.0, "particle_radius": 0.002}
+    cells = {"dim_x": 2, "dim_y": 2, "dim_z": 2, "cell_x": 0.05, "cell_y": 0.05, "cell_z": 0.05}
+    at = wp.vec3(-0.05, -0.05, 0.051)
+    builder.add_soft_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **material)
+    builder.color()
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverVBD(model, iterations=5, integrate_with_external_rigid_solver=True)
+    solver = bsc.SolverCCD(inner, coupling="auto")
+    start, end = model.state(), model.state()
+    end.body_q.assign(np.float32([[0.0, 0.0, 0.006, 0.0, 0.0, 0.0, 1.0]]))
+    solver.step(start, end, model.control(), None, DT)
+    assert solver.report.certified and solver.report.substeps >= 8
+
+
+def test_lengths_at_rest_are_those_of_the_material(device):
+    """Edges of cloth and of a soft body, apart from where they are now."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 1.0))
+    sizes = {"dim_x": 1, "dim_y": 1, "dim_z": 1, "cell_x": 0.1, "cell_y": 0.2, "cell_z": 0.3}
+    material = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 0.0}
+    builder.add_soft_grid(pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), **sizes, **material)
+    x = np.array(builder.particle_q)
+    builder.particle_q = [wp.vec3(*row) for row in 2.0 * x]
+    edges, lengths, is_solid = edges_at_rest(builder.finalize(device=device))
+    assert np.allclose(lengths, np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1), rtol=1e-5)
+    assert is_solid.tolist() == (edges >= 9).all(axis=1).tolist()
+    assert len(edges) == 16 + 18
+
+
+def test_each_world_takes_the_substeps_that_it_needs(device):
+    """Three worlds, of which one takes none, in one model and each in a model of its own."""
+    speeds = 0.1, 3.0, 30.0
+    worlds, alone = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0)), []
+    for speed in speeds:
+        world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        add_patch(world, 8, 0.05, (0.0, 0.0, 0.0), fixed=True)
+        add_patch(world, 4, 0.03, (0.011, 0.017, 2e-4 + 0.004 * speed), velocity=(0.0, 0.0, -speed))
+        worlds.add_world(world)
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.add_world(world)
+        alone.append(builder)
+    rollouts = []
+    for builder in (worlds, *alone):
+        builder.color()
+        model = builder.finalize(device=device)
+        solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), separation=2e-4, coupling="auto")
+        rollouts.append(Rollout(model, solver))
+    substeps = []
+    for _ in range(3):
+        for rollout in rollouts:
+            rollout.step()
+        numbers = [rollout.solver.report.substeps for rollout in rollouts]
+        assert numbers[0] == max(numbers[1:])
+        substeps.append(numbers[1:])
+        expected = np.concatenate([rollout.positions for rollout in rollouts[1:]])
+        assert rollouts[0].positions.tobytes() == expected.tobytes()
+    assert any(len(set(numbers)) == 3 for numbers in substeps)
+    assert all(rollout.solver.report.uncertified_steps == 0 for rollout in rollouts)
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
@@ -102,27 +207,29 @@ def test_worlds_are_like_one_alone(device):
         assert world.tobytes() == one.positions.tobytes()
 
 
-def test_momentum_of_free_bodies_is_conserved(device):
+@pytest.mark.parametrize("coupling", [None, 4, "auto"])
+def test_momentum_of_free_bodies_is_conserved(coupling, device):
     """Two patches collide; momentum is kept to 1e-6 of what collides, as XPBD keeps it and VBD by itself does not."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 1.0))
     add_patch(builder, 5, 0.04, (0.013, 0.017, 0.012), velocity=(0.5, 0.0, -1.0))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, coupling=4))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, coupling=coupling))
     before, _ = rollout.momenta()
     colliding = model.particle_mass.numpy() @ np.linalg.norm(rollout.velocities, axis=1)
     for _ in range(8):
         rollout.step()
     after, _ = rollout.momenta()
     assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    assert rollout.solver.report.coupled_steps > 0
+    assert (rollout.solver.report.coupled_steps > 0) is (coupling is not None)
     assert np.abs(after - before).max() < 1e-6 * colliding
     assert abs(rollout.velocities[: 7 * 7, 2].mean() - 1.0) > 0.3  # they did collide
 
 
+@pytest.mark.parametrize("coupling", [None, 4])
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_a_bounce_returns_the_energy_of_restitution(restitution, device):
+def test_a_bounce_returns_the_energy_of_restitution(restitution, coupling, device):
     """A patch hits a box squarely: its energy afterwards is that before times restitution squared."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     box = newton.ModelBuilder.ShapeConfig(mu=0.0)
@@ -130,17 +237,18 @@ def test_a_bounce_returns_the_energy_of_restitution(restitution, device):
     add_patch(builder, 5, 0.05, (0.0, 0.0, 0.02), velocity=(0.0, 0.0, -2.0))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, coupling=4)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, coupling=coupling)
     rollout = Rollout(model, solver)
     mass = model.particle_mass.numpy()[:, None]
     before = (mass * rollout.velocities**2).sum()
     for _ in range(8):
         rollout.step()
-    assert solver.report.coupled_steps > 0 and rollout.collisions == 0
+    assert (solver.report.coupled_steps > 0) is (coupling is not None) and rollout.collisions == 0
     assert abs((mass * rollout.velocities**2).sum() / before - restitution**2) < 0.02
 
 
-def test_a_pile_comes_to_rest(device):
+@pytest.mark.parametrize("coupling", [None, 3, "auto"])
+def test_a_pile_comes_to_rest(coupling, device):
     """Layers that fall on the ground gain no energy, and lie still."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
@@ -148,7 +256,7 @@ def test_a_pile_comes_to_rest(device):
         add_patch(builder, 4, 0.05, (0.011 * layer, 0.007 * layer, 0.02 * (layer + 1)))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, coupling=3))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, coupling=coupling))
     mass = model.particle_mass.numpy().astype(float)
 
     def energy():
@@ -197,6 +305,26 @@ def test_style3d_is_coupled_too(device):
         assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
     assert rollout.solver.report.coupled_steps > 10
     assert stretch[1] < 0.5 * stretch[0]
+
+
+def test_xpbd_is_coupled_too(device):
+    """Cloth of springs falls on a sphere at 1/60 s, where XPBD with its contacts between steps throws it apart."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.15)
+    cells = {"dim_x": 12, "dim_y": 12, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.001, "particle_radius": 0.005}
+    springs = {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": 5.0, "spring_kd": 0.0}
+    at = wp.vec3(-0.3, -0.3, 0.16)
+    builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **springs)
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverXPBD(model, iterations=10)
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, coupling=8))
+    edges, lengths, _ = edges_at_rest(model)
+    for _ in range(12):
+        rollout.step(1.0 / 60.0)
+    stretch = (np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1) / lengths).max() - 1.0
+    assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
+    assert rollout.solver.report.coupled_steps > 6
+    assert stretch < 0.5
 
 
 class Clocked(newton.solvers.SolverVBD):
@@ -271,6 +399,8 @@ def test_a_moving_plate_pushes_in_each_substep(device):
         end.body_q.assign(np.float32([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]]))
         solver.step(start, end, model.control(), None, DT)
         assert solver.report.certified
+        is_pushed = solver._response.progress.fast.numpy()[0] == 1  # so that no vertex is left in the way
+        assert is_pushed or solver.report.hits == 0
         start, end = end, start
     assert solver.report.coupled_steps > 8
     above = start.particle_q.numpy()[:, 2] - (0.05 + heights[-1])
@@ -278,11 +408,12 @@ def test_a_moving_plate_pushes_in_each_substep(device):
     assert np.allclose(start.particle_qd.numpy()[:, 2], 20.0 * 12 * DT, rtol=0.1)
 
 
-def test_coupled_steps_in_a_graph_are_those_without(device):
+@pytest.mark.parametrize("coupling", [3, "auto"])
+def test_coupled_steps_in_a_graph_are_those_without(coupling, device):
     if device.is_cuda and not wp.is_conditional_graph_supported():
         pytest.skip("needs conditional nodes")
     model = bullet(30.0, device=device)
-    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=3)) for _ in range(2))
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=coupling)) for _ in range(2))
     start, end = captured.states
 
     def frame():
@@ -317,12 +448,18 @@ def test_a_solver_that_allocates_is_captured_too(device):
         wp.capture_launch(capture.graph)
     assert rollout.solver.report.steps == 7 and rollout.solver.report.coupled_steps > 1
     assert rollout.solver.report.uncertified_steps == 0
+    if device.is_cuda:  # a graph of the CPU knows what to leave out
+        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model), coupling="auto")
+        with pytest.raises(NotImplementedError, match="SolverXPBD needs a number"), wp.ScopedCapture(device):
+            chooses.step(start, end, rollout.control, None, DT)
 
 
 def test_what_cannot_be_coupled_is_refused(device):
     model = bullet(10.0, device=device)
     with pytest.raises(ValueError, match="2 substeps"):
         bsc.SolverCCD(SOLVERS["vbd"](model), coupling=1)
+    with pytest.raises(ValueError, match="'auto', not 'always'"):
+        bsc.SolverCCD(SOLVERS["vbd"](model), coupling="always")
     with pytest.raises(ValueError, match="coupling has no meaning"):
         bsc.SolverCCD(SOLVERS["vbd"](model), coupling=4, respond=False)
     builder = newton.ModelBuilder()

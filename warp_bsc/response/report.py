@@ -39,8 +39,17 @@ class SolverReport:
         speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(self, motion: ModelMotion, response: Response, *, responds: bool = True, lifts: bool = False):
+    def __init__(
+        self,
+        motion: ModelMotion,
+        response: Response,
+        substeps: wp.array[int],
+        *,
+        responds: bool = True,
+        lifts: bool = False,
+    ):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
+        self._substeps = substeps
         self._motion, self._response, self._responds = motion, response, responds
         self.speed_limit_lifted = lifts
         self._totals_values = wp.zeros(len(StepTotals.vars), dtype=int, device=response.device)
@@ -209,6 +218,11 @@ class SolverReport:
     def coupled_steps(self) -> int:
         """Steps so far that were taken in substeps, see :mod:`.coupling`."""
         return _read(self._totals.coupled_steps)
+
+    @property
+    def substeps(self) -> int:
+        """Substeps of the last step, the most of all worlds; 0 if it was not taken in substeps."""
+        return _read(self._substeps)
 
     @property
     def uncertified_steps(self) -> int:

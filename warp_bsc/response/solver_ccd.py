@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import newton
 import numpy as np
@@ -13,7 +13,7 @@ from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
-from .coupling import Coupling
+from .coupling import SUBSTEPS, Coupling
 from .coupling_hooks import CouplingHooks
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
@@ -107,13 +107,13 @@ def _finish_inspection(
 
 
 @wp.kernel(enable_backward=False)
-def _count_step(status: SolveStatus, is_coupled: wp.array[int], totals: StepTotals):
+def _count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals):
     """Adds a step to the totals."""
     # a certified motion of elements that did not cross makes no crossings
     unchanged = status.certified[0] == 1 and status.crossings[0] == 0 and status.excluded[0] == 0
     status.recount[0] = wp.where(unchanged, 0, 1)
     totals.steps[0] = totals.steps[0] + 1
-    totals.coupled_steps[0] = totals.coupled_steps[0] + is_coupled[0]
+    totals.coupled_steps[0] = totals.coupled_steps[0] + wp.min(substeps[0], 1)
     totals.uncertified_steps[0] = totals.uncertified_steps[0] + 1 - status.certified[0]
     totals.undetected_steps[0] = totals.undetected_steps[0] + status.undetected[0]
     totals.truncated_steps[0] = totals.truncated_steps[0] + status.truncated[0]
@@ -204,7 +204,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         separation: float | None = None,
         friction: float | None = None,
         restitution: float | None = None,
-        coupling: int | None = None,
+        coupling: int | Literal["auto"] | None = None,
         bodies: bool | None = None,
         min_distance: float | None = None,
         radius: float | np.ndarray | wp.array | None = None,
@@ -221,7 +221,9 @@ class SolverCCD(SolverBase, CouplingHooks):
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``.
             coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
-                against the contacts, see :mod:`.coupling`; None for none.
+                against the contacts, see :mod:`.coupling`; None for none. ``"auto"`` takes a step again only where
+                contacts strain cloth or soft bodies by more than 1% against what the inner solver wanted, in up to 32
+                substeps.
             bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
                 friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
                 keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit) and the model has
@@ -272,8 +274,8 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"friction must be at least 0, and finite in single precision, not {friction!r}")
         if respond and not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be in [0, 1], not {restitution!r}")
-        if coupling is not None and coupling < 2:
-            raise ValueError(f"coupling takes at least 2 substeps, not {coupling!r}")
+        if coupling is not None and coupling != "auto" and not (isinstance(coupling, int) and coupling >= 2):
+            raise ValueError(f"coupling takes at least 2 substeps, or 'auto', not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
         keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
@@ -302,11 +304,14 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
-            arguments = self._step_inner, solver, mesh, self._motion, self._response, coupling
+            choices = SUBSTEPS if coupling == "auto" else (coupling,)
+            arguments = self._step_inner, solver, mesh, self._motion, self._response, choices
             self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
-        self._is_coupled = wp.zeros(1, dtype=int, device=mesh.device)
+        no_substeps = wp.zeros(1, dtype=int, device=mesh.device)
+        self._substeps = no_substeps if self._coupling is None else self._coupling.substeps
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self.report = SolverReport(self._motion, self._response, responds=respond, lifts=self._limited is not None)
+        lifts = self._limited is not None
+        self.report = SolverReport(self._motion, self._response, self._substeps, responds=respond, lifts=lifts)
 
     def _find_moves_bodies(self, bodies):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
@@ -377,6 +382,8 @@ class SolverCCD(SolverBase, CouplingHooks):
             ValueError: If a tape records gradients of the response, and both states are the same.
             NotImplementedError: If a tape records gradients of a response that keeps a minimum distance.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
+            NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
+                memory, such as ``SolverXPBD``.
         """
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
@@ -457,7 +464,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         with self._timed():
             self._set_end(_arrays(state), dt)
             assert self._coupling is not None
-            resolution = self._coupling.resolve(state, control, contacts, dt, self._is_coupled)
+            resolution = self._coupling.resolve(state, control, contacts, dt)
             self._finish(resolution, _arrays(state))
 
     def _finish(self, resolution, end):
@@ -472,7 +479,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._count_step(resolution)
 
     def _count_step(self, resolution):
-        self._launch(_count_step, 1, [resolution.status, self._is_coupled], [self.report._totals])
+        self._launch(_count_step, 1, [resolution.status, self._substeps], [self.report._totals])
 
     @contextlib.contextmanager
     def _timed(self):
