@@ -151,7 +151,7 @@ def _divide(
     cut: wp.array[bool],
 ):
     for i in range(normals.shape[0]):
-        add_plane(planes, wp.vec4i(0, -1, -1, -1), 1, normals[i], offsets[i], margins[i])
+        add_plane(planes, wp.vec4i(0, -1, -1, -1), 1, normals[i], offsets[i], margins[i], wp.float64(0.0))
     position, was_cut = position_on_sides(planes, 0, x0, x1)
     end[0] = position
     cut[0] = was_cut

@@ -58,7 +58,8 @@ def load_detector(
     detector = CollisionDetector(triangles, method=method)
     detector.detect(points, points)
     if strands:
-        rope = CollisionMesh([[0, 1, 2]], 6, edges=[[3, 4]], points=[5], radius=1.0, device=device)
+        elements = {"edges": np.array([[3, 4]]), "points": np.array([5])}
+        rope = CollisionMesh(np.array([[0, 1, 2]]), 6, **elements, radius=1.0, device=device)
         CollisionDetector(rope, method=method).detect(points, points)
     if intersections:
         detector.find_intersections(points)

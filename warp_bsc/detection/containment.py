@@ -215,7 +215,7 @@ class _Parts:
         is_shared = np.zeros(count, dtype=bool)
         is_shared[mesh.faces[last_body[mesh.faces] != bodies[:, None]]] = True
         nodes, self._node_vertices = _divide(mesh.faces, is_shared, bodies)
-        edges, of_edges = _divide(mesh.face_edges, is_shared[mesh.edges].all(axis=1), bodies)
+        edges, of_edges = _divide(mesh.face_edges, is_shared[mesh.edges[:, 0]] & is_shared[mesh.edges[:, 1]], bodies)
 
         roots = _connect(nodes, len(self._node_vertices))
         used = np.zeros(len(roots), dtype=bool)
@@ -248,10 +248,11 @@ class _Parts:
     def boxes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the lowest and the highest corners of the parts' bounding boxes, each of shape [part_count, 3]."""
         columns = [np.ascontiguousarray(column) for column in x[self._ordered_vertices].T]
-        return tuple(
+        low, high = (
             np.stack([bound.reduceat(column, self._starts) for column in columns], axis=1)
             for bound in (np.minimum, np.maximum)
         )
+        return low, high
 
     def meeting(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
         """Returns keys of the pairs of parts that meet, and of those of which an edge passes through a face.

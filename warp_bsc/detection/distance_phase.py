@@ -26,7 +26,14 @@ from .rings import Rings, are_within_rings
 from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
 from .stage_timer import StageTimer
 
-__all__ = ["checked_distance", "decide_distances_on_host", "pair_distances", "run_distance_phases"]
+__all__ = [
+    "checked_distance",
+    "decide_distances_on_host",
+    "distance_of_corners",
+    "firsts_of",
+    "pair_distances",
+    "run_distance_phases",
+]
 
 _BLOCK, _THREADS_OF_MULTIPROCESSOR = 64, 256
 """Threads of a block, and of a multiprocessor, that search: as many as run at once. On a CPU a thread has one pair."""
@@ -56,13 +63,13 @@ def checked_distance(min_distance: float | np.ndarray, shape: tuple[int, ...] = 
 
 
 @wp.func
-def _firsts(kind: int) -> int:
+def firsts_of(kind: int) -> int:
     """Returns how many of the four places of a pair the first element has."""
     return wp.where(kind == EDGE_EDGE, 2, 1)
 
 
 @wp.func
-def _distance(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) -> wp.float64:
+def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) -> wp.float64:
     """Returns the minimum distance of a pair."""
     a = radius[v[0]]
     b = radius[v[1]]
@@ -122,9 +129,9 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-        distance = _distance(kind, v, radius)
+        distance = distance_of_corners(kind, v, radius)
         motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
-        if clears_at_once(motion, scaled) or are_within_rings(v, _firsts(kind), rings):
+        if clears_at_once(motion, scaled) or are_within_rings(v, firsts_of(kind), rings):
             return
         append(pair, stages.survivors, stages.counts, _SURVIVORS)
 
@@ -159,7 +166,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
                 a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
                 a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
                 points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-                distance = _distance(kind, v, radius)
+                distance = distance_of_corners(kind, v, radius)
                 motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
                 search = begin_search(motion, scaled, tolerance)
                 search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import warp as wp
 
+from .approach_phase import MinDistances, run_approach_phases
 from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import checked_distance, run_distance_phases
 from .mesh import CollisionMesh
@@ -101,6 +102,7 @@ class DetectionPipeline:
         tolerance: float = TOLERANCE,
         min_distance: float = 0.0,
         rings: int = 1,
+        keeping: "MinDistances | None" = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
     ):
@@ -112,6 +114,8 @@ class DetectionPipeline:
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, see :class:`CollisionDetector`.
             rings: Pairs that so few edges join are excluded, see :class:`CollisionDetector`.
+            keeping: Distances that pairs are to keep, see :mod:`.approach_phase`, instead of those that radii and
+                ``min_distance`` make; None for these.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together;
@@ -133,8 +137,12 @@ class DetectionPipeline:
         self.counters = Counters(mesh.device)
         self.counts = self.counters.read()
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
-        self.radius = _radius(mesh, float(checked_distance(min_distance)))
-        self._rings = Rings() if self.radius is None else make_rings(mesh, rings)
+        self._keeping = keeping
+        if keeping is None:
+            self.radius = _radius(mesh, float(checked_distance(min_distance)))
+        else:
+            self.radius = keeping.radius.numpy() + 0.5 * keeping.reach
+        self._rings = Rings() if self.radius is None or keeping is not None else make_rings(mesh, rings)
         self._radius = padding = None
         if self.radius is not None:
             self._radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
@@ -209,7 +217,10 @@ class DetectionPipeline:
                 self._launch_count_not_finite(x0, x1)
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
-        if self._radius is None:
+        if self._keeping is not None:
+            options = {"tolerance": self.tolerance, "timer": timer}
+            run_approach_phases(narrow_phases, x0, x1, self._keeping, near_pairs=not refit, **options)
+        elif self._radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:
             run_distance_phases(narrow_phases, x0, x1, self._radius, self._rings, **options)

@@ -181,9 +181,9 @@ def name_elements(
     indices, all_vertices = np.full((n, 2, 2), -1, dtype=np.int64), np.full((n, 2, 2), -1, dtype=np.int64)
     all_faces = np.full((n, 2), -1, dtype=np.int64)
     stop = 0
-    for count, (*first, second_element, second) in zip(counts, blocks, strict=True):
+    for count, (first_element, first, second_element, second) in zip(counts, blocks, strict=True):
         rows, stop = slice(stop, stop + count), stop + count
-        for side, (element, own) in enumerate((first, (second_element, second))):
+        for side, (element, own) in enumerate(((first_element, first), (second_element, second))):
             elements[rows, side] = element
             if element == FACE:
                 all_faces[rows, side] = own

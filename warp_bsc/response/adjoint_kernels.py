@@ -352,7 +352,7 @@ def make_constraints(
         normal = impact.normal
         separation = widened(least, progress)
         if constraints.slow[i] == 1:
-            separation = feasible_in_contact(motion, corners, weight, normal, separation, least)
+            separation = feasible_in_contact(motion, corners, weight, normal, separation, least, wp.float64(0.0))
         separation += sagitta(motion, vertices, corners, MOST_SAGITTA * least)
     elif kind > PLANE_CONTACT:
         weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from ..detection.approach_phase import MinDistances
+
 __all__ = [
     "DIVIDED",
     "FROZEN",
@@ -89,6 +91,7 @@ class Motion:
     friction: wp.array[float]  # coefficient
     world: wp.array[int]
     bodies: Bodies
+    distances: MinDistances  # that pairs are to keep; empty if they only must not touch
 
 
 @wp.struct
@@ -118,6 +121,7 @@ class Constraints:
     weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
     normal: wp.array[wp.vec3d]
     separation: wp.array[wp.float64]  # along the normal [m]
+    least: wp.array[wp.float64]  # part of it that is the minimum distance [m]; empty without minimum distances
     friction: wp.array[float]  # coefficient
     kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
     plane: wp.array[int]  # of a contact with a plane
@@ -154,6 +158,7 @@ class SolveStatus:
     body_contacts: wp.array[int]  # contacts between bodies that the last detection found, left to the inner solver
     crossings: wp.array[int]  # edges that cross faces at the start
     projecting: wp.array[int]  # 1 if the last detection added constraints
+    near: wp.array[int]  # 1 if the wanted motion ends with a pair nearer than its separation, but not in contact
     recount: wp.array[int]  # 1 if crossings may have changed since they were counted
     truncated: wp.array[int]  # 1 if a path was cut
     frozen: wp.array[int]  # 1 if a vertex was frozen
@@ -212,11 +217,13 @@ def allocate_bodies(count, device) -> MovedBodies:
     return bodies
 
 
-def allocate_constraints(capacity, device) -> Constraints:
+def allocate_constraints(capacity, device, *, keep_distances: bool = False) -> Constraints:
     """Returns constraints, none yet, with this capacity."""
     constraints = Constraints()
     for name, var in Constraints.vars.items():
         setattr(constraints, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
+    if not keep_distances:
+        constraints.least = wp.empty(0, dtype=wp.float64, device=device)
     constraints.count = wp.zeros(1, dtype=int, device=device)
     constraints.active_count = wp.zeros(1, dtype=wp.int64, device=device)
     return constraints

@@ -2,8 +2,10 @@
 
 import warp as wp
 
-from ..kernels.pipeline.pairs import vertices_of_pair
+from ..detection.approach_phase import distances_of_pair
+from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import take_place
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from .buffers import Constraints, Motion, Progress, Vertices
 from .exclusion import Connectivity, crossed_at_start, is_movable
 
@@ -30,6 +32,7 @@ __all__ = [
     "contact_vertices",
     "contact_weights",
     "count_contact",
+    "distances_at_start",
     "divides_all_near_pairs",
     "divides_near_pairs",
     "feasible",
@@ -39,9 +42,11 @@ __all__ = [
     "inverse_mass_of",
     "is_dividing",
     "is_excluded",
+    "is_on_body",
     "is_projecting",
     "is_pushing",
     "is_slow",
+    "least_distance",
     "longest_path",
     "relative",
     "to_double",
@@ -102,7 +107,8 @@ class Contacts:
     """The contacts of one kind of pair, unsorted, as the last detection found them."""
 
     mesh: Connectivity
-    edges: int  # 1 where they are of edges: EDGE_EDGE, else VERTEX_FACE
+    kind: int  # VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX
+    edges: int  # 1 where they are of two edges, else 0
     elements: wp.array2d[int]
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
@@ -203,7 +209,7 @@ def truncated_path(x0: wp.vec3d, x1: wp.vec3d, time: wp.float64) -> wp.vec3d:
 @wp.func
 def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
     """Returns the four vertices of a contact, those of its first element first."""
-    return vertices_of_pair(contacts.edges, contacts.elements, contacts.pairs[i])
+    return points_of_pair(contacts.kind, contacts.elements, contacts.pairs[i])
 
 
 @wp.func
@@ -215,15 +221,19 @@ def is_excluded(motion: Motion, contacts: Contacts, i: int, corners: wp.vec4i) -
 
 
 @wp.func
-def contact_weights(edges: int, c: wp.vec3d) -> wp.vec4d:
+def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
     """Returns the weights of four vertices in the vector from the second contact point to the first.
 
     Args:
-        edges: 1 where the contact is of edges.
-        c: Its coordinates.
+        kind: The kind of pair.
+        c: The coordinates of the contact.
     """
-    if edges == 1:
+    if kind == EDGE_EDGE:
         return wp.vec4d(_ONE - c[0], c[0], c[1] - _ONE, -c[1])
+    if kind == VERTEX_EDGE:
+        return wp.vec4d(_ONE, c[0] - _ONE, -c[0], _ZERO)
+    if kind == VERTEX_VERTEX:
+        return wp.vec4d(_ONE, -_ONE, _ZERO, _ZERO)
     return wp.vec4d(_ONE, -c[0], -c[1], -c[2])
 
 
@@ -243,10 +253,15 @@ def longest_path(motion: Motion, corners: wp.vec4i) -> wp.float64:
 
 
 @wp.func
-def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
-    """Returns 1 if two elements move so little for their size that one direction holds for the whole step, else 0."""
+def is_slow(motion: Motion, corners: wp.vec4i, kind: int) -> int:
+    """Returns 1 if two elements move so little for their size that one direction holds for the whole step, else 0.
+
+    The size of points is their distance.
+    """
+    if kind == VERTEX_VERTEX:
+        return wp.where(longest_path(motion, corners) <= _SLOW * _side(motion, corners[0], corners[1]), 1, 0)
     size = _side(motion, corners[2], corners[3])
-    if edges == 1:
+    if kind == EDGE_EDGE:
         size = wp.min(size, _side(motion, corners[0], corners[1]))
     else:
         size = wp.min(size, _side(motion, corners[1], corners[2]))
@@ -254,7 +269,25 @@ def is_slow(motion: Motion, corners: wp.vec4i, edges: int) -> int:
 
 
 @wp.func
-def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d) -> bool:
+def distances_at_start(motion: Motion, corners: wp.vec4i, kind: int):
+    """Returns the distance of a pair at the start, and the one it is to keep; see :func:`distances_of_pair` [m]."""
+    a = to_double(motion.x0[corners[0]])
+    b = to_double(motion.x0[corners[1]])
+    c = to_double(motion.x0[corners[2]])
+    d = to_double(motion.x0[corners[3]])
+    return distances_of_pair(motion.distances, kind, corners, a, b, c, d)
+
+
+@wp.func
+def least_distance(constraints: Constraints, i: int) -> wp.float64:
+    """Returns the part of the separation of a constraint that is the minimum distance of its pair [m]."""
+    if constraints.least:
+        return constraints.least[i]
+    return _ZERO
+
+
+@wp.func
+def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, least: wp.float64) -> bool:
     """Returns whether two elements in contact would meet even if all that can be moved stood still.
 
     Dividing planes, which let vertices stand still, are then no way out.
@@ -268,7 +301,15 @@ def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.
             moves = moves or wp.length_sq(motion.x1[vertex] - x) > 0.0
             x = motion.x1[vertex]
         end += weights[j] * to_double(x)
-    return moves and wp.dot(normal, end) <= _ZERO
+    return moves and wp.dot(normal, end) <= least
+
+
+@wp.func
+def is_on_body(motion: Motion, vertex: int) -> bool:
+    """Returns whether a vertex is of a body; False if the response moves none."""
+    if motion.bodies.of_vertex:
+        return motion.bodies.of_vertex[vertex] >= 0
+    return False
 
 
 @wp.func
@@ -303,9 +344,10 @@ def feasible_in_contact(
     normal: wp.vec3d,
     target: wp.float64,
     separation: wp.float64,
+    least: wp.float64,
 ) -> wp.float64:
-    """Returns the separation for a contact of slow elements, where fast ones get ``target`` [m]."""
-    start = wp.dot(normal, relative(weights, corners, motion.x0))
+    """Returns the separation beyond ``least`` for a contact of slow elements, where fast ones get ``target`` [m]."""
+    start = wp.dot(normal, relative(weights, corners, motion.x0)) - least
     return feasible(motion, corners, target, start, separation)
 
 
@@ -372,6 +414,7 @@ def add_constraint(
     within_tolerance: bool,
     toi: wp.float64,
     multiplier: wp.vec3d,
+    least: wp.float64,
 ) -> int:
     """Adds a constraint with a position multiplier if it fits; counts it in any case, and returns its place."""
     i = take_place(constraints.count)
@@ -390,4 +433,6 @@ def add_constraint(
         constraints.velocity_multiplier[i] = wp.vec3d()
         constraints.previous_multiplier[i] = wp.vec3d()
         constraints.last_sweep[i] = -2
+        if constraints.least:
+            constraints.least[i] = least
     return i

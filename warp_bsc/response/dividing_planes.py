@@ -59,6 +59,7 @@ class DividingPlanes:
     count: wp.array[int]  # of planes, whether they fit or not
     normal: wp.array[wp.vec3d]
     offset: wp.array[wp.float64]  # coordinate along the normal [m]
+    half: wp.array[wp.float64]  # of the minimum distance of both elements [m]; empty without minimum distances
     margin: wp.array[float]  # by which projection exceeds it [m]
     split: wp.array[wp.int8]  # the first corner that stays below
     next: wp.array[int]  # the next node in the list of the same vertex, or the end
@@ -66,12 +67,15 @@ class DividingPlanes:
     kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
 
 
-def allocate_dividing_planes(vertices: int, capacity: int, device: wp.Device) -> DividingPlanes:
+def allocate_dividing_planes(
+    vertices: int, capacity: int, device: wp.Device, *, keep_distances: bool = False
+) -> DividingPlanes:
     """Returns lists without planes for this many vertices, with a capacity for all planes together."""
     planes = DividingPlanes()
     planes.count = wp.zeros(1, dtype=int, device=device)
     planes.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
     planes.offset = wp.empty(capacity, dtype=wp.float64, device=device)
+    planes.half = wp.empty(capacity if keep_distances else 0, dtype=wp.float64, device=device)
     planes.margin = wp.empty(capacity, dtype=float, device=device)
     planes.split = wp.empty(capacity, dtype=wp.int8, device=device)
     planes.next = wp.empty(4 * capacity, dtype=int, device=device)
@@ -90,7 +94,13 @@ def _add_node(planes: DividingPlanes, vertex: int, node: int):
 
 @wp.func
 def add_plane(
-    planes: DividingPlanes, corners: wp.vec4i, split: int, normal: wp.vec3d, offset: wp.float64, margin: wp.float64
+    planes: DividingPlanes,
+    corners: wp.vec4i,
+    split: int,
+    normal: wp.vec3d,
+    offset: wp.float64,
+    margin: wp.float64,
+    half: wp.float64,
 ):
     """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` says so.
 
@@ -100,7 +110,8 @@ def add_plane(
         split: The first that stays below.
         normal: Unit normal of the plane.
         offset: Its coordinate along the normal [m].
-        margin: Least distance from it after projection [m].
+        margin: Least distance from it after projection, beside ``half`` [m].
+        half: Half of the distance that both sides keep from each other [m].
     """
     plane = take_place(planes.count)
     fits = plane < planes.normal.shape[0]
@@ -109,6 +120,8 @@ def add_plane(
         planes.offset[plane] = offset
         planes.margin[plane] = float(margin)
         planes.split[plane] = wp.int8(split)
+        if planes.half:
+            planes.half[plane] = half
     for j in range(4):
         if corners[j] >= 0:
             _add_node(planes, corners[j], wp.where(fits, 4 * plane + j, _INCOMPLETE))
@@ -128,7 +141,10 @@ def _half_space(planes: DividingPlanes, node: int):
     """Returns the normal of a vertex's side of a plane, its least coordinate along it, and the margin."""
     plane = node / 4
     side = wp.where(node % 4 < int(planes.split[plane]), _ONE, -_ONE)
-    return side * planes.normal[plane], side * planes.offset[plane], wp.float64(planes.margin[plane])
+    least = side * planes.offset[plane]
+    if planes.half:
+        least += planes.half[plane]
+    return side * planes.normal[plane], least, wp.float64(planes.margin[plane])
 
 
 @wp.struct
@@ -144,12 +160,19 @@ class _Side:
 
 @wp.func
 def _side(
-    motion: Motion, vertices: Vertices, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d, normal: wp.vec3d
+    motion: Motion,
+    vertices: Vertices,
+    corners: wp.vec4i,
+    begin: int,
+    end: int,
+    origin: wp.vec3d,
+    normal: wp.vec3d,
+    half: wp.float64,
 ) -> _Side:
     """Returns how far the vertices from ``begin`` to ``end`` reach against a normal.
 
-    Planes take a vertex no farther than the ball around its path: this is what projection onto a convex set does to the
-    end of a path that starts in it.
+    They reach farther by ``half`` of the distance that they are to keep. Planes take a vertex no farther than the ball
+    around its path: this is what projection onto a convex set does to the end of a path that starts in it.
     """
     side = _Side()
     side.reach = _FAR
@@ -160,7 +183,7 @@ def _side(
         vertex = corners[j]
         start = to_double(motion.x0[vertex])
         path = to_double(vertices.x1[vertex]) - start
-        x0 = wp.dot(normal, start - origin)
+        x0 = wp.dot(normal, start - origin) - half
         x1 = x0 + wp.dot(normal, path)
         side.start = wp.min(side.start, x0)
         side.reach = wp.min(side.reach, _HALF * (x0 + x1 - wp.length(path)))
@@ -179,6 +202,7 @@ def add_dividing_plane(
     corners: wp.vec4i,
     edges: int,
     separation: wp.float64,
+    least: wp.float64,
     planes: DividingPlanes,
     is_contact: bool,
 ) -> bool:
@@ -186,7 +210,7 @@ def add_dividing_plane(
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
-    cannot bring together.
+    cannot bring together. ``least`` is the distance that the elements are to keep [m]: half of it is on either side.
 
     Returns:
         Whether the elements meet at the end, or nearly, without planes.
@@ -194,8 +218,9 @@ def add_dividing_plane(
     normal = closest_direction(motion, corners, edges)
     origin = to_double(motion.x0[corners[3]])
     split = wp.where(edges == 1, 2, 1)
-    above = _side(motion, vertices, corners, 0, split, origin, normal)
-    below = _side(motion, vertices, corners, split, 4, origin, -normal)
+    half = _HALF * least
+    above = _side(motion, vertices, corners, 0, split, origin, normal, half)
+    below = _side(motion, vertices, corners, split, 4, origin, -normal, half)
     distance = above.start + below.start
     if not is_contact and (distance <= _ZERO or above.reach + below.reach > _ZERO):
         return False
@@ -214,7 +239,7 @@ def add_dividing_plane(
     offset = wp.clamp(offset, least - below.start, above.start - least)
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
-    add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin)
+    add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin, half)
     return above.end + below.end < margin
 
 

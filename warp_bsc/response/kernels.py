@@ -4,6 +4,7 @@ import warp as wp
 
 from ..detection.settings import Count
 from ..kernels.pipeline.queues import is_filled
+from ..kernels.polynomials import EDGE_EDGE
 from ..kernels.signs import FREE
 from .bodies import first_contact_of_body, sagitta
 from .buffers import (
@@ -35,6 +36,7 @@ from .constraints import (
     contact_vertices,
     contact_weights,
     count_contact,
+    distances_at_start,
     divides_all_near_pairs,
     divides_near_pairs,
     feasible_in_contact,
@@ -42,7 +44,9 @@ from .constraints import (
     is_dividing,
     is_pushing,
     is_slow,
+    least_distance,
     longest_path,
+    relative,
     to_double,
     to_single,
     truncated_path,
@@ -109,6 +113,7 @@ def begin_step(
         status.frozen[0] = 0
         status.lost[0] = 0
         status.projecting[0] = 0
+        status.near[0] = 0
         status.rounds[0] = 0
         constraints.count[0] = 0
         dividing.count[0] = 0
@@ -144,48 +149,69 @@ def _collect_contact(
     separation: wp.float64,
 ):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
-    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
+    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS):
+        return
+    near = int(contacts.status[i]) == FREE  # only
+    if near and not motion.distances.radius:
         return
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
-        if bodies_meet(motion, corners):
+        if not near and bodies_meet(motion, corners):
             if not crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
                 wp.atomic_add(progress.status.body_hits, 0, 1)
                 for j in range(4):
                     vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
+    least = wp.float64(0.0)
+    crossed = bool(False)
+    if motion.distances.radius:
+        start, kept = distances_at_start(motion, corners, contacts.kind)
+        least = kept
+        crossed = start <= wp.float64(0.0)
     may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
-    if may_cross and crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
-        wp.atomic_add(progress.status.crossed_hits, 0, 1)
+    if may_cross and not crossed and contacts.kind <= EDGE_EDGE:
+        crossed = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i])
+    if crossed:
+        wp.atomic_add(progress.status.crossed_hits, 0, wp.where(near, 0, 1))
         return
     world = motion.world[corners[0]]
-    count_contact(progress, world)
-    for j in range(4):
-        vertices.changed[corners[j]] = 1
     iteration = progress.status.iteration[0]
-    slow = is_slow(motion, corners, contacts.edges)
-    weights = contact_weights(contacts.edges, contacts.coordinates[i])
+    slow = is_slow(motion, corners, contacts.kind)
+    weights = contact_weights(contacts.kind, contacts.coordinates[i])
     normal = contacts.normal[i]
-    if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal)):
-        progress.fast[world] = 1
+    if not near:
+        count_contact(progress, world)
+        for j in range(4):
+            vertices.changed[corners[j]] = 1
+        if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal, least)):
+            progress.fast[world] = 1
     multiplier = wp.vec3d()
+    if near and is_dividing(progress, world, iteration):
+        return
     if is_dividing(progress, world, iteration):
         for j in range(4):
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, dividing, True)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, least, dividing, True)
         multiplier = TOUCH * normal
     else:
-        progress.status.projecting[0] = 1
+        if not near:
+            progress.status.projecting[0] = 1
         if iteration == 0 and contacts.edges == 1:
-            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, contacts.toi[i]):
+            time = wp.where(near, wp.float64(0.0), contacts.toi[i])
+            if are_hidden(motion, contacts.mesh, contacts.pairs[i], corners, normal, time):
                 return  # the next detection finds it, if it is still there
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     target = widened(separation, progress)
     if slow == 1:
-        target = feasible_in_contact(motion, corners, weights, normal, target, separation)
+        target = feasible_in_contact(motion, corners, weights, normal, target, separation, least)
     target += sagitta(motion, vertices, corners, MOST_SAGITTA * separation)
+    target += least
+    if near and wp.dot(normal, relative(weights, corners, vertices.x1)) < target:
+        progress.status.near[0] = 1
+        progress.status.projecting[0] = 1
+        progress.contact_iteration[world] = iteration
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     add_constraint(
         motion,
@@ -201,6 +227,7 @@ def _collect_contact(
         contacts.within_tolerance[i],
         contacts.toi[i],
         multiplier,
+        least,
     )
 
 
@@ -256,7 +283,8 @@ def divide_near_pairs(
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
     if not divides_all_near_pairs(progress) and longest_path(motion, corners) > _RESTING * separation:
         return
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, dividing, False)
+    least = least_distance(constraints, i)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):
@@ -300,6 +328,7 @@ def decide(
     overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and status.undetected[0] == 0:
         status.undetected[0] = 1
+        status.near[0] = 0
         status.hits[0] = 0
         status.crossed_hits[0] = 0
         status.body_hits[0] = 0
@@ -320,7 +349,9 @@ def decide(
     status.newly_frozen[0] = 0
     status.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
     status.undetected[0] = wp.where(overflowed, 1, 0)
-    status.active[0] = wp.where(hits == 0 or overflowed or stuck, 0, 1)
+    finished = hits == 0 and status.near[0] == 0
+    status.near[0] = 0
+    status.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
     status.iteration[0] = status.iteration[0] + status.active[0]
     status.rounds[0] = status.rounds[0] + status.active[0]
     status.unfinished[0] = wp.where(status.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)

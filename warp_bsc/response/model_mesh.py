@@ -6,12 +6,17 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
+from ..detection.approach_phase import MinDistances, make_min_distances
+from ..detection.distance_phase import checked_distance
 from ..detection.mesh import CollisionMesh
 
 __all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "vertex_position"]
 
 _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
+
+_STRAIGHT = 0.9
+"""Length of a spring, as a share of that of two others between its ends, from which it runs along them."""
 
 _BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
 """Options of a ``newton.Mesh`` whose triangles alone are used."""
@@ -69,7 +74,8 @@ class ModelMesh(CollisionMesh):
     vertices in each. Infinite planes have no triangles and are listed separately.
 
     Later changes of the model do not change the mesh, except for positions and inverse masses. Margins of shapes and
-    radii of particles are ignored.
+    radii of particles are ignored. Springs and particles without faces take part only where pairs keep distances, see
+    :meth:`keep_distances`.
 
     Attributes:
         model: The model.
@@ -81,13 +87,17 @@ class ModelMesh(CollisionMesh):
         device_planes: ``planes`` as Warp arrays.
         device_vertex_edges: The edges of each vertex, :class:`Incidence`.
         device_edge_faces: The faces of each edge, :class:`Incidence`.
+        distances: Minimum distances of pairs, None if pairs only must not touch.
     """
 
-    def __init__(self, model: Model):
+    def __init__(self, model: Model, *, strands: bool = False):
         """Tessellates the shapes and puts the mesh on the model's device.
 
         Args:
             model: The ``newton.Model``.
+            strands: Whether springs without faces take part as edges, and particles without springs as points. Only a
+                minimum distance keeps these apart from each other. A spring that runs along two others, against
+                bending, takes no part.
 
         Raises:
             NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
@@ -123,7 +133,9 @@ class ModelMesh(CollisionMesh):
                 vertex_count += len(shape_positions)
         world = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)])
         worlds = world if model.world_count > 1 else None
-        super().__init__(np.concatenate(faces), vertex_count, world=worlds, device=model.device)
+        faces = np.concatenate(faces)
+        edges, points = _strands(model, faces) if strands else (None, None)
+        super().__init__(faces, vertex_count, edges=edges, points=points, world=worlds, device=model.device)
 
         shapes = np.array(shapes, dtype=np.int32)
         planes = np.flatnonzero(collides & infinite).astype(np.int32)
@@ -143,6 +155,33 @@ class ModelMesh(CollisionMesh):
         self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
+        self.distances: MinDistances | None = None
+
+    def keep_distances(
+        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
+    ) -> None:
+        """Sets the minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
+
+        Args:
+            min_distance: Minimum distance of all pairs [m], at least 0.
+            radius: Radius of each particle [m], at least 0, shape [particle_count], or one for all; None for 0.
+            reach: How much farther apart than their distance near pairs are at most [m].
+
+        Raises:
+            ValueError: If the distance or the radii have another shape, or are not finite and at least 0.
+        """
+        distance = float(checked_distance(min_distance))
+        count = self.model.particle_count
+        radii = np.asarray(0.0 if radius is None else radius.numpy() if isinstance(radius, wp.array) else radius)
+        if radii.shape not in ((), (count,)):
+            raise ValueError(f"radius must be one number or {count}, one a particle, not of shape {radii.shape}")
+        if not (np.isfinite(radii) & (radii >= 0.0)).all():
+            raise ValueError("radii must be finite and at least 0")
+        every = np.full(self.vertex_count, 0.5 * distance)
+        every[:count] += radii
+        group = np.full(self.vertex_count, -1)
+        group[count:] = self.shape_vertices.body + 1
+        self.distances = make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
@@ -263,6 +302,35 @@ def _soft_faces(model):
     corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
     return np.concatenate([triangles, sides[first[count == 1]]])
+
+
+def _strands(model, faces):
+    """Returns the springs with an end that no face has, without those along two others, and particles without springs.
+
+    The inner particles of soft bodies are left out.
+    """
+    count = model.particle_count
+    bare = np.ones(count, dtype=bool)
+    bare[faces[faces < count]] = False
+    if model.tet_indices is not None:
+        bare[model.tet_indices.numpy()] = False
+    if not model.spring_count:
+        return None, np.flatnonzero(bare)
+    springs = model.spring_indices.numpy().reshape(-1, 2)
+    lengths = model.spring_rest_length.numpy()
+    taken = bare[springs].any(axis=1)
+    springs, lengths = springs[taken], lengths[taken]
+    neighbours = [{} for _ in range(count)]
+    for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True):
+        neighbours[a][b] = neighbours[b][a] = length
+
+    def is_chord(a, b, length):
+        between = neighbours[a].keys() & neighbours[b].keys()
+        return any(length >= _STRAIGHT * (neighbours[a][c] + neighbours[b][c]) for c in between)
+
+    kept = [not is_chord(a, b, length) for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True)]
+    bare[springs] = False
+    return springs[kept], np.flatnonzero(bare)
 
 
 def _tessellate(model, shape, shape_type, scale):

@@ -175,6 +175,8 @@ class ModelMotion:
         vertices.is_lost = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
+        if mesh.distances is not None:
+            vertices.distances = mesh.distances
         self.planes = planes = MovingPlanes()
         planes.friction, planes.world = friction.planes, mesh.device_planes.world
         planes.shape, planes.body = mesh.device_planes.shape, mesh.device_planes.body

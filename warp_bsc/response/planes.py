@@ -17,6 +17,7 @@ from .constraints import (
     feasible,
     inverse_mass_of,
     is_dividing,
+    is_on_body,
     to_double,
     update_first_contact,
     widened,
@@ -40,6 +41,8 @@ _MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
 _DEEPER = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
+_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
+"""Share of its distance at the start that a particle keeps."""
 _ZERO = wp.constant(wp.float64(0.0))
 
 _KERNEL = {"enable_backward": False}
@@ -95,11 +98,9 @@ def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
 @wp.func
 def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     """Returns whether a plane is to stop a vertex: not one of its own body, or of a shape that it passes."""
-    if not motion.bodies.of_vertex:
+    if not is_on_body(motion, vertex):
         return True
     body = motion.bodies.of_vertex[vertex]
-    if body < 0:
-        return True
     shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
     return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
 
@@ -108,13 +109,12 @@ def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
 def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float64:
     """Returns the distance from a plane that a vertex is kept at [m]: 0, or less for one of a body, see the module."""
     least = _ZERO
-    if motion.bodies.of_vertex:
-        if motion.bodies.of_vertex[vertex] >= 0:
-            before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-            least = wp.min(before, _ZERO)
-            if motion.bodies.responds == 0:
-                wanted, _error_wanted = signed_distance(planes.end[i], motion.x1[vertex])
-                least = wp.min(wanted, least)
+    if is_on_body(motion, vertex):
+        before, _error = signed_distance(planes.start[i], motion.x0[vertex])
+        least = wp.min(before, _ZERO)
+        if motion.bodies.responds == 0:
+            wanted, _error_wanted = signed_distance(planes.end[i], motion.x1[vertex])
+            least = wp.min(wanted, least)
     return least
 
 
@@ -122,18 +122,32 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
 def offset_from(
     motion: Motion, planes: MovingPlanes, i: int, vertex: int, progress: Progress, separation: wp.float64
 ) -> wp.float64:
-    """Returns the offset that constraints move a vertex to that a plane stops [m]."""
+    """Returns the offset that constraints move a vertex to that a plane stops, without a minimum distance [m]."""
     plane = planes.end[i]
     distance = widened(separation, progress)
-    if motion.bodies.of_vertex:
-        if motion.bodies.of_vertex[vertex] >= 0:
-            least = level(motion, planes, i, vertex)
-            if least < _ZERO:
-                distance = least
-            else:
-                before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-                distance = feasible(motion, wp.vec4i(vertex), distance, before, separation)
+    if is_on_body(motion, vertex):
+        least = level(motion, planes, i, vertex)
+        if least < _ZERO:
+            distance = least
+        else:
+            before, _error = signed_distance(planes.start[i], motion.x0[vertex])
+            distance = feasible(motion, wp.vec4i(vertex), distance, before, separation)
     return plane[3] + distance
+
+
+@wp.func
+def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int):
+    """Returns the distance that a vertex is kept at from a plane, and how much farther away it is near [m].
+
+    Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
+    """
+    if is_on_body(motion, vertex):
+        return level(motion, planes, i, vertex), _ZERO
+    if not motion.distances.radius:
+        return _ZERO, _ZERO
+    before, error = signed_distance(planes.start[i], motion.x0[vertex])
+    least = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
+    return wp.max(least, _ZERO), motion.distances.reach
 
 
 @wp.kernel(**_KERNEL)
@@ -160,12 +174,15 @@ def collect_penetrations(
         if planes.world[i] >= 0 and planes.world[i] != world:
             continue
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
-        if not (after <= error_after):  # nor where the plane is not finite
+        least, reach = _distances_from_plane(motion, planes, i, vertex)
+        if not (after <= least + wp.max(reach, error_after)):  # nor where the plane is not finite
+            continue
+        near = after > least + error_after  # only
+        if near and not ahead:
+            continue
+        if least < _ZERO and after >= least - _DEEPER * separation:
             continue
         if not _stops(motion, planes, i, vertex):
-            continue
-        least = level(motion, planes, i, vertex)
-        if least < _ZERO and after >= least - _DEEPER * separation:
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
         before -= least
@@ -175,7 +192,7 @@ def collect_penetrations(
                 wp.atomic_add(progress.status.crossed_hits, 0, 1)
             continue
         if ahead:
-            wp.atomic_add(progress.status.first_hits, 0, 1)
+            wp.atomic_add(progress.status.first_hits, 0, wp.where(near, 0, 1))
         else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
@@ -190,7 +207,7 @@ def collect_penetrations(
             offset = plane[3] + least + wp.min(wp.float64(2.0) * error_after, margin)
             if least < _ZERO:
                 offset = plane[3] + least - _DEEPER * separation
-            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, offset, margin)
+            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, offset, margin, _ZERO)
             multiplier = TOUCH * normal
         else:
             progress.status.projecting[0] = 1
@@ -201,13 +218,14 @@ def collect_penetrations(
             wp.vec4i(vertex),
             wp.vec4d(wp.float64(1.0), _ZERO, _ZERO, _ZERO),
             normal,
-            offset_from(motion, planes, i, vertex, progress, separation),
+            offset_from(motion, planes, i, vertex, progress, separation) + wp.max(least, _ZERO),
             contact_friction(motion.friction[vertex], planes.friction[i]),
             1,
             PLANE_CONTACT,
             True,
             _ZERO,
             multiplier,
+            wp.max(least, _ZERO),
         )
         if place < constraints.plane.shape[0]:
             constraints.plane[place] = i

@@ -12,6 +12,7 @@ from .constraints import (
     gap,
     is_dividing,
     is_projecting,
+    least_distance,
     relative,
     to_double,
     to_single,
@@ -278,14 +279,15 @@ def activate_position_constraints(
     world = motion.world[constraints.vertices[i][0]]
     if constraints.kind[i] == EDGE_EDGE_PROXIMITY and is_dividing(progress, world, progress.status.iteration[0]):
         start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
-        if wp.dot(constraints.normal[i], start) >= _NEAR * constraints.separation[i]:
+        least = least_distance(constraints, i)
+        if wp.dot(constraints.normal[i], start) - least >= _NEAR * (constraints.separation[i] - least):
             return
     past = progress.sweep.number[0] >= _max_sweeps(motion, constraints, progress, i, progress.slow_position_sweeps)
     if past or not is_projecting(progress, world):
         return
     distance = gap(vertices, constraints, i)
     if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
-        tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * constraints.separation[i])
+        tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * (constraints.separation[i] - least_distance(constraints, i)))
     tolerance = _tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
     if not active and is_reversible(constraints, progress, i):
@@ -435,7 +437,7 @@ def activate_velocity_constraints(
     if wp.length_sq(multiplier) == _ZERO:
         if not has_pushed(constraints, i):
             return
-        if gap(vertices, constraints, i) > constraints.separation[i]:
+        if gap(vertices, constraints, i) > constraints.separation[i] - least_distance(constraints, i):
             return
     tolerance = _tolerance_of(motion, constraints, i, tolerance) / dt
     normal = constraints.normal[i]

@@ -13,6 +13,7 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     add_constraint,
     contact_friction,
+    distances_at_start,
     feasible,
     has_overflowed,
     is_projecting,
@@ -156,8 +157,12 @@ def _collect_proximity(
     weights, normal, distance = _weights_across(motion, corners, near.edges)
     if distance == _ZERO:
         return
+    least = _ZERO
+    if motion.distances.radius:
+        _start, kept = distances_at_start(motion, corners, near.edges)
+        least = kept
     path = longest_path(motion, corners)
-    if distance > wp.max(path, _REACH * separation):
+    if distance - least > wp.max(path, _REACH * separation):
         return
     if not is_movable(motion, corners) or not is_projecting(progress, motion.world[corners[0]]):
         return
@@ -168,7 +173,7 @@ def _collect_proximity(
     if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    target = feasible(motion, corners, separation, distance, separation)
+    target = least + feasible(motion, corners, separation, distance - least, separation)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     add_constraint(
         motion,
@@ -184,6 +189,7 @@ def _collect_proximity(
         True,
         _ZERO,
         wp.vec3d(),
+        least,
     )
 
 

@@ -11,21 +11,26 @@ from ..detection.broad_phase_hierarchy import (
     overlapping_vertices,
     traversal_kernel,
 )
+from ..detection.distance_phase import distance_of_corners
 from ..detection.settings import TOLERANCE
+from ..kernels.ccd import impact_at_distance
 from ..kernels.classification import classify
-from ..kernels.motion import relative_motion
+from ..kernels.min_distance import clears_at_once
+from ..kernels.motion import motion_and_distance, relative_motion
 from ..kernels.pipeline.hierarchy import lowest_place
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
-from .constraints import NO_CONSTRAINT, count_contact, update_first_contact
+from .constraints import NO_CONSTRAINT, count_contact, distances_at_start, update_first_contact
 from .dividing_planes import DividingPlanes, add_dividing_plane
 from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable
 
 __all__ = ["find_contacts_without_queues"]
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
+_POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
+"""The pair of a point and another cell, behind those of :func:`_pairs_of_faces`."""
 
 
 @wp.struct
@@ -47,8 +52,67 @@ def _next(corner: int) -> int:
 
 
 @wp.func
-def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+def _resolve(
+    arguments: _Arguments,
+    kind: int,
+    corners: wp.vec4i,
+    movable: bool,
+    crossed: bool,
+    toi: wp.float64,
+    least: wp.float64,
+):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
+    motion = arguments.motion
+    if crossed:
+        wp.atomic_add(arguments.progress.status.crossed_hits, 0, wp.where(movable, 1, 0))
+        return
+    if not movable:
+        wp.atomic_add(arguments.progress.status.body_hits, 0, 1)
+        for j in range(4):
+            arguments.vertices.changed[corners[j]] = 1
+        return
+    count_contact(arguments.progress, motion.world[corners[0]])
+    edges = wp.where(kind == EDGE_EDGE, 1, 0)
+    separation = arguments.separation
+    add_dividing_plane(motion, arguments.vertices, corners, edges, separation, least, arguments.dividing, True)
+    for j in range(4):
+        arguments.vertices.changed[corners[j]] = 1
+        update_first_contact(arguments.vertices, corners[j], toi, NO_CONSTRAINT, 0)
+
+
+@wp.func
+def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+    """Resolves a pair if it comes nearer than it may."""
+    motion = arguments.motion
+    movable = is_movable(motion, corners)
+    if not movable and not bodies_meet(motion, corners):
+        return
+    a0 = motion.x0[corners[0]]
+    b0 = motion.x0[corners[1]]
+    c0 = motion.x0[corners[2]]
+    d0 = motion.x0[corners[3]]
+    a1 = arguments.vertices.x1[corners[0]]
+    b1 = arguments.vertices.x1[corners[1]]
+    c1 = arguments.vertices.x1[corners[2]]
+    d1 = arguments.vertices.x1[corners[3]]
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    most = distance_of_corners(kind, corners, motion.distances.radius)
+    relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
+    if clears_at_once(relative, scaled):
+        return
+    start, least = distances_at_start(motion, corners, kind)
+    result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, least, ROUNDOFF, True, _TOLERANCE)
+    if result.status == FREE:
+        return
+    crossed = start <= wp.float64(0.0)
+    if not crossed and kind <= EDGE_EDGE:
+        crossed = crossed_at_start(motion, arguments.mesh, wp.where(kind == EDGE_EDGE, 1, 0), pair, result.toi)
+    _resolve(arguments, kind, corners, movable, crossed, result.toi, least)
+
+
+@wp.func
+def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+    """Resolves a pair if it is in contact."""
     motion = arguments.motion
     movable = is_movable(motion, corners)
     if not movable and not bodies_meet(motion, corners):
@@ -77,65 +141,91 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
     if result.status == FREE:
         return
     edges = wp.where(kind == EDGE_EDGE, 1, 0)
-    if crossed_at_start(motion, arguments.mesh, edges, pair, result.toi):
-        wp.atomic_add(arguments.progress.status.crossed_hits, 0, wp.where(movable, 1, 0))
-        return
-    if not movable:
-        wp.atomic_add(arguments.progress.status.body_hits, 0, 1)
-        for j in range(4):
-            arguments.vertices.changed[corners[j]] = 1
-        return
-    count_contact(arguments.progress, motion.world[corners[0]])
-    add_dividing_plane(motion, arguments.vertices, corners, edges, arguments.separation, arguments.dividing, True)
-    for j in range(4):
-        arguments.vertices.changed[corners[j]] = 1
-        update_first_contact(arguments.vertices, corners[j], result.toi, NO_CONSTRAINT, 0)
+    crossed = crossed_at_start(motion, arguments.mesh, edges, pair, result.toi)
+    _resolve(arguments, kind, corners, movable, crossed, result.toi, wp.float64(0.0))
 
 
 @wp.func
-def _decide_faces(arguments: _Arguments, place: int, other: int):
-    """Decides all pairs of elements that two faces represent."""
-    mesh = arguments.faces
+def _pairs_of_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
+    """Returns the pairs of elements that two faces represent and whose boxes overlap, as bits."""
     left = overlapping_vertices(mesh, place, other, False) >> 3
     left = left | ((overlapping_vertices(mesh, other, place, False) >> 3) << 3)
-    left = left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
-    while left != 0:  # one body for all, which is large
-        bit = lowest_place(wp.uint32(left))
-        left = left & (left - 1)
-        kind = VERTEX_FACE
-        pair = wp.vec2i()
-        corners = wp.vec4i()
-        if bit < 6:
-            of = wp.where(bit < 3, place, other)
-            face = wp.where(bit < 3, other, place)
-            vertex = mesh.faces[of, bit % 3]
-            pair = wp.vec2i(vertex, mesh.order[face])
-            corners = wp.vec4i(vertex, mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
-        else:
-            kind = EDGE_EDGE
-            side = (bit - 6) / 3
-            other_side = (bit - 6) % 3
-            pair = wp.vec2i(mesh.face_edges[place, side], mesh.face_edges[other, other_side])
-            corners = wp.vec4i(
-                mesh.faces[place, side],
-                mesh.faces[place, _next(side)],
-                mesh.faces[other, other_side],
-                mesh.faces[other, _next(other_side)],
-            )
-        _decide_pair(arguments, kind, pair, corners)
+    return left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
+
+
+@wp.func
+def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
+    """Returns kind, elements and vertices of one of the pairs of :func:`_pairs_of_faces`."""
+    if bit < 6:
+        of = wp.where(bit < 3, place, other)
+        face = wp.where(bit < 3, other, place)
+        vertex = mesh.faces[of, bit % 3]
+        corners = wp.vec4i(vertex, mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
+        return VERTEX_FACE, wp.vec2i(vertex, mesh.order[face]), corners
+    side = (bit - 6) / 3
+    other_side = (bit - 6) % 3
+    corners = wp.vec4i(
+        mesh.faces[place, side],
+        mesh.faces[place, _next(side)],
+        mesh.faces[other, other_side],
+        mesh.faces[other, _next(other_side)],
+    )
+    return EDGE_EDGE, wp.vec2i(mesh.face_edges[place, side], mesh.face_edges[other, other_side]), corners
 
 
 @wp.func
 def _visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
+    mesh = arguments.faces
     while found != wp.uint32(0):
-        _decide_faces(arguments, place, first + lowest_place(found))
+        other = first + lowest_place(found)
         found = found & (found - wp.uint32(1))
+        left = _pairs_of_faces(mesh, place, other)
+        while left != 0:  # one body for all, which is large
+            kind, pair, corners = _pair_of_bit(mesh, place, other, lowest_place(wp.uint32(left)))
+            left = left & (left - 1)
+            _decide_pair(arguments, kind, pair, corners)
+
+
+@wp.func
+def _point_pair(mesh: FaceHierarchy, point: int, other: int):
+    """Returns kind, elements and vertices of a pair of a point and another cell, at two places; kind -1 if none."""
+    p = mesh.faces[point, 0]
+    q = mesh.faces[other, 0]
+    if mesh.order[other] >= mesh.point_start:
+        return VERTEX_VERTEX, wp.vec2i(p, q), wp.vec4i(p, q, q, q)
+    if mesh.order[other] >= mesh.face_count:
+        return VERTEX_EDGE, wp.vec2i(p, mesh.face_edges[other, 0]), wp.vec4i(p, q, mesh.faces[other, 1], q)
+    return -1, wp.vec2i(), wp.vec4i()
+
+
+@wp.func
+def _visit_at_distances(place: int, first: int, found: wp.uint32, arguments: _Arguments):
+    mesh = arguments.faces
+    while found != wp.uint32(0):
+        other = first + lowest_place(found)
+        found = found & (found - wp.uint32(1))
+        left = _pairs_of_faces(mesh, place, other)
+        point = int(-1)
+        if mesh.order[place] >= mesh.point_start:
+            point = place
+        elif mesh.order[other] >= mesh.point_start:
+            point = other
+        if point >= 0 and place != other:
+            left = left | _POINTS
+        while left != 0:
+            bit = lowest_place(wp.uint32(left))
+            left = left & (left - 1)
+            kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
+            if bit == _POINT_BIT:
+                kind, pair, corners = _point_pair(mesh, point, place + other - point)
+            if kind >= 0:
+                _decide_distance(arguments, kind, pair, corners)
 
 
 @functools.cache
-def _kernel() -> wp.Kernel:
+def _kernel(keep_distances: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
-    return traversal_kernel(_visit, _Arguments)
+    return traversal_kernel(_visit_at_distances if keep_distances else _visit, _Arguments)
 
 
 def find_contacts_without_queues(
@@ -165,4 +255,4 @@ def find_contacts_without_queues(
     arguments.faces, arguments.mesh, arguments.motion = broad_phase.hierarchy, mesh, motion
     arguments.vertices, arguments.dividing, arguments.progress = vertices, dividing, progress
     arguments.separation = wp.float64(separation)
-    broad_phase.traverse(_kernel(), arguments)
+    broad_phase.traverse(_kernel(bool(motion.distances.radius)), arguments)

@@ -61,6 +61,8 @@ class SolverReport:
     def certified(self) -> bool:
         """Whether a complete detection found the motion of the last step, as stored, to be free of collisions.
 
+        With minimum distances, a collision is a pair that comes nearer than it may, here and in what follows.
+
         Contacts that :attr:`excluded` counts, and contacts of which no vertex can be moved, are not part of this. A
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.
@@ -135,8 +137,8 @@ class SolverReport:
         invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
         if not self._responds:
             invalid |= self._motion.vertices.is_lost.numpy() != 0
-        faces = self._mesh.faces
-        listed[faces[invalid[faces].any(axis=1)]] = True
+        for elements in (self._mesh.faces, self._mesh.edges):
+            listed[elements[invalid[elements].any(axis=1)]] = True
         return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
 
     @property

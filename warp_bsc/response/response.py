@@ -117,6 +117,10 @@ class Response:
     Bodies that can be moved are projected with the particles, each by its pose, see :mod:`.bodies`. One whose vertices
     are to be divided or frozen goes back along its path as one, and collides with what is left in the next iteration.
 
+    Where the mesh has minimum distances, see :meth:`.model_mesh.ModelMesh.keep_distances`, a contact is a pair that
+    comes nearer than it may. The first detection also adds constraints for pairs that come within the separation of
+    that: the distance by which these are moved apart goes to zero where a pair only just comes near.
+
     If the response is differentiable, paths are truncated before their first contact instead of divided, and a
     detection whose queues are too small freezes all vertices, uncertified.
 
@@ -152,7 +156,9 @@ class Response:
             moves_bodies: Whether motions have bodies that can be moved.
         """
         self.device = device = mesh.device
-        self.detector = DetectionPipeline(mesh, pairs_per_face=None if device.is_cpu else _PAIRS_PER_FACE)
+        self._keeps_distances = mesh.distances is not None
+        pairs_per_face = None if device.is_cpu else _PAIRS_PER_FACE
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=mesh.distances)
         self.separation, self.restitution = separation, restitution
         self._tolerance = 0.0 if differentiable else _TOLERANCE * separation
         self._differentiable = differentiable
@@ -186,7 +192,9 @@ class Response:
         self._most_penetrations = self._stopped * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
         self._crossing_candidates = CrossingCandidates(mesh)
-        self._dividing_planes = allocate_dividing_planes(mesh.vertex_count, _DIVIDING_PLANES * self._movable, device)
+        self._dividing_planes = allocate_dividing_planes(
+            mesh.vertex_count, _DIVIDING_PLANES * self._movable, device, keep_distances=self._keeps_distances
+        )
         self._dividing = DividingPlanes() if differentiable else self._dividing_planes
         progress.max_slow_iterations = MAX_ITERATIONS if differentiable else MAX_SLOW_ITERATIONS
         progress.slow_position_sweeps = int(MAX_SWEEPS) if differentiable else SLOW_POSITION_SWEEPS
@@ -346,7 +354,7 @@ class Response:
 
         def collect() -> None:
             kinds = []
-            for narrow_phase, elements in self._with_elements():
+            for narrow_phase, elements in self._with_elements()[:2]:
                 near = Proximities()
                 kinds.append(near)
                 near.mesh = self._connectivity
@@ -376,7 +384,7 @@ class Response:
             self.launch_over_constraints(activate_position_constraints, [*inputs, *options])
         inputs.append(self._record)
         self._launch_over(project_positions, [(constraints.active_set, constraints.active_count, 0)], inputs)
-        self._launch_over_particles(update_positions, [*inputs, last])
+        self._launch_over_particles(update_positions, [*inputs, last], finishes=True)
         self._launch_over_bodies(move_bodies, last)
         self._launch_over_shape_vertices(place_vertices)
 
@@ -393,7 +401,7 @@ class Response:
 
     def _update_velocities(self, last=True):
         inputs = [self._motion.vertices, self.vertices, self.constraints, self.progress, self._record, last]
-        self._launch_over_particles(update_velocities, inputs)
+        self._launch_over_particles(update_velocities, inputs, finishes=True)
         self._launch_over_bodies(change_body_velocities, last)
         self._launch_over_shape_vertices(set_vertex_velocities)
 
@@ -443,7 +451,7 @@ class Response:
             inputs = [motion, vertices, self.constraints, dividing, self.progress, self.separation]
             self.launch_over_constraints(divide_near_pairs, inputs)
         inputs = [motion, vertices, self.progress, self._record, dividing]
-        inputs += [*self._contacts(), dt]
+        inputs += [*self._contacts()[0], dt]
         self._launch_over_particles(truncate_vertices, inputs)
         self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing, self._record)
         if self._recorder is not None:
@@ -467,12 +475,14 @@ class Response:
             vertices.changed.zero_()
             inputs = [self.constraints, self._record, self._most_contacts]
             wp.launch(drop_if_full, 1, inputs=inputs, device=self.device)
-        contacts = list(self._contacts())
-        queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
-        inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
-        self._launch_over(collect_contacts, queues, [*inputs, *self._fill_of_queues()])
+        of_elements, of_points = self._contacts()
+        for contacts in (of_elements, of_points) if of_points else (of_elements,):
+            queues = [(c.pairs, c.counts, Count.CONTACTS) for c in contacts]
+            inputs = [motion, vertices, *contacts, self.constraints, self._dividing, progress, self.separation]
+            self._launch_over(collect_contacts, queues, [*inputs, *self._fill_of_queues()])
         if self._recorder is not None:
-            self._launch_over(count_grazing, queues, [motion, vertices, *contacts, self._record])
+            queues = [(c.pairs, c.counts, Count.CONTACTS) for c in of_elements]
+            self._launch_over(count_grazing, queues, [motion, vertices, *of_elements, self._record])
         if self._most_penetrations:
             self._collect_penetrations(ahead=False)
         self._decide()
@@ -505,24 +515,28 @@ class Response:
         self._decide()
 
     def _contacts(self):
-        """Yields the contacts that the last detection found, vertex-face and edge-edge."""
-        for narrow_phase, elements in self._with_elements():
-            found = narrow_phase.contacts
-            contacts = Contacts()
-            contacts.mesh = self._connectivity
-            contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
-            contacts.elements, contacts.counts = elements, narrow_phase.counts
-            contacts.pairs, contacts.status, contacts.within_tolerance = (
-                found.pairs,
-                found.status,
-                found.within_tolerance,
-            )
-            contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
-            yield contacts
+        """Returns the contacts that the last detection found: vertex-face and edge-edge, and those of points."""
+        contacts = [self._contacts_of(*phase) for phase in self._with_elements()]
+        return contacts[:2], contacts[2:]
+
+    def _contacts_of(self, narrow_phase, elements):
+        found = narrow_phase.contacts
+        contacts = Contacts()
+        contacts.mesh = self._connectivity
+        contacts.kind = int(narrow_phase.kind)
+        contacts.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
+        contacts.elements, contacts.counts = elements, narrow_phase.counts
+        contacts.pairs, contacts.status, contacts.within_tolerance = (
+            found.pairs,
+            found.status,
+            found.within_tolerance,
+        )
+        contacts.toi, contacts.coordinates, contacts.normal = found.toi, found.coordinates, found.normal
+        return contacts
 
     def _with_elements(self):
-        """Returns each narrow phase with the vertices of its second elements."""
-        return ((n, self.detector.mesh.device_elements(n.kind)) for n in self.detector.narrow_phases)
+        """Returns each narrow phase with the vertices of its second elements, those of points last."""
+        return [(n, self.detector.mesh.device_elements(n.kind)) for n in self.detector.narrow_phases]
 
     @property
     def _most_contacts(self):
@@ -536,7 +550,8 @@ class Response:
             return
         filled = int(old.count.numpy()[0])
         if len(old.vertices) < filled + needed:
-            self.constraints = new = allocate_constraints(filled + _ITERATIONS_RESERVED * needed, self.device)
+            capacity = filled + _ITERATIONS_RESERVED * needed
+            self.constraints = new = allocate_constraints(capacity, self.device, keep_distances=self._keeps_distances)
             for name in Constraints.vars if filled else ():
                 array = getattr(old, name)
                 wp.copy(getattr(new, name), array, count=min(filled, len(array)))
@@ -573,8 +588,9 @@ class Response:
         """Launches a kernel over the constraints, see :meth:`_launch_over`."""
         self._launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
 
-    def _launch_over_particles(self, kernel, inputs):
-        wp.launch(kernel, self._movable, inputs=inputs, device=self.device)
+    def _launch_over_particles(self, kernel, inputs, finishes=False):
+        """Launches a kernel over the particles; one that finishes a sweep runs even if there are none."""
+        wp.launch(kernel, max(self._movable, int(finishes)), inputs=inputs, device=self.device)
 
     def _launch_over_bodies(self, kernel, *options):
         if self._bodies:

@@ -138,6 +138,11 @@ class _Arrays(NamedTuple):
     body_qd: wp.array | None
 
 
+def _numpy(values):
+    """Returns a number or an array as a NumPy array."""
+    return values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+
+
 def _arrays(state):
     return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
 
@@ -173,6 +178,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     times the separation; the arcs themselves are not certified. A body whose wanted pose or velocity is not finite is
     left to the inner solver, and the step is not certified.
 
+    With ``min_distance`` or ``radius`` the certificate is of distances: no pair that started farther apart comes within
+    its minimum distance, and none that started nearer comes nearer than it was, beyond the rounding of 2^-30 of that.
+    Elements that touch at the start are set aside, and elements that an edge of the mesh joins only do not touch.
+
     With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
     tape then records what the inner solver records.
 
@@ -200,6 +209,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         restitution: float | wp.array[float] | None = None,
         coupling: int | Literal["auto"] | None = None,
         bodies: bool | None = None,
+        min_distance: float | None = None,
+        radius: float | np.ndarray | wp.array | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -228,13 +239,21 @@ class SolverCCD(SolverBase, CouplingHooks):
                 an infinite plane that it collides with, nor deeper than it was or is wanted to be; with True, no motion
                 does. Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies
                 that are all kinematic at construction stay so.
+            min_distance: Distance that pairs keep [m], vertices from faces and edges from edges, and particles from
+                infinite planes: a pair that started farther apart stays so, and one that started nearer does not come
+                nearer. Neighbours, elements that an edge of the mesh joins, only do not touch. The stage moves pairs
+                apart to this distance and ``separation``. Springs and particles that no face has take part. None or 0:
+                pairs do not touch.
+            radius: Radius of each particle [m], shape [particle_count], or one for all, such as
+                ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
+                a face is the largest one of its vertices, that of a shape 0.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
                 ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
                 velocity; separation, friction, restitution, coupling and bodies then have no meaning, and must not be
-                given.
+                given. With a minimum distance, it counts the pairs that come nearer than they may.
 
         Raises:
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
@@ -265,11 +284,14 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"coupling takes at least 2 substeps, or 'auto', not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
-        self.mesh = mesh = ModelMesh(model)
+        keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
+        self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
         elif not 0.0 < separation < np.inf:
             raise ValueError(f"separation must be more than 0, not {separation!r}")
+        if keeps_distances:
+            mesh.keep_distances(min_distance or 0.0, radius, reach=separation if respond else 0.0)
         self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(
             mesh, self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
@@ -344,7 +366,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._response.status.recount.fill_(1)
 
     def _median_edge(self):
-        """Returns the median edge length of cloth and soft bodies at rest [m]; 1 if they have no edges."""
+        """Returns the median edge length of cloth, soft bodies and ropes at rest [m]; 1 if they have no edges."""
         particle_q = self.model.particle_q
         rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
         edges = self.mesh.edges[self.mesh.edges[:, 1] < self.model.particle_count]
@@ -374,6 +396,7 @@ class SolverCCD(SolverBase, CouplingHooks):
 
         Raises:
             ValueError: If a tape records gradients of the response, and both states are the same.
+            NotImplementedError: If a tape records gradients of a response that keeps a minimum distance.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
             NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
                 memory, such as ``SolverXPBD``.
@@ -381,6 +404,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
+            if self.respond and tape is not None and self.model.requires_grad and self.mesh.distances is not None:
+                raise NotImplementedError("steps that keep a distance carry no gradients: omit min_distance and radius")
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:

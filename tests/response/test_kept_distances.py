@@ -1,0 +1,340 @@
+"""A stage with a minimum distance: exact queries say of each step, as stored, what came nearer than it may."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import DT, SOLVERS, Changed, Rollout, add_patch, add_plates, place_plates
+from test_queueless import stage
+
+import warp_bsc as bsc
+from warp_bsc.detection.distance_phase import pair_distances
+from warp_bsc.detection.settings import DistanceKind
+
+SHRUNK = 1.0 - 2.0**-28
+"""What is left at least of the distance of a pair that started nearer than it is to keep."""
+
+
+class DistanceRollout(Rollout):
+    """Steps a stage, and counts the pairs that came nearer than they may.
+
+    Attributes:
+        approaches: Number of these so far.
+        near: Pairs so far that came within their minimum distance, all of which started there.
+    """
+
+    def __init__(self, model, solver, distance=0.0, radius=0.0):
+        super().__init__(model, solver)
+        self.mesh = solver.mesh
+        radii = np.zeros(self.mesh.vertex_count)
+        radii[: model.particle_count] = radius
+        self.radius = radii + 0.5 * distance
+        mesh = bsc.CollisionMesh(
+            self.mesh.faces,
+            self.mesh.vertex_count,
+            edges=self.mesh.edges[self.mesh.free_edges],
+            points=self.mesh.points,
+            radius=self.radius,
+            world=self.mesh.world,
+            device=model.device,
+        )
+        self.distances = bsc.CollisionDetector(mesh, method="exact")
+        self.approaches = self.near = 0
+
+    def step(self, dt=DT, contacts=None):
+        super().step(dt, contacts)
+        movable = self.mesh.inverse_masses.numpy() > 0.0
+        before, after = self.start, self.vertices(self.states[0])
+        found = self.distances.detect(before, after)
+        at_rest = self.distances.find_proximities(before, 2.0 * self.radius.max())
+        pairs_at_rest = [getattr(at_rest, kind.label) for kind in DistanceKind]
+        starts = np.split(at_rest.distance, np.cumsum([len(pairs) for pairs in pairs_at_rest])[:-1])
+        for kind, near, starts_of_kind in zip(DistanceKind, pairs_at_rest, starts, strict=True):
+            pairs = getattr(found, kind.label)
+            elements = self.mesh.faces if kind == DistanceKind.VERTEX_FACE else self.mesh.edges
+            corners, distance = pair_distances(kind, elements, pairs, self.radius)
+            known = dict(zip(map(tuple, near.tolist()), starts_of_kind, strict=True))
+            start = np.array([known.get(tuple(pair), np.inf) for pair in pairs.tolist()])
+            own = movable[corners].any(axis=1)
+            self.near += np.count_nonzero(own)
+            self.approaches += np.count_nonzero(start[own] > distance[own])  # farther at the start, but not in the step
+            points = np.concatenate([before[corners[own]], after[corners[own]]], axis=1)
+            query = getattr(bsc, f"query_{kind.label}")
+            allowed = np.minimum(distance, SHRUNK * np.minimum(start, distance))[own]
+            if len(points):
+                self.approaches += np.count_nonzero(query(points, min_distance=allowed).hit)
+
+
+def add_rope(builder, points, *, mass=0.002, velocity=(0.0, 0.0, 0.0), stiffness=1e3):
+    """Particles at some positions, and springs from each to the next."""
+    first = builder.particle_count
+    for point in np.asarray(points, dtype=float).tolist():
+        builder.add_particle(wp.vec3(*point), wp.vec3(*velocity), mass, radius=0.004)
+    for i in range(first, builder.particle_count - 1):
+        builder.add_spring(i, i + 1, stiffness, 0.01, 0.0)
+
+
+def strands(device, worlds=1):
+    """Two ropes and loose particles that fall onto each other, and onto a patch that is held at its border."""
+    world = newton.ModelBuilder()
+    add_patch(world, 5, 0.04, (0.0, 0.0, 0.0), fixed=True)
+    along = np.linspace(-0.09, 0.09, 10)
+    add_rope(world, np.stack([along, 0.01 + 0.1 * along, 0.02 + 0.0 * along], axis=1), velocity=(0.0, 0.0, -1.5))
+    add_rope(world, np.stack([0.1 * along, along, 0.04 + 0.0 * along], axis=1), velocity=(0.0, 0.0, -3.0))
+    for i, height in enumerate((0.055, 0.07, 0.085)):
+        at = wp.vec3(0.001 * i, 0.012 - 0.001 * i, height)
+        world.add_particle(at, wp.vec3(0.0, 0.0, -4.0 - i), 0.002, radius=0.004)
+    builder = world
+    if worlds > 1:
+        builder = newton.ModelBuilder()
+        builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def bullet(speed, device):
+    """A patch shot at a smaller sheet that is held at its border."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    add_patch(builder, 5, 0.03, (0.011, 0.017, 0.08), velocity=(0.4, 0.0, -speed))
+    builder.color()
+    return builder.finalize(device=device)
+
+
+@pytest.mark.parametrize("iterations", [0, 40])
+@pytest.mark.parametrize("speed", [5.0, 60.0])
+def test_a_bullet(speed, iterations, device):
+    """It stops at the distance, by projection, and by planes alone."""
+    model, distance = bullet(speed, device), 0.012
+    rollout = DistanceRollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), min_distance=distance), distance)
+    rollout.solver._response.max_iterations = iterations
+    hits = 0
+    for _ in range(8 if speed < 50.0 else 4):
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+    assert hits > 20 and rollout.near == rollout.approaches == rollout.collisions == 0
+    assert rollout.solver.report.frozen_steps == 0
+
+
+def test_ropes_and_points(device):
+    """They keep the sum of their radii from each other and from cloth, by springs and particles without faces."""
+    model = strands(device)
+    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=2), radius=model.particle_radius, friction=0.3)
+    assert len(solver.mesh.free_edges) == 18 and len(solver.mesh.points) == 3
+    rollout = DistanceRollout(model, solver, radius=model.particle_radius.numpy())
+    hits = 0
+    for _ in range(12):
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+    assert hits > 40 and rollout.near == rollout.approaches == 0
+
+
+def test_without_queues(device, monkeypatch):
+    """Where queues of a graph are too small, the search without them keeps the distances of all kinds of pairs."""
+    model = strands(device)
+    radius = model.particle_radius.numpy()
+    rollout = DistanceRollout(model, stage(model, monkeypatch, tiny=True, inner="xpbd", radius=radius), radius=radius)
+    hits = 0
+    for _ in range(8):
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified and not rollout.solver.report.undetected
+    assert hits > 20 and rollout.near == rollout.approaches == 0
+
+
+def test_worlds(device):
+    """Two worlds in one place move like one world alone, bit for bit."""
+    ends = []
+    for worlds in (1, 2):
+        model = strands(device, worlds)
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model), radius=0.004))  # XPBD knows no worlds of particles
+        for _ in range(6):
+            rollout.step()
+            assert rollout.solver.report.certified
+        assert rollout.solver.report.hits > 0
+        ends.append(rollout.positions)
+    np.testing.assert_array_equal(ends[1], np.concatenate([ends[0]] * 2))
+
+
+def test_what_starts_nearer_moves_apart(device):
+    """Sheets at 0.7 of the distance that are pushed together come no nearer, and end up farther apart."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    distance = 0.012
+    add_patch(builder, 4, 0.04, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.4))
+    add_patch(builder, 4, 0.04, (0.013, 0.007, 0.7 * distance), velocity=(0.0, 0.0, -0.4))
+    builder.color()
+    model = builder.finalize(device=device)
+
+    def push(state):
+        velocity = np.repeat([[0.0, 0.0, 0.4], [0.0, 0.0, -0.4]], 25, axis=0)
+        state.particle_qd.assign(velocity.astype(np.float32))
+
+    rollout = DistanceRollout(model, bsc.SolverCCD(Changed(model, push), min_distance=distance), distance)
+    counts = []
+    for _ in range(40):
+        before = rollout.near
+        rollout.step()
+        assert rollout.solver.report.certified
+        counts.append(rollout.near - before)
+    assert counts[0] > 100 and counts[-1] == 0 and rollout.approaches == 0
+
+
+def test_infinite_planes(device):
+    """Cloth stops at the distance above one; what starts nearer comes no nearer."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    add_patch(builder, 3, 0.04, (0.0, 0.0, 0.03), velocity=(0.0, 0.0, -2.0))
+    add_patch(builder, 3, 0.04, (0.5, 0.0, 0.004), velocity=(0.0, 0.0, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), min_distance=0.01))
+    for _ in range(8):
+        rollout.step()
+        assert rollout.solver.report.certified
+        heights = rollout.positions[:, 2].reshape(2, 16)
+        assert heights[0].min() > 0.01 and heights[1].min() >= 0.004
+    assert heights[0].max() < 0.02
+
+
+@pytest.mark.parametrize("options", [{}, {"coupling": 3}])
+def test_plates_bodies_and_coupled_steps(options, device):
+    """Kinematic plates that close on cloth, and a box that falls onto a sheet, keep the distance as shapes."""
+    distance = 0.006
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.04)
+    body = builder.add_body(xform=wp.transform(wp.vec3(0.6, 0.0, 0.05), wp.quat_identity()))
+    builder.add_shape_box(body, hx=0.03, hy=0.03, hz=0.03)
+    builder.joint_qd[-4] = -2.0
+    add_patch(builder, 5, 0.04, (0.61, 0.01, 0.0), fixed=True)
+    builder.color()
+    model = builder.finalize(device=device)
+    velocity = model.body_qd.numpy()
+    velocity[2, :3] = (0.0, 0.0, -2.0)
+    model.body_qd.assign(velocity)
+
+    class Falling(Changed):
+        def step(self, state_in, state_out, control, contacts, dt):
+            poses, twists = state_in.body_q.numpy(), state_in.body_qd.numpy()
+            super().step(state_in, state_out, control, contacts, dt)
+            poses[2, :3] += dt * twists[2, :3]
+            state_out.body_q.assign(poses)
+            state_out.body_qd.assign(twists)
+            place_plates(state_out, gap)
+
+    rollout = DistanceRollout(
+        model, bsc.SolverCCD(Falling(model), min_distance=distance, bodies=None, **options), distance
+    )
+    hits = 0
+    for step in range(6):
+        gap = max(0.022, 0.04 - 0.004 * step)
+        rollout.step()
+        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified
+    assert hits > 20 and rollout.approaches == 0
+
+
+def test_what_touches_at_the_start_is_set_aside(device):
+    """A rope through another one is left to the inner solver, and the steps are certified without this pair."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_rope(builder, [[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], velocity=(0.0, 0.0, 0.1))
+    add_rope(builder, [[0.0, -0.05, 0.0], [0.0, 0.05, 0.0]])
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model), radius=0.004))
+    rollout.step()
+    assert rollout.solver.report.certified and rollout.solver.report.excluded == 1
+
+
+def test_nothing_is_the_same_without_a_distance(device):
+    """A distance of 0 is none: the same bits, and no springs or loose particles."""
+    ends = []
+    for options in ({}, {"min_distance": 0.0}):
+        model = strands(device)
+        rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=2), **options))
+        assert len(rollout.solver.mesh.free_edges) == len(rollout.solver.mesh.points) == 0
+        for _ in range(6):
+            rollout.step()
+        ends.append(rollout.positions)
+    np.testing.assert_array_equal(*ends)
+
+
+def test_a_monitor_counts_approaches(device):
+    model = bullet(60.0, device)
+    hits = []
+    for distance in (None, 0.012):
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), respond=False, min_distance=distance))
+        rollout.step()
+        hits.append(rollout.solver.report.hits)
+        assert rollout.solver.report.certified == (hits[-1] == 0)
+    assert hits[1] > hits[0]
+
+
+def test_springs_that_take_part(device):
+    """Those of cloth and those along two others do not; a tether from cloth to a particle does."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 1, 0.1, (0.0, 0.0, 0.0), add_springs=True)
+    add_rope(builder, [[0.2, 0.0, 0.0], [0.3, 0.0, 0.0], [0.4, 0.01, 0.0]])
+    builder.add_spring(4, 6, 1.0, 0.0, 0.0)  # against bending
+    builder.add_spring(3, 4, 1.0, 0.0, 0.0)
+    builder.add_particle(wp.vec3(1.0, 0.0, 0.0), wp.vec3(), 1.0)
+    model = builder.finalize(device=device)
+    mesh = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=0.01).mesh
+    assert mesh.edges[mesh.free_edges].tolist() == [[3, 4], [4, 5], [5, 6]]
+    assert mesh.points.tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"min_distance": -1.0}, "min_distance must be finite and at least 0"),
+        ({"radius": np.ones(3)}, r"radius must be one number or 59, one a particle"),
+        ({"radius": np.nan}, "radii must be finite and at least 0"),
+    ],
+)
+def test_bad_distances_are_refused(options, message, device):
+    model = strands(device)
+    with pytest.raises(ValueError, match=message):
+        bsc.SolverCCD(newton.solvers.SolverXPBD(model), **options)
+
+
+def test_a_step_that_is_differentiated_is_refused(device):
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.04, (0.0, 0.0, 0.0))
+    model = builder.finalize(device=device, requires_grad=True)
+    solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), min_distance=0.01)
+    states = model.state(), model.state()
+    with pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and radius"), wp.Tape():
+        solver.step(*states, model.control(), None, DT)
+    solver.step(*states, model.control(), None, DT)
+
+
+def test_bodies_alone(device):
+    """Boxes that fall onto each other and onto a table, in a model without particles, keep the distance."""
+    distance = 0.01
+    builder = newton.ModelBuilder()
+    table = wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity())
+    builder.add_shape_box(-1, xform=table, hx=0.3, hy=0.3, hz=0.1)
+    for i in range(2):
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), 0.3 * i)
+        body = builder.add_body(xform=wp.transform(wp.vec3(0.01 * i, 0.02 * i, 0.06 + 0.1 * i), turn))
+        builder.add_shape_box(body, hx=0.04, hy=0.05, hz=0.03)
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=distance, bodies=True)
+    states, mesh = (model.state(), model.state()), solver.mesh
+    x = wp.empty(mesh.vertex_count, dtype=wp.vec3, device=device)
+    finder, rounds = bsc.CollisionDetector(mesh), 0
+    for step in range(60):
+        states[0].clear_forces()
+        solver.step(*states, model.control(), None, DT)
+        states = states[::-1]
+        rounds += solver.report.rounds
+        assert solver.report.certified
+        if step % 20 == 19:
+            mesh.positions(states[0].particle_q, states[0].body_q, x)
+            near = finder.find_proximities(x, distance)
+            of_edges = mesh.shape_vertices.body[mesh.edges[:, 0]]
+            first = mesh.shape_vertices.body[near.vertex_face[:, 0]], of_edges[near.edge_edge[:, 0]]
+            second = mesh.shape_vertices.body[mesh.faces[near.vertex_face[:, 1], 0]], of_edges[near.edge_edge[:, 1]]
+            assert (np.concatenate(first) == np.concatenate(second)).all()
+    assert rounds > 20

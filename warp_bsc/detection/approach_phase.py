@@ -1,0 +1,233 @@
+"""The narrow phase of a response that keeps distances: pairs that come nearer than they may, and those that are near.
+
+A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance_phase`, or as it was at the
+start, if it was nearer, less the rounding of distances. Pairs that an edge of the mesh joins may come as near as they
+like without touching: neighbours are always near. The reach is how much nearer than that other pairs are reported.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from ..kernels.ccd import impact_at_distance
+from ..kernels.distance import closest_points
+from ..kernels.min_distance import clears_at_once, closest_at
+from ..kernels.motion import doubles, motion_and_distance
+from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import FREE, ROUNDOFF
+from .distance_phase import distance_of_corners, firsts_of
+from .kernels import PairStages
+from .launch import launch_over_queue
+from .mesh import CollisionMesh
+from .narrow_phase import NarrowPhase
+from .rings import Rings, are_within_rings, make_rings
+from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count
+from .stage_timer import StageTimer
+
+__all__ = ["MinDistances", "distances_of_pair", "make_min_distances", "run_approach_phases"]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
+"""Share of its distance at the start that a pair keeps: the search certifies that it does at rest."""
+_ZERO = wp.constant(wp.float64(0.0))
+_TWO = wp.constant(wp.float64(2.0))
+
+_RINGS = 1
+
+
+@wp.struct
+class MinDistances:
+    """The minimum distances of a mesh; without arrays there are none.
+
+    Attributes:
+        radius: Radius of each vertex, half of the minimum distance included [m].
+        of_planes: Radius of infinite planes, half of the minimum distance [m].
+        reach: How much farther apart than their minimum distance near pairs are at most [m].
+        rings: Vertices whose elements have no minimum distance.
+        group: Of each vertex; vertices of one group keep their distances by themselves. -1 for none.
+    """
+
+    radius: wp.array[wp.float64]
+    of_planes: wp.float64
+    reach: wp.float64
+    rings: Rings
+    group: wp.array[int]
+
+
+def make_min_distances(
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: float, reach: float, group: np.ndarray
+) -> MinDistances:
+    """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
+
+    Args:
+        mesh: The mesh.
+        radius: Radius of each vertex, float64, shape [vertex_count].
+        of_planes: Radius of infinite planes.
+        reach: How much farther apart near pairs are.
+        group: Group of each vertex, int, shape [vertex_count].
+    """
+    distances = MinDistances()
+    distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
+    distances.of_planes, distances.reach = of_planes, reach
+    distances.rings = make_rings(mesh, _RINGS)
+    distances.group = wp.array(group, dtype=int, device=mesh.device)
+    return distances
+
+
+@wp.func
+def distances_of_pair(
+    distances: MinDistances, kind: int, corners: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
+):
+    """Returns the distance of a pair at the start, from its points there, and the distance that it is to keep [m].
+
+    The first is a lower bound; it is 0 if the elements may touch. The second is less, unless that is 0.
+    """
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
+    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
+    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
+    _at, found, error = closest_points(points, u, v, w)
+    start = wp.max(found - _TWO * error, _ZERO)
+    if are_within_rings(corners, firsts_of(kind), distances.rings):
+        return start, _ZERO
+    return start, wp.min(distance_of_corners(kind, corners, distances.radius), _KEPT * start)
+
+
+@functools.cache
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that cull and decide, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def cull_approaches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        distances: MinDistances,
+        kind: int,
+        # in and out
+        stages: PairStages,
+    ):
+        i = first + wp.tid()
+        if not is_filled(i, stages.queue, stages.counts, _QUEUED):
+            return
+        pair = stages.queue[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        group = distances.group[v[0]]
+        if group >= 0 and distances.group[v[3]] == group:
+            return
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, distances.radius) + distances.reach
+        motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
+        if clears_at_once(motion, scaled):
+            return
+        if are_within_rings(v, firsts_of(kind), distances.rings):
+            _same, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distances.reach, ROUNDOFF)
+            if clears_at_once(motion, scaled):
+                return
+        append(pair, stages.survivors, stages.counts, _SURVIVORS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_approaches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        distances: MinDistances,
+        kind: int,
+        near_pairs: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = first + wp.tid()
+        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
+            return
+        pair = stages.survivors[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        a, b, c, d = doubles(a0, b0, c0, d0)
+        start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
+        result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
+        status = result.status
+        if near_pairs:
+            reach = distances.reach
+            if not are_within_rings(v, firsts_of(kind), distances.rings):
+                reach += distance_of_corners(kind, v, distances.radius)
+            if start < reach:
+                points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+                motion, _scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+                coordinates, normal = closest_at(kind, motion, _ZERO)
+                result.coordinates = coordinates
+                result.normal = normal
+            else:
+                near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
+                if near.status == FREE:
+                    return
+                result.coordinates = near.coordinates
+                result.normal = near.normal
+        elif status == FREE:
+            return
+        slot = take_slot(stages.counts, _CONTACTS)
+        take_slot(stages.counts, _FOUND)
+        contacts = stages.contacts
+        if slot < wp.int64(contacts.pairs.shape[0]):
+            k = wp.int32(slot)
+            contacts.pairs[k] = pair
+            contacts.status[k] = wp.int8(status)
+            contacts.within_tolerance[k] = result.within_tolerance == 1
+            contacts.toi[k] = result.toi
+            contacts.coordinates[k] = result.coordinates
+            contacts.normal[k] = result.normal
+
+    return cull_approaches, decide_approaches
+
+
+def run_approach_phases(
+    phases: Sequence[tuple[NarrowPhase, wp.array]],
+    x0: wp.array,
+    x1: wp.array,
+    distances: MinDistances,
+    *,
+    near_pairs: bool,
+    tolerance: float = TOLERANCE,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
+
+    The status of a contact is FREE if the pair is only near. Times of impact are those at which a pair comes nearer
+    than it may, 2 if it does not. With ``near_pairs``, coordinates and normals are those at which the pair comes within
+    reach, at the start if it is within reach then: they depend continuously on the motion, and the direction to move
+    the pair apart vanishes with the distance that it is to be moved.
+
+    Args:
+        phases: The buffers of each kind, a :class:`DistanceKind`, with the vertex indices of its second elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        distances: The minimum distances.
+        near_pairs: Whether to report pairs that are only near.
+        tolerance: Of the times of impact, as a share of the step.
+        timer: Measures the stages.
+    """
+    cull, decide = _kernels(x0.dtype)
+    with timer.stage("cull"):
+        for phase, elements in phases:
+            stages = phase.stages(elements)
+            inputs = [x0, x1, distances, int(phase.kind)]
+            launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+    with timer.stage("classify"):
+        for phase, elements in phases:
+            stages = phase.stages(elements)
+            inputs = [x0, x1, distances, int(phase.kind), near_pairs, tolerance]
+            queue, places = stages.survivors, Count.SURVIVORS
+            launch_over_queue(decide, queue, phase.counts, places, inputs=inputs, outputs=[stages], block_dim=64)
