@@ -455,7 +455,7 @@ class Response:
         self._launch_over_particles(truncate_vertices, inputs)
         self._launch_over_shape_vertices(find_body_shares, self.progress, self._dividing, self._record)
         if self._recorder is not None:
-            self._launch_over_shape_vertices(record_body_truncations, self._record, *self._contacts())
+            self._launch_over_shape_vertices(record_body_truncations, self._record, *self._contacts()[0])
         self._launch_over_bodies(cut_bodies, self.progress, dt)
         self._launch_over_shape_vertices(place_vertices)
         self._detect(refit=True)
