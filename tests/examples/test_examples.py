@@ -232,8 +232,9 @@ def test_the_coupling_of_three_scenes_is_measured(monkeypatch, capsys):
         monkeypatch.setattr(scene, "duration", 1.0 / 60.0)
     monkeypatch.setattr(sys, "argv", ["coupling.py", "--coupling", "2", "--device", str(wp.get_device())])
     program.main()
-    rows = re.findall(r"│ (1/\d+) +│ (\d+|-) +│(?: [\d.e+-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
-    steps = [("1/1920", "-"), ("1/960", "-"), ("1/240", "-"), ("1/240", "2"), ("1/60", "-"), ("1/60", "8")]
+    rows = re.findall(r"│ (1/\d+) +│ (\d+|-|auto) +│(?: [\d.e+-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
+    steps = [("1/1920", "-"), ("1/960", "-"), ("1/240", "-"), ("1/240", "2"), ("1/240", "auto")]
+    steps += [("1/60", "-"), ("1/60", "8"), ("1/60", "auto")]
     assert rows == [(*step, "0") for step in 3 * steps]  # all certified
 
 

@@ -128,7 +128,7 @@ class Constraints:
     within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
     toi: wp.array[wp.float64]  # time of impact
     approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
-    slow: wp.array[int]  # 1 if its elements move little, see constraints.is_slow
+    slow: wp.array[int]  # 1 if its elements move little, see constraints.is_slow, or RESTING, see there
     position_multiplier: wp.array[wp.vec3d]  # [kg m]
     velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
     previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum

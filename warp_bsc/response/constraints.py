@@ -17,9 +17,11 @@ __all__ = [
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
     "MAX_TRUNCATIONS",
+    "MOST_AT_REST",
     "MOST_SAGITTA",
     "NO_CONSTRAINT",
     "PLANE_CONTACT",
+    "RESTING",
     "TIME_UNITS",
     "TOUCH",
     "VERTEX_FACE_CONTACT",
@@ -81,6 +83,11 @@ TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
 _DIVISIONS_OF_CONTACTS = wp.constant(2)
 """Iterations that divide contacts alone, before planes between near pairs that move: these stop what they divide."""
+RESTING = wp.constant(2)
+"""In place of 1 for slow: of near pairs at rest, which are divided before the next detection."""
+MOST_AT_REST = wp.constant(wp.float64(4.0))
+"""Longest path of near pairs at rest, in separations. Planes stand still: what moves farther together, they would stop,
+and what slides, push apart."""
 _SHARE = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes."""
 _WIDENING = wp.constant(wp.float64(1.25))

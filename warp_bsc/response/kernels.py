@@ -26,6 +26,7 @@ from .constraints import (
     MOST_SAGITTA,
     NO_CONSTRAINT,
     PLANE_CONTACT,
+    RESTING,
     TIME_UNITS,
     TOUCH,
     VERTEX_FACE_CONTACT,
@@ -45,7 +46,6 @@ from .constraints import (
     is_pushing,
     is_slow,
     least_distance,
-    longest_path,
     relative,
     to_double,
     to_single,
@@ -72,10 +72,6 @@ __all__ = [
 ]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
-
-_RESTING = wp.constant(wp.float64(4.0))
-"""Longest path, in separations, of near pairs that are divided before the next detection. Planes stand still: what
-moves farther together, they would stop, and what slides, push apart."""
 
 _KERNEL = {"enable_backward": False}
 
@@ -281,7 +277,7 @@ def divide_near_pairs(
     if not divides_near_pairs(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
-    if not divides_all_near_pairs(progress) and longest_path(motion, corners) > _RESTING * separation:
+    if not divides_all_near_pairs(progress) and constraints.slow[i] != RESTING:
         return
     least = least_distance(constraints, i)
     meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False)

@@ -8,6 +8,7 @@ from .buffers import PROJECTED, Constraints, Motion, Progress, Vertices, has_fin
 from .constraints import (
     EDGE_EDGE_PROXIMITY,
     PLANE_CONTACT,
+    RESTING,
     are_on_body,
     gap,
     is_dividing,
@@ -167,7 +168,7 @@ def is_reversible(constraints: Constraints, progress: Progress, i: int) -> bool:
 
     Constraints of fast elements only push after the first iteration, which makes room where contacts come back.
     """
-    return progress.status.iteration[0] == 1 or constraints.slow[i] == 1
+    return progress.status.iteration[0] == 1 or constraints.slow[i] != 0
 
 
 @wp.func
@@ -269,15 +270,16 @@ def activate_position_constraints(
 ):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
-    Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities of edges where planes divide
-    near pairs afterwards, unless they are too near: a stack has four times as many as of vertices and faces, which hold
-    it as well.
+    Constraints met within the tolerance cost nothing, and move nothing. Nor do edges at rest near each other where
+    planes divide them afterwards, unless they are too near: a stack has four times as many as of vertices and faces,
+    which hold it as well.
     """
     i = wp.tid()
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
-    if constraints.kind[i] == EDGE_EDGE_PROXIMITY and is_dividing(progress, world, progress.status.iteration[0]):
+    resting_edges = constraints.kind[i] == EDGE_EDGE_PROXIMITY and constraints.slow[i] == RESTING
+    if resting_edges and is_dividing(progress, world, progress.status.iteration[0]):
         start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
         least = least_distance(constraints, i)
         if wp.dot(constraints.normal[i], start) - least >= _NEAR * (constraints.separation[i] - least):

@@ -10,6 +10,8 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .buffers import Constraints, Motion, Progress, Vertices
 from .constraints import (
     EDGE_EDGE_PROXIMITY,
+    MOST_AT_REST,
+    RESTING,
     VERTEX_FACE_PROXIMITY,
     add_constraint,
     contact_friction,
@@ -174,6 +176,7 @@ def _collect_proximity(
         return
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     target = least + feasible(motion, corners, separation, distance - least, separation)
+    slow = wp.where(path <= MOST_AT_REST * separation, RESTING, 1)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
     add_constraint(
         motion,
@@ -184,7 +187,7 @@ def _collect_proximity(
         normal,
         target,
         friction,
-        1,
+        slow,
         kind,
         True,
         _ZERO,
