@@ -260,7 +260,7 @@ def main():
                 run = Run(scene, dt, coupling).simulate()
                 reference = run.positions() if reference is None else reference
                 distance = 1e3 * np.sqrt(((run.positions() - reference) ** 2).sum(axis=1).mean())
-                values = [f"{value:.4g}" for value in (*scene.measure(run), np.mean(run.substeps), distance)]
+                values = [f"{value:.3g}" for value in (*scene.measure(run), np.mean(run.substeps), distance)]
                 report = run.solver.report
                 values += [str(report.uncertified_steps), f"{run.seconds:.1f}"]
                 table.add_row(f"1/{1.0 / dt:.0f}", str(coupling or "-"), *values)
