@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 _BLOCK, _THREADS_OF_MULTIPROCESSOR = 64, 256
-"""Threads of a block, and of a multiprocessor, that search: as many as run at once. On a CPU a thread has one pair."""
+"""Threads of a block, and of a multiprocessor, that search, each one pair after another. On a CPU a thread has one."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))

@@ -35,6 +35,7 @@ from .step_record import (
     RecordCounts,
     StepRecord,
     name_elements,
+    truncation_at,
 )
 
 __all__ = ["RecordedStep", "StepAdjoint"]
@@ -238,9 +239,8 @@ def _restore_paths(
     velocity: wp.array[wp.vec3],
 ):
     """Restores the ends of truncated paths; the gradients of their vertices move to ``end`` and ``velocity``."""
-    iteration = cursor.iteration[0]
-    entry = record.truncation_offsets[iteration] + wp.tid()
-    if entry >= record.truncation_offsets[iteration + 1]:
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0:
         return
     vertex = record.vertex[entry]
     if vertex < 0:

@@ -43,7 +43,7 @@ from .projection import (
     with_momentum,
 )
 from .proximities import closest_vector
-from .step_record import NO_CONTACT, StepRecord
+from .step_record import NO_CONTACT, StepRecord, truncation_at
 
 __all__ = [
     "Cursor",
@@ -410,9 +410,8 @@ def truncate_paths(
     velocity: wp.array[wp.vec3],
 ):
     """Computes the ends and velocities of truncated paths, see :func:`.kernels.truncate_vertices`."""
-    iteration = cursor.iteration[0]
-    entry = record.truncation_offsets[iteration] + wp.tid()
-    if entry >= record.truncation_offsets[iteration + 1]:
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0:
         return
     vertex = record.vertex[entry]
     if vertex < 0:

@@ -18,7 +18,6 @@ from .body_adjoint_kernels import (
     restore_body_velocities,
     restore_poses,
     restore_unturned_bodies,
-    restore_vertices,
     set_centres,
     take_vertices,
     truncate_body_paths,
@@ -170,7 +169,7 @@ class BodyAdjoint:
         """Restores velocities of bodies and their vertices as they were before a sweep."""
         if self.moves:
             self._launch(restore_body_velocities, [self._motion, self._vertices, self._of])
-            self._launch_over_vertices(restore_vertices, [self._motion, self._vertices, False])
+            self._launch_over_vertices(vertex_velocities, [self._motion, self._vertices, self._vertices.velocity])
 
     def take_velocities(self):
         """Turns gradients with respect to velocities of vertices into those with respect to their bodies."""
@@ -269,7 +268,7 @@ class BodyAdjoint:
         self._launch(restore_poses, [self._motion, self._vertices, self._sums])
 
     def _place(self):
-        self._launch_over_vertices(restore_vertices, [self._motion, self._vertices, True])
+        self._launch_over_vertices(place_vertices, [self._motion, self._vertices, self._vertices.x1])
 
     def _take(self, of_vertices, more):
         self._launch_over_vertices(take_vertices, [self._motion, of_vertices, more, self._of])

@@ -23,7 +23,7 @@ from .buffers import Motion, SolveStatus, Vertices, has_final_velocity
 from .constraints import to_double, to_single
 from .model_motion import moves_with_body, wanted_velocity
 from .planes import MovingPlanes, transformed_plane
-from .step_record import NO_CONTACT, StepRecord
+from .step_record import NO_CONTACT, StepRecord, truncation_at
 
 __all__ = [
     "BodyGradients",
@@ -39,7 +39,6 @@ __all__ = [
     "restore_body_velocities",
     "restore_poses",
     "restore_unturned_bodies",
-    "restore_vertices",
     "set_centres",
     "take_vertices",
     "truncate_body_paths",
@@ -183,9 +182,8 @@ def truncate_body_paths(
     velocities: wp.array[wp.spatial_vector],
 ):
     """Computes the poses and velocities of bodies whose paths were truncated, see :func:`.bodies.cut_bodies`."""
-    iteration = cursor.iteration[0]
-    entry = record.truncation_offsets[iteration] + wp.tid()
-    if entry >= record.truncation_offsets[iteration + 1]:
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0:
         return
     body = record.body[entry]
     if body < 0:
@@ -308,20 +306,6 @@ def restore_poses(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_
 
 
 @wp.kernel(**_KERNEL)
-def restore_vertices(motion: Motion, vertices: Vertices, places: bool):
-    """Restores positions of vertices of bodies, if ``places``, or else their velocities."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    body = motion.bodies.of_vertex[vertex]
-    if body < 0 or not _is_movable(motion, body):
-        return
-    if places:
-        vertices.x1[vertex] = wp.transform_point(vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
-    else:
-        arm = to_double(vertices.x1[vertex]) - vertices.bodies.centre[body]
-        vertices.velocity[vertex] = velocity_on_body(vertices.bodies.velocity[body], arm)
-
-
-@wp.kernel(**_KERNEL)
 def take_vertices(motion: Motion, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3], gradients: BodyGradients):
     """Takes the gradients with respect to vertices of bodies, which are to become those with respect to bodies."""
     vertex = motion.bodies.particle_count + wp.tid()
@@ -346,9 +330,8 @@ def restore_body_paths(
     velocities: wp.array[wp.spatial_vector],
 ):
     """Restores the poses before truncation; the gradients of their bodies move to ``poses`` and ``velocities``."""
-    iteration = cursor.iteration[0]
-    entry = record.truncation_offsets[iteration] + wp.tid()
-    if entry >= record.truncation_offsets[iteration + 1]:
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0:
         return
     body = record.body[entry]
     if body < 0:

@@ -1,5 +1,7 @@
 """The hooks of Newton's coupled solvers for a stage behind another solver: that solver's, and what the stage adds."""
 
+from typing import Any
+
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers import SolverBase
@@ -11,42 +13,24 @@ from .constraints import to_double, to_single
 
 __all__ = ["CouplingHooks"]
 
-_PROXY = wp.constant(int(BodyFlags.PROXY))
-_PARTICLE_PROXY = wp.constant(int(ParticleFlags.PROXY))
-
 _KERNEL = {"enable_backward": False}
 
 
 @wp.kernel(**_KERNEL)
-def _start_bodies(
+def _find_starts(
     # in
-    ends: wp.array[wp.transform],
+    ends: wp.array[Any],
     flags: wp.array[int],
-    body_q: wp.array[wp.transform],
+    proxy: int,
+    places: wp.array[Any],
     # out
-    starts: wp.array[wp.transform],
+    starts: wp.array[Any],
 ):
-    """Writes where bodies start: proxies where the last step ended, others where they are."""
-    body = wp.tid()
-    starts[body] = body_q[body]
-    if flags[body] & _PROXY != 0:
-        starts[body] = ends[body]
-
-
-@wp.kernel(**_KERNEL)
-def _start_particles(
-    # in
-    ends: wp.array[wp.vec3],
-    flags: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    # out
-    starts: wp.array[wp.vec3],
-):
-    """Writes where particles start: proxies where the last step ended, others where they are."""
-    particle = wp.tid()
-    starts[particle] = particle_q[particle]
-    if flags[particle] & _PARTICLE_PROXY != 0:
-        starts[particle] = ends[particle]
+    """Writes where bodies or particles start: proxies where the last step ended, others where they are."""
+    i = wp.tid()
+    starts[i] = places[i]
+    if flags[i] & proxy != 0:
+        starts[i] = ends[i]
 
 
 @wp.kernel(**_KERNEL)
@@ -209,16 +193,11 @@ class _Coupled:
             return state
         self._continues = False
         model, first, start = self._model, self._first, self._start
-        for kernel, count, arrays in (
-            (_start_bodies, model.body_count, (first.body_q, model.body_flags, state.body_q, start.body_q)),
-            (
-                _start_particles,
-                model.particle_count,
-                (first.particle_q, model.particle_flags, state.particle_q, start.particle_q),
-            ),
-        ):
+        bodies = first.body_q, model.body_flags, int(BodyFlags.PROXY), state.body_q, start.body_q
+        particles = first.particle_q, model.particle_flags, int(ParticleFlags.PROXY), state.particle_q, start.particle_q
+        for count, inputs in ((model.body_count, bodies), (model.particle_count, particles)):
             if count:
-                wp.launch(kernel, count, inputs=arrays, device=model.device)
+                wp.launch(_find_starts, count, inputs=inputs, device=model.device)
         return start
 
     def finish(self, state, motion, vertices, moves_bodies):

@@ -16,6 +16,7 @@ __all__ = [
     "is_recording",
     "name_elements",
     "record_entry",
+    "truncation_at",
 ]
 
 NO_CONTACT = wp.constant(-1)
@@ -112,6 +113,15 @@ def begin_iteration(record: StepRecord, iteration: int, constraints: int):
     record.sweep_offsets[iteration] = record.counts.sweeps[0]
     record.constraint_offsets[iteration] = constraints
     record.truncation_offsets[iteration] = record.counts.truncations[0]
+
+
+@wp.func
+def truncation_at(record: StepRecord, iteration: int, i: int) -> int:
+    """Returns the place of a truncation of an iteration; -1 after its last."""
+    entry = record.truncation_offsets[iteration] + i
+    if entry >= record.truncation_offsets[iteration + 1]:
+        return -1
+    return entry
 
 
 def name_elements(struct_type, values):
