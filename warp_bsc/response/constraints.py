@@ -81,8 +81,6 @@ TOUCH = wp.constant(wp.float64(1e-100))
 """Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities."""
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; times in keys are integers of them."""
-_DIVISIONS_OF_CONTACTS = wp.constant(2)
-"""Iterations that divide contacts alone, before planes between near pairs that move: these stop what they divide."""
 RESTING = wp.constant(2)
 """In place of 1 for slow: of near pairs at rest, which are divided before the next detection."""
 MOST_AT_REST = wp.constant(wp.float64(4.0))
@@ -150,7 +148,7 @@ def is_dividing(progress: Progress, world: int, iteration: int) -> bool:
 def divides_near_pairs(progress: Progress, world: int) -> bool:
     """Returns whether near pairs of a world without fast contacts are divided in this iteration, as contacts are.
 
-    Those at rest are after the last projection, all of them where planes between contacts have not been enough.
+    Those at rest are after the last projection, and all of them in the next iteration, if contacts are left.
     """
     last = progress.status.iteration[0] - 1
     if progress.contact_iteration[world] != last or progress.fast[world] == 1:
@@ -160,8 +158,8 @@ def divides_near_pairs(progress: Progress, world: int) -> bool:
 
 @wp.func
 def divides_all_near_pairs(progress: Progress) -> bool:
-    """Returns whether near pairs that move are divided too in this iteration."""
-    return progress.status.iteration[0] - 1 == progress.max_slow_iterations + _DIVISIONS_OF_CONTACTS
+    """Returns whether all near pairs are divided in this iteration, also where that stops what moves together."""
+    return progress.status.iteration[0] - 1 == progress.max_slow_iterations
 
 
 @wp.func

@@ -2,10 +2,10 @@
 
 If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
 at all times of a linear motion. After the last projection, near pairs at rest get a plane across the shortest vector
-between their elements at the start, as does each contact that is left, and every vertex of the two is projected onto
-its side. If contacts are left even so, near pairs that move get planes too. Vertices that stand still are on their
-sides, so that there is a solution for the vertices of all pairs at once, each by itself. What slides along a plane goes
-on sliding, unlike what is truncated.
+between their elements at the start, and every vertex of the two is projected onto its side; but no pair that moves or
+turns together without meeting, which a plane would stop, as it stands still. If contacts are left, they get planes, and
+so do all near pairs. Vertices that stand still are on their sides, so that there is a solution for the vertices of all
+pairs at once, each by itself. What slides along a plane goes on sliding, unlike what is truncated.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -16,8 +16,8 @@ import warp as wp
 
 from ..kernels.pipeline.queues import take_place
 from .buffers import Motion, Vertices
-from .constraints import LEAST_DISTANCE, inverse_mass_of, to_double, to_single
-from .proximities import closest_direction
+from .constraints import LEAST_DISTANCE, inverse_mass_of, relative, to_double, to_single
+from .proximities import closest_direction, closest_vector
 
 __all__ = [
     "DividingPlanes",
@@ -205,12 +205,24 @@ def add_dividing_plane(
     least: wp.float64,
     planes: DividingPlanes,
     is_contact: bool,
+    may_stop: bool,
 ) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
-    cannot bring together. ``least`` is the distance that the elements are to keep [m]: half of it is on either side.
+    cannot bring together.
+
+    Args:
+        motion: The motion of the step.
+        vertices: The vertices as they were moved so far.
+        corners: The vertices of both elements.
+        edges: 1 where these are edges, 0 for a vertex and a face.
+        separation: Distance that projection moves contacts apart [m].
+        least: Distance that the elements are to keep [m]: half of it is on either side.
+        planes: The planes, which the new one is added to.
+        is_contact: Whether the elements are in contact.
+        may_stop: Whether elements get a plane that stops them although their closest points do not meet.
 
     Returns:
         Whether the elements meet at the end, or nearly, without planes.
@@ -239,6 +251,10 @@ def add_dividing_plane(
     offset = wp.clamp(offset, least - below.start, above.start - least)
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
+    if not may_stop and (above.end < offset or -below.end > offset):
+        weights, _between = closest_vector(motion, corners, edges)
+        if wp.dot(normal, relative(weights, corners, vertices.x1)) >= half + half + margin:
+            return False
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin, half)
     return above.end + below.end < margin
 

@@ -189,7 +189,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, least, dividing, True)
+        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, least, dividing, True, True)
         multiplier = TOUCH * normal
     else:
         if not near:
@@ -277,10 +277,11 @@ def divide_near_pairs(
     if not divides_near_pairs(progress, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
     edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
-    if not divides_all_near_pairs(progress) and constraints.slow[i] != RESTING:
+    all_pairs = divides_all_near_pairs(progress)
+    if not all_pairs and constraints.slow[i] != RESTING:
         return
     least = least_distance(constraints, i)
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False, all_pairs)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):

@@ -74,7 +74,7 @@ def _resolve(
     count_contact(arguments.progress, motion.world[corners[0]])
     edges = wp.where(kind == EDGE_EDGE, 1, 0)
     separation = arguments.separation
-    add_dividing_plane(motion, arguments.vertices, corners, edges, separation, least, arguments.dividing, True)
+    add_dividing_plane(motion, arguments.vertices, corners, edges, separation, least, arguments.dividing, True, True)
     for j in range(4):
         arguments.vertices.changed[corners[j]] = 1
         update_first_contact(arguments.vertices, corners[j], toi, NO_CONSTRAINT, 0)
