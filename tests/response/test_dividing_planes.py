@@ -137,6 +137,36 @@ def test_a_pile_takes_few_rounds(device):
     assert max(rounds) <= 4 and np.median(rounds[3:]) <= 2, rounds
 
 
+@pytest.mark.parametrize("turns", [False, True])
+def test_layers_that_move_together_are_not_stopped(turns, device):
+    """Two layers near each other fly or turn on as they do alone, while others collide in the same world.
+
+    Planes between them stand still. They would stop a layer that goes farther than the gap in a step.
+    """
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for height in (0.0, 1e-4):
+        add_patch(builder, 4, 0.05, (100.0 * height, 0.0, height), velocity=(0.0, 0.0, 1.0))
+    count = builder.particle_count
+    for height in (0.0, 1e-4):
+        velocity = (0.0, 0.0, 0.1 - 2000.0 * height)
+        add_patch(builder, 4, 0.05, (2.0 + 100.0 * height, 0.0, height), velocity=velocity)
+    if turns:
+        for i in range(count):
+            x, _, z = builder.particle_q[i]
+            builder.particle_qd[i] = wp.vec3(10.0 * z, 0.0, -10.0 * x)
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    dt = 1.0 / 1920.0
+    wanted = 10.0 * dt * rollout.velocities[:count]
+    start, hits = rollout.positions[:count], 0
+    for _ in range(10):
+        rollout.step(dt)
+        hits += rollout.solver.report.hits
+    assert rollout.collisions == 0 and hits > 0
+    path = rollout.positions[:count] - start
+    assert abs((path * wanted).sum() / (wanted**2).sum() - 1.0) < 1e-3
+
+
 @wp.kernel(enable_backward=False)
 def _divide(
     # in
