@@ -36,6 +36,7 @@ class CollisionMesh:
             [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
+        only_free: Whether pairs of which faces have both elements are left out.
         device: Warp device of the arrays that the detector uses.
     """
 
@@ -48,6 +49,7 @@ class CollisionMesh:
         points: np.ndarray | wp.array | None = None,
         radius: float | np.ndarray | wp.array | None = None,
         world: np.ndarray | wp.array | None = None,
+        only_free: bool = False,
         device: wp.DeviceLike = None,
     ):
         """Finds the edges and puts the mesh on a device.
@@ -62,6 +64,8 @@ class CollisionMesh:
                 or Warp array; or one for all. A pair collides if it comes within the sum of its two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
+            only_free: Whether only pairs with a vertex or an edge that no face has are wanted, where another detector
+                finds those of the faces. They cost no time then.
             device: Warp device; default: Warp's default.
 
         Raises:
@@ -100,6 +104,7 @@ class CollisionMesh:
         first_sides = first_sides[proper & (first_sides < len(sides))]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
         self.face_edges, self.owned = face_edges.astype(np.int32), owned
+        self.only_free = only_free
         self.device = wp.get_device(device)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
