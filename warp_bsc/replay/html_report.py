@@ -168,10 +168,11 @@ class ReportPage(RecordFile):
             arrays |= {"kind": np.full(len(rows), _NEAR), "distance": found.distance[rows]}
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
-            curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
+            curves = found.cuts.points
             arrays |= {
                 "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
                 "curves": self._placed(curves[_spread(len(curves), self._most_rows)]),
+                "through": self._placed(found.position[np.intersect1d(rows, found.of_curves)]),
             }
             facts["curves"] = len(curves)
         return len(rows), _block(f"{name}-{index}", facts, arrays)

@@ -162,6 +162,7 @@ async function loadView(index) {
     rest: atEnds.slice(0, 2).map((block) => (block ? block.position : NO_FLOATS)),
     curves: atEnds.slice(0, 2).map((block) => (block ? block.curves : NO_FLOATS)),
     inside: atEnds.slice(0, 2).map((block) => (block ? block.position.filter((_, i) => block.kind[Math.floor(i / 3)] === INSIDE) : NO_FLOATS)),
+    through: atEnds.slice(0, 2).map((block) => (block ? block.through : NO_FLOATS)),
     close: atEnds.slice(2).map((block) => (block ? block.position : NO_FLOATS)),
   };
 }
@@ -253,11 +254,13 @@ function makeViewer() {
     shown.some = vertexArray(gl, triangles, positions, lit);
     shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
     if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
+    if (shown.through.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "curve through a face");
     if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "near pair");
     // Marks of what is at the start, and at the end.
     shown.marks = shown.inside.map((inside, end) => {
-      const places = new Float32Array([...inside, ...shown.close[end]]), markColors = new Float32Array(places.length);
-      for (let i = 0; i < places.length; i += 3) markColors.set(i < inside.length ? CURVE_COLOR : NEAR_COLOR, i);
+      const at = [...inside, ...shown.through[end]], places = new Float32Array([...at, ...shown.close[end]]);
+      const markColors = new Float32Array(places.length);
+      for (let i = 0; i < places.length; i += 3) markColors.set(i < at.length ? CURVE_COLOR : NEAR_COLOR, i);
       return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
     });
     const segments = (values, stride, places) => vertexArray(gl, lines, ["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]));
