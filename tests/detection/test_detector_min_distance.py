@@ -106,7 +106,7 @@ def test_all_pairs_are_found(monkeypatch, device, broad_phase, dtype, how):
 
 @pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
 def test_only_pairs_with_what_no_face_has(monkeypatch, device, broad_phase):
-    """A rope tied to the cloth, a string between two of its vertices, and points; the cloth's own pairs are left out."""
+    """A rope tied to the cloth, a string between two of its vertices, and points; pairs of the cloth are left out."""
     if broad_phase is BroadPhaseSimd and device.is_cuda:
         pytest.skip("SIMD packets are for the CPU")
 

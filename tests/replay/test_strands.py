@@ -160,7 +160,7 @@ def test_edges_of_curves_through_faces_are_found_at_rest(pierced, tmp_path, caps
     assert [(row["elements"], row["meshes"], row["phase"], row["position"], row["time"]) for row in rows] == [
         (["edge 0-1", "face 0"], ["/World/Rope", "/World/Floor"], "crosses", [0.25, -0.5, 0], 2)
     ]
-    # the rope's first point comes through the floor and goes back; its edge in the floor meets none of the floor's edges
+    # the rope's first point comes through the floor and goes back; its edge in the floor meets no other edge
     of_rope = [[c for c in interval["contacts"] if "/World/Rope" in c["meshes"]] for interval in found["intervals"]]
     phases = [{(contact["phase"], contact["separate"]) for contact in contacts} for contacts in of_rope]
     assert phases == [{("enters", True)}, set(), set(), {("leaves", False)}]
@@ -222,7 +222,9 @@ def test_curves_inside_a_box(stage, tmp_path):
     box = moved(CORNERS, (4, 0, 0))
     add_mesh(stage, "/World/Box", {t: box for t in range(2)}, [4] * 6, SIDES)
     inner = [(4.25, 0.25, 0.25), (4.5, 0.5, 0.5), (4.75, 0.5, 0.5)]
-    add_rope(stage, "/World/Two", {0: inner + moved(inner, (2, 0, 0)), 1: moved(inner + inner, (2, 0, 0))}, counts=[3, 3])
+    add_rope(
+        stage, "/World/Two", {0: inner + moved(inner, (2, 0, 0)), 1: moved(inner + inner, (2, 0, 0))}, counts=[3, 3]
+    )
     add_rope(stage, "/World/Tied", [tuple(box[0]), *moved(inner[1:], (0, 0, 0.125))])
     add_rope(stage, "/World/Through", [*moved(inner, (0, 0.25, 0)), (9, 0, 0)])
     add_points(stage, "/World/Dust", [inner[0]])

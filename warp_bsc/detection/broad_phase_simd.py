@@ -342,7 +342,6 @@ class BroadPhaseSimd:
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
 
-
         def of_vertices(vertices: np.ndarray) -> _Tree:
             return _Tree(vertices.reshape(-1, 1), vertices, mesh.world, padding)
 
@@ -380,7 +379,9 @@ class BroadPhaseSimd:
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates."""
         trees = [self._vertices, self._edges, self._faces]
-        self._build(trees + [self._edges_of_faces] * bool(self._edges_of_faces), x0, x1, refit, changed)
+        if self._edges_of_faces:
+            trees.append(self._edges_of_faces)
+        self._build(trees, x0, x1, refit, changed)
         self._pair_elements(vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, keep_separated)
 
     def pair_points(

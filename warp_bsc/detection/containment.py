@@ -35,9 +35,10 @@ class ContainmentFinder:
     """Finds what is inside what, in one configuration after another, in meshes that consist of several bodies.
 
     A part of a body is what its faces and its edges without faces connect. A part is closed if an even number of its
-    faces meet at each edge, and it has no other edges. Closed parts enclose what they wind around; where the faces of a part are not oriented alike, what a
-    ray from it passes an odd number of times. All closed parts of a body count together, with their signs: what is in
-    the cavity of a hollow body, whose inner surface is turned inwards, is not inside. Open parts enclose nothing.
+    faces meet at each edge, and it has no other edges. Closed parts enclose what they wind around; where the faces of a
+    part are not oriented alike, what a ray from it passes an odd number of times. All closed parts of a body count
+    together, with their signs: what is in the cavity of a hollow body, whose inner surface is turned inwards, is not
+    inside. Open parts enclose nothing.
 
     A part is wholly inside a body if it is inside at one of its vertices and its edges and faces pass through none of
     the body's. A part that touches the body is inside if none of its vertices is outside, and not all are on the body.

@@ -64,8 +64,8 @@ class CollisionMesh:
                 or Warp array; or one for all. A pair collides if it comes within the sum of its two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
-            only_free: Whether only pairs with a vertex or an edge that no face has are wanted, where another detector
-                finds those of the faces. They cost no time then.
+            only_free: Whether to find only the pairs with a vertex or an edge that no face has. The others, which
+                another detector can find, then cost no time.
             device: Warp device; default: Warp's default.
 
         Raises:

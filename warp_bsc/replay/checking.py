@@ -17,7 +17,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .results import IntervalResult, Work, summarize, summarize_intersections
-from .scene_contacts import SceneContacts, compare_contacts, find_contacts, find_strand_contacts, join_contacts
+from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead

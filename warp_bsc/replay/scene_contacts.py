@@ -216,9 +216,7 @@ def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContac
     return replace(contacts, **joined, ignored=ignored)
 
 
-def compare_contacts(
-    contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections
-) -> SceneContacts:
+def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
     """Returns contacts with the fields that come from the intersections at the start and at the end of the interval."""
     separate, phase = np.zeros(len(contacts), dtype=bool), np.full(len(contacts), -1)
     segment = contacts.segment
