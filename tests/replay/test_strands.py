@@ -315,13 +315,17 @@ def test_emitted_points_split_the_motion(stage):
     assert any("/World/Dust changes its topology at time 1" in warning for warning in found["warnings"])
 
 
-def test_a_scene_without_faces(tmp_path):
+def test_a_scene_without_faces(tmp_path, capsys):
     stage = new_stage(tmp_path / "ropes.usda")
     add_rope(stage, "/World/Still", [(-1, 0, 0), (1, 0, 0)], [0.25])
     add_rope(stage, "/World/Falling", lowered([(0, -1, 0), (0, 1, 0)], 1, -1), [0.25])
     add_points(stage, "/World/Thin", lowered([(0.5, 0, 0)], 1, -1))
     words = [word for name in ("csv", "overlay", "report") for word in (f"--{name}", str(tmp_path / f"{name}.usda"))]
     found = find(stage, "--min-distance", "0.1", *words)
+    said = "at 2 times; between times, distances are not checked, nor are those of curves and points at all.\n"
+    assert said in capsys.readouterr().out
+    notes = Page((tmp_path / "report.usda").read_text()).data["notes"]
+    assert "Distances of curves and points are not checked, only their collisions." in notes
     assert [(contact["kind"], contact["triangle"]) for contact in found["intervals"][0]["contacts"]] == [
         ("edge-edge", None), ("vertex-edge", None)
     ]  # fmt: skip

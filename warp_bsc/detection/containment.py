@@ -51,8 +51,7 @@ class ContainmentFinder:
 
         Args:
             mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
-            bodies: Body of each face, integers from 0, shape [face_count]; or with those of ``mesh.free_edges`` after
-                them, for edges without faces to take part, which otherwise do not.
+            bodies: Body of each face, then of each of ``mesh.free_edges``, integers from 0, shape [n].
         """
         self._mesh, self._bodies = mesh, bodies.astype(np.int64)
 
@@ -204,12 +203,12 @@ class _Parts:
         body: Body of each part, shape [part_count].
         closed: Whether an even number of its faces meet at each edge, shape [part_count].
         oriented: Whether its faces pass each edge as often in one direction as in the other, shape [part_count].
-        of_face: Part of each face, then of the edges without faces that take part, shape [len(bodies)].
+        of_face: Part of each face, then of each edge without faces, shape [n].
         first_vertex: The first vertex of each part, shape [part_count].
     """
 
     def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
-        """Connects the faces of each body, and the edges without faces that have one."""
+        """Connects the faces and the edges without faces of each body."""
         self._edges, count = mesh.edges, mesh.vertex_count
         faces, face_edges = mesh.cells[: len(bodies)], mesh.cell_edges[: len(bodies)]
         # the nodes of a vertex that bodies share come after all vertices

@@ -223,6 +223,8 @@ class ReportPage(RecordFile):
     def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
         """Returns sentences on all that is not in the page."""
         notes = []
+        if summary.min_distance is not None and summary.scene.has_strands:
+            notes.append("Distances of curves and points are not checked, only their collisions.")
         most = f"an interval has at most {self._most_rows:,} rows, spread evenly, with at least one for each two meshes"
         rest = sum(at.crossings + at.touches + sum(at.inside.values()) for at in summary.intersections)
         near = sum(at.pairs for at in summary.proximities)
