@@ -30,7 +30,7 @@ COLORS = {
     "VertexEdge": (1.0, 0.7, 0.1),
     "VertexVertex": (1.0, 0.8, 0.5),
     "Intersections": (0.6, 0.2, 1.0),
-    "CurveIntersections": (0.6, 0.2, 1.0),
+    "CurveIntersections": (0.85, 0.35, 1.0),
     "Inside": (0.1, 0.5, 1.0),
     "Near": (0.1, 0.85, 0.4),
 }
