@@ -196,6 +196,8 @@ def collect_penetrations(
         else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
+            if progress.status.iteration[0] == 0 and is_on_body(motion, vertex):
+                progress.fast[world] = 1  # as between elements, see kernels.collect_contacts
         plane = planes.end[i]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         multiplier = wp.vec3d()
