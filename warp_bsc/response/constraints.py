@@ -100,9 +100,8 @@ _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
 _REST = wp.constant(wp.float64(0.25))
-"""Distance of slow elements of which one may rest on the other, as a share of their longest path, from which it does not
-grow: what is further apart than it comes in a step does not collide in the next, and what falls freely every few steps
-never rests."""
+"""Distance of what may rest from slow elements, as a share of their longest path, from which it does not grow: what is
+further apart than it comes in a step does not collide in the next, and falls freely every few steps."""
 _ROUNDING = wp.constant(wp.float64(2.0**-20))
 """Least distance of what rests, as a share of its coordinates: 16 times their rounding, which closes smaller ones."""
 LEAST_DISTANCE = wp.constant(wp.float64(0.1))
