@@ -7,7 +7,7 @@ import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.constraints import MAX_ITERATIONS
+from warp_bsc.response.constraints import EDGE_EDGE_PROXIMITY, MAX_ITERATIONS, VERTEX_FACE_PROXIMITY
 
 SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
 
@@ -108,6 +108,32 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
     with_proximities = rounds()
     monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
     assert 0 < with_proximities <= 3 < rounds()
+
+
+def test_proximities_are_of_neighbours_in_a_pile(device):
+    """Layers fall further in a step than three of them are apart; what is behind a neighbour is no proximity."""
+    layers, spacing = 5, 0.0004
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
+    for layer in range(layers):
+        at = (0.004 * layer, 0.003 * layer, spacing * (layer + 1))
+        add_patch(builder, 4, 0.028, at, velocity=(0.0, 0.0, -0.8))
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
+    rollout.step()
+    constraints = rollout.solver._response.constraints
+    kinds, corners = (
+        array.numpy()[: constraints.count.numpy()[0]] for array in (constraints.kind, constraints.vertices)
+    )
+    particles = model.particle_count
+    layer = np.where(corners < particles, corners // (particles // layers), -1)  # of the box: -1
+    x = model.particle_q.numpy()[:, :2]
+    covered = (np.abs(x) < 0.05).all(axis=1)  # by every layer
+    for kind in (int(VERTEX_FACE_PROXIMITY), int(EDGE_EDGE_PROXIMITY)):
+        found = (kinds == kind) & (corners < particles).all(axis=1)
+        found &= covered[np.minimum(corners, particles - 1)].all(axis=1)
+        apart = np.abs(layer[found, 0] - layer[found, 3])
+        assert len(apart) > 20 and (apart == 1).all(), (kind, np.bincount(apart))
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])

@@ -27,11 +27,20 @@ from .constraints import (
 from .exclusion import Connectivity, crossed_at_start, is_movable
 from .hidden_edges import are_hidden
 
-__all__ = ["Proximities", "closest_direction", "closest_vector", "collect_proximities", "drop_proximities"]
+__all__ = [
+    "Proximities",
+    "closest_direction",
+    "closest_vector",
+    "collect_proximities",
+    "drop_proximities",
+    "find_nearest",
+]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _REACH = wp.constant(wp.float64(1.5))
 """Distance in separations up to which pairs are proximities even if they stand still: neighbours in a stack."""
+_BEHIND = wp.constant(wp.float64(1.5))
+"""Distance, as a multiple of that of the nearest face in its direction, from which an element is behind that face."""
 _PARALLEL = wp.constant(wp.float64(1.0e-12))
 """Squared sine up to which edges, or two sides of a face, count as parallel."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -144,10 +153,50 @@ def _weights_across(motion: Motion, corners: wp.vec4i, edges: int):
 
 
 @wp.func
+def _direction(u: wp.vec3d) -> int:
+    """Returns to which of the six directions along the axes a vector is nearest."""
+    axis = int(0)
+    for other in range(1, 3):
+        if wp.abs(u[other]) > wp.abs(u[axis]):
+            axis = other
+    return 2 * axis + wp.where(u[axis] > _ZERO, 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def find_nearest(motion: Motion, vertex_face: Proximities, nearest: wp.array2d[float]):
+    """Finds how far each vertex is from the nearest face in each of six directions [m]; ``nearest`` is infinite before.
+
+    Only faces count that have the closest point within them.
+    """
+    i = wp.tid()
+    if not is_filled(i, vertex_face.pairs, vertex_face.counts, _QUEUED):
+        return
+    corners = vertices_of_pair(0, vertex_face.elements, vertex_face.pairs[i])
+    _weights, normal, distance = _weights_across(motion, corners, 0)
+    if distance > _ZERO:
+        wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
+
+
+@wp.func
+def _is_behind(
+    corners: wp.vec4i, edges: int, normal: wp.vec3d, distance: wp.float64, nearest: wp.array2d[float]
+) -> bool:
+    """Returns whether another face is between two elements: seen from the vertex, or from both ends of an edge."""
+    a = nearest[corners[0], _direction(-normal)]
+    if edges == 0:
+        return distance > _BEHIND * wp.float64(a)
+    b = nearest[corners[1], _direction(-normal)]
+    c = nearest[corners[2], _direction(normal)]
+    d = nearest[corners[3], _direction(normal)]
+    return distance > _BEHIND * wp.float64(wp.min(wp.max(a, b), wp.max(c, d)))
+
+
+@wp.func
 def _collect_proximity(
     motion: Motion,
     vertices: Vertices,
     near: Proximities,
+    nearest: wp.array2d[float],
     i: int,
     constraints: Constraints,
     progress: Progress,
@@ -170,7 +219,10 @@ def _collect_proximity(
         return
     if is_slow(motion, corners, near.edges) == 0:
         return
-    if progress.status.crossings[0] > 0 and crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+    if progress.status.crossings[0] > 0:
+        if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+            return
+    elif nearest and _is_behind(corners, near.edges, normal, distance, nearest):
         return
     if near.edges == 1 and are_hidden(motion, near.mesh, near.pairs[i], corners, normal, _ZERO):
         return
@@ -202,6 +254,7 @@ def collect_proximities(
     vertices: Vertices,
     vertex_face: Proximities,
     edge_edge: Proximities,
+    nearest: wp.array2d[float],
     constraints: Constraints,
     progress: Progress,
     separation: wp.float64,
@@ -210,11 +263,13 @@ def collect_proximities(
 
     In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
     the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs
-    whose closest points are within both elements are used, because others soon are those of other elements.
+    whose closest points are within both elements are used, because others soon are those of other elements, and none
+    with another face between them, if ``nearest`` is known and nothing crosses: neighbours in a stack hold what is
+    behind them.
     """
     i = wp.tid()
-    _collect_proximity(motion, vertices, vertex_face, i, constraints, progress, separation)
-    _collect_proximity(motion, vertices, edge_edge, i, constraints, progress, separation)
+    _collect_proximity(motion, vertices, vertex_face, nearest, i, constraints, progress, separation)
+    _collect_proximity(motion, vertices, edge_edge, nearest, i, constraints, progress, separation)
 
 
 @wp.kernel(**_KERNEL)

@@ -64,7 +64,7 @@ from .projection import (
     update_positions,
     update_velocities,
 )
-from .proximities import Proximities, collect_proximities, drop_proximities
+from .proximities import Proximities, collect_proximities, drop_proximities, find_nearest
 from .queueless import find_contacts_without_queues
 from .step_record import StepRecord, StepRecorder, name_elements
 
@@ -191,6 +191,7 @@ class Response:
         self._stopped = mesh.vertex_count if moves_bodies else self._movable  # vertices that planes may stop
         self._most_penetrations = self._stopped * int(planes_of_a_world)
         self._kept = wp.zeros(1, dtype=int, device=device)
+        self._nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
         self._crossing_candidates = CrossingCandidates(mesh)
         self._dividing_planes = allocate_dividing_planes(
             mesh.vertex_count, _DIVIDING_PLANES * self._movable, device, keep_distances=self._keeps_distances
@@ -361,7 +362,11 @@ class Response:
                 near.edges = int(narrow_phase.kind == PairKind.EDGE_EDGE)
                 near.elements, near.pairs, near.counts = elements, narrow_phase.queue, narrow_phase.counts
             queues = [(near.pairs, near.counts, Count.QUEUED) for near in kinds]
-            inputs = [motion, vertices, *kinds, self.constraints, self.progress, self.separation]
+            nearest = self._nearest
+            if nearest is not None:
+                nearest.fill_(np.inf)
+                self._launch_over(find_nearest, queues[:1], [motion, kinds[0], nearest])
+            inputs = [motion, vertices, *kinds, nearest, self.constraints, self.progress, self.separation]
             self._launch_over(collect_proximities, queues, inputs)
 
         retry_until_fits(collect, self, self.device)
