@@ -118,8 +118,8 @@ import warp as wp
                 flush();
             for (; mask; mask &= mask - 1) {
                 const int a = element[lane], b = other_element[__builtin_ctz(mask)];
-                found[2 * count] = symmetric && b < a ? b : a;
-                found[2 * count + 1] = symmetric && b < a ? a : b;
+                found[2 * count] = ordered && b < a ? b : a;
+                found[2 * count + 1] = ordered && b < a ? a : b;
                 ++count;
             }
         }
@@ -170,6 +170,7 @@ def pair_packet(
     other_node_worlds: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
     symmetric: int,
+    ordered: int,
     keep_separated: int,
     at_end: int,
     counts: wp.array[wp.int64],
@@ -182,7 +183,7 @@ def pair_packet(
     A candidate, a pair whose swept boxes overlap, is counted, and enqueued unless an axis separates the two at the
     start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. With ``at_end`` the
     boxes at the end count instead of the swept ones, and all pairs that overlap are enqueued. Pairs without a changed
-    element are excluded. With ``symmetric`` both are of one tree, and each pair is found once, the smaller number
-    first.
+    element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered`` the
+    smaller number comes first, else that of the packet.
     """
     ...

@@ -52,6 +52,26 @@ def test_boxes_on_a_grid(weld, dtype):
     assert total > 15
 
 
+def test_polylines_on_a_grid():
+    """One is inside a box if no point of it is outside and some is on no side of the box; its edges touch at most."""
+    random = np.random.default_rng(2)
+    vertices, faces = box((0, 0, 0), (4, 4, 4))
+    lines = random.integers(0, 5, (80, 3, 3)) + random.choice([-1, 0, 1], (80, 3, 3), p=[0.05, 0.9, 0.05])
+    x = np.concatenate([vertices, lines.reshape(-1, 3)]).astype(np.float64)
+    starts = len(vertices) + 3 * np.arange(len(lines))
+    edges = (starts[:, None, None] + np.array([[0, 1], [1, 2]])).reshape(-1, 2)
+    mesh = bsc.CollisionMesh(faces, len(x), edges=edges, device="cpu")
+    bodies = np.concatenate([np.zeros(len(faces), dtype=int), 1 + np.arange(len(edges)) // 2])
+    found = bsc.CollisionDetector(mesh).intersection_finder().find(x)
+    inside = ContainmentFinder(mesh, bodies).find(x, found, lambda pairs: np.ones(len(pairs), dtype=bool))
+    in_closed = ((lines >= 0) & (lines <= 4)).all(axis=(1, 2))
+    in_open = ((lines > 0) & (lines < 4)).all(axis=2).any(axis=1)
+    expected = 1 + np.flatnonzero(in_closed & in_open)
+    assert 5 < len(expected) < in_closed.sum() < len(lines)
+    assert inside.bodies.tolist() == [[body, 0] for body in expected.tolist()]
+    assert ((x[inside.vertices] > 0) & (x[inside.vertices] < 4)).all()
+
+
 def solid_angle(points, corners):
     """Times that a closed surface winds around points, in floating point."""
     a, b, c = (corners[None] - points[:, None, None]).transpose(2, 0, 1, 3)

@@ -7,7 +7,7 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection import pipeline
+from warp_bsc.detection import intersections, pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.distance_phase import pair_distances
@@ -102,6 +102,41 @@ def test_all_pairs_are_found(monkeypatch, device, broad_phase, dtype, how):
     assert_same(collisions, expected)
     assert_same(detector.detect(x0, x1), expected)  # with the trees of the run before
     assert collisions.earliest_toi == min(getattr(collisions, f"{label}_toi").min(initial=2.0) for label in expected)
+
+
+@pytest.mark.parametrize("broad_phase", [BroadPhaseSimd, BroadPhaseHierarchy])
+def test_only_pairs_with_what_no_face_has(monkeypatch, device, broad_phase):
+    """A rope tied to the cloth, a string between two of its vertices, and points; pairs of the cloth are left out."""
+    if broad_phase is BroadPhaseSimd and device.is_cuda:
+        pytest.skip("SIMD packets are for the CPU")
+
+    def make_broad_phase(mesh, count, *, padding=None, **_):
+        return broad_phase(mesh, count, padding=padding)
+
+    for module in (pipeline, intersections):
+        monkeypatch.setattr(module, "make_broad_phase", make_broad_phase)
+    arguments, radius, x0, x1 = scene(np.float32)
+    arguments["edges"] = np.concatenate([arguments["edges"], [[2, arguments["edges"][0, 0]], [1, 30]]])
+    meshes = [bsc.CollisionMesh(**arguments, radius=radius, only_free=only_free) for only_free in (False, True)]
+    mesh = meshes[0]
+    everything, found = (bsc.CollisionDetector(one, method="exact", min_distance=0.0007) for one in meshes)
+    for start, end in ((x0, x1), (x1, x0)):
+        whole, part = everything.detect(start, end), found.detect(start, end)
+        is_free = ~np.isin(whole.vertex_face[:, 0], mesh.faces)
+        np.testing.assert_array_equal(part.vertex_face, whole.vertex_face[is_free])
+        is_free = np.isin(whole.edge_edge, mesh.free_edges).any(axis=1)
+        np.testing.assert_array_equal(part.edge_edge, whole.edge_edge[is_free])
+        assert 0 < len(part.edge_edge) < len(whole.edge_edge) and 0 < len(part.vertex_face) < len(whole.vertex_face)
+        assert part.stats.edge_edge.candidates < whole.stats.edge_edge.candidates
+        for label in ("vertex_edge", "vertex_vertex"):
+            np.testing.assert_array_equal(getattr(part, label), getattr(whole, label))
+        mixed = np.random.default_rng(0).permutation(end)
+        for x, is_end in ((end, True), (mixed, False)):
+            crossing = everything.find_intersections(x)
+            of_free = crossing[np.isin(crossing[:, 0], mesh.free_edges)]
+            assert 0 < len(of_free) <= len(crossing) - (not is_end)
+            np.testing.assert_array_equal(found.find_intersections(x), of_free)
+            np.testing.assert_array_equal(found.intersection_finder().find(x, is_end=is_end).pairs, of_free)
 
 
 def test_method_conservative_misses_nothing():

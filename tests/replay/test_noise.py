@@ -109,6 +109,17 @@ def test_what_is_new_against_a_baseline(stage, tmp_path, capsys):
     before.write_text(json.dumps(json.loads(before.read_text()), indent=1))  # as other programs write it
     assert main(["replay", path, *options, str(before), "--fail-on", "new,collisions"]) == 1
     assert "Nothing is new" in capsys.readouterr().out
+    whole = before.read_text()
+    before.write_text(whole.replace('"complete": true', '"complete": false'))
+    assert main(["replay", path, *options, str(before)]) == 2
+    assert "before.json: its replay was stopped, and does not say what there is later" in capsys.readouterr().err
+    before.write_text(whole.replace('"intersections": true', '"intersections": false'))
+    assert main(["replay", path, *options, str(before)]) == 2
+    assert "its replay had --no-intersections, and does not say what crossed" in capsys.readouterr().err
+    assert main(["replay", path, *options, str(before), "--no-intersections", "--fail-on", "new"]) == 0
+    before.unlink()
+    assert main(["replay", path, *options, str(before)]) == 2
+    assert f"error: {before}: No such file or directory\n" in capsys.readouterr().err
     for text in ("{}", "[]", "no JSON", ""):
         before.write_text(text)
         assert main(["replay", path, *options, str(before)]) == 2

@@ -6,11 +6,13 @@ import json
 import numpy as np
 import pytest
 from chromium import CHROMIUM, Browser
-from pxr import UsdGeom
+from pxr import Usd, UsdGeom
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
+from test_intersections import CORNERS, SIDES
 from test_replay_outputs import Page
 
 import warp_bsc as bsc
+from warp_bsc import checker
 from warp_bsc.cli.main import main
 
 ALONG = [(0.0, -0.5, 0.0), (0.5, -0.5, 0.0), (1.0, -0.5, 0.0)]
@@ -74,10 +76,9 @@ def test_a_rope_meets_a_floor_at_half_its_width(stage, widths, interpolation, ra
         assert hit in [one for one in listed if one[1].startswith("vertex")]
     (interval,) = found["intervals"]
     assert interval["vertex_face_hits"] == 3 and interval["hits"] == len(listed)
-    assert all(contact["phase"] is contact["separate"] is None for contact in interval["contacts"])
-    assert found["warnings"] == [
-        "curves and points are checked between the times alone, with half their widths as radii: 1 BasisCurves"
-    ]
+    assert all((contact["phase"], contact["separate"]) == ("passes", True) for contact in interval["contacts"])
+    (warning,) = found["warnings"]
+    assert warning.startswith("curves and points are checked with half their widths as radii between the times; ")
     assert found["certified"] and found["intersections"] == []
 
 
@@ -122,12 +123,118 @@ def test_points_with_all_kinds(stage, tmp_path, capsys):
     assert by_kind["vertex-edge"]["position"] == pytest.approx([0.25, -1, 0.25])
     assert by_kind["vertex-vertex"]["position"] == pytest.approx([-1, -1, 0.3125], abs=1e-5)
     assert by_kind["vertex-vertex"]["normal"] == pytest.approx([0, 0, 1])
+    assert all(contact["phase"] is contact["separate"] is None for contact in by_kind.values())
     assert found["hits"] == 3
     assert "1 vertex-face, 0 edge-edge, 1 vertex-edge and 1 vertex-vertex pairs." in capsys.readouterr().out
     with out.open() as file:
         assert {row["kind"] for row in csv.DictReader(file)} == set(by_kind)
     overlay = (tmp_path / "overlay.usda").read_text()
     assert 'def PointInstancer "VertexEdge"' in overlay and 'def PointInstancer "VertexVertex"' in overlay
+
+
+UPRIGHT = [(0.25, -0.5, -0.5), (0.25, -0.5, 0.5), (0.25, -0.5, 1.5)]
+"""A rope whose first edge passes through the floor's first triangle."""
+
+
+@pytest.fixture
+def pierced(stage):
+    """A rope that is above the floor, comes through it, stays, and leaves it, and one that passes through a wall."""
+    add_rope(stage, "/World/Rope", lowered(UPRIGHT, 1, 0, -0.25, 0, 1), [0.0625])
+    add_rope(stage, "/World/Still", moved(UPRIGHT, (0.5, 0.25, 0)), [0.0625])
+    add_rope(stage, "/World/Standing", moved(UPRIGHT, (0, 0.25, 0.5)))
+    return stage
+
+
+def test_edges_of_curves_through_faces_are_found_at_rest(pierced, tmp_path, capsys):
+    names = {name: tmp_path / f"out.{name}" for name in ("csv", "usda", "html")}
+    words = ("--csv", str(names["csv"]), "--overlay", str(names["usda"]), "--report", str(names["html"]))
+    found = find(pierced, *words)
+    printed = capsys.readouterr().out
+    assert "Already crosses at 0: 1 edge through faces, 1 edge touching faces." in printed
+    assert "  /World/Floor with /World/Still: from 0 to 4, 1 edge at first, 1 at last: stays\n" in printed
+    assert "  /World/Floor with /World/Rope: from 1 to 3, 1 edge at first, 1 at last: heals\n" in printed
+    assert "  /World/Floor with /World/Standing: from 0 to 4, 1 edge at first, 1 at last: touches only\n" in printed
+    spans = {(span["meshes"][1], span["since"], span["until"], span["crossings"]) for span in found["intersections"]}
+    assert spans == {("/World/Still", 0, 4, 1), ("/World/Rope", 1, 3, 1), ("/World/Standing", 0, 4, 0)}
+    rows = [row for row in found["intervals"][2]["edges_through_faces"] if row["meshes"][0] == "/World/Rope"]
+    assert [(row["elements"], row["meshes"], row["phase"], row["position"], row["time"]) for row in rows] == [
+        (["edge 0-1", "face 0"], ["/World/Rope", "/World/Floor"], "crosses", [0.25, -0.5, 0], 2)
+    ]
+    # the rope's first point comes through the floor and goes back; its edge in the floor meets no other edge
+    of_rope = [[c for c in interval["contacts"] if "/World/Rope" in c["meshes"]] for interval in found["intervals"]]
+    phases = [{(contact["phase"], contact["separate"]) for contact in contacts} for contacts in of_rope]
+    assert phases == [{("enters", True)}, set(), set(), {("leaves", False)}]
+    with names["csv"].open() as file:
+        written = [row for row in csv.DictReader(file) if row["phase"] == "crosses"]
+    assert len(written) == 5 + 3 and {row["first_mesh"] for row in written} == {"/World/Rope", "/World/Still"}
+    layer = Usd.Stage.Open(str(names["usda"]))
+    points = UsdGeom.PointInstancer(layer.GetPrimAtPath("/Collisions/CurveIntersections"))
+    for time, count in ((0, 1), (1, 2), (2, 2), (3, 2), (4, 1)):
+        assert len(points.GetPositionsAttr().Get(time) or ()) == count, time
+    assert not layer.GetPrimAtPath("/Collisions/Intersections").GetAttribute("points").Get(2)
+    block = Page(names["html"].read_text()).block("rest-2")
+    np.testing.assert_allclose(sorted(np.diff(block["through"].reshape(-1, 3), axis=0)[0]), [0, 0.25, 0.5])
+
+
+def test_ignored_initial_curves_and_no_intersections(pierced):
+    found = find(pierced, "--ignore-initial")
+    assert {span["meshes"][1] for span in found["intersections"]} == {"/World/Rope", "/World/Standing"}
+    without = find(pierced, "--no-intersections")
+    assert "intersections" not in without["intervals"][0] and without["hits"] == find(pierced)["hits"]
+
+
+def test_curves_of_a_still_stage_are_checked_at_rest(stage):
+    add_rope(stage, "/World/Still", UPRIGHT)
+    found = find(stage)
+    assert [(span["meshes"], span["crossings"]) for span in found["intersections"]] == [
+        (["/World/Floor", "/World/Still"], 1)
+    ]
+    assert found["hits"] == 0
+
+
+def test_random_curves_through_random_meshes(stage):
+    """All edges that the exact checker finds, and no others, at each time."""
+    rng = np.random.default_rng(0)
+    at = {t: rng.uniform(-1, 1, (30, 3)).astype(np.float32) for t in range(3)}
+    add_mesh(stage, "/World/Soup", {t: x[:12].tolist() for t, x in at.items()}, [3] * 4, list(range(12)))
+    add_rope(stage, "/World/Ropes", {t: x[12:].tolist() for t, x in at.items()}, [0.01], counts=[9, 9])
+    scene = bsc.Scene(save(stage), selection=bsc.Selection(exclude=("/World/Floor",)))
+    faces = np.arange(12).reshape(4, 3)
+    ends = np.delete(np.stack([np.arange(17), np.arange(1, 18)], axis=1), 8, axis=0) + 12
+    total = 0
+    for result in bsc.replay(scene, device="cpu"):
+        start, end = result.intersections
+        for found, time in ((start, result.summary.start), (end, result.summary.end)):
+            x = at[time]
+            edge, face = (grid.ravel() for grid in np.meshgrid(range(len(ends)), range(len(faces)), indexing="ij"))
+            corners = x[faces[face]]
+            passes = checker.edges_pass_faces(x[ends[edge]], corners, corners)
+            expected = {(*(ends[i] - 12), j) for i, j in zip(edge[passes], face[passes], strict=True)}
+            rows = found.of_curves
+            assert {(*i, j) for i, (j, _) in found.indices[rows]} == expected and len(rows) == len(expected)
+            assert found.crossings > len(rows)  # the soup crosses itself, too
+            total += len(rows)
+    assert total > 10
+
+
+def test_curves_inside_a_box(stage, tmp_path):
+    """Of two curves of a prim one is inside; another is tied to a corner of the box; one passes through a wall."""
+    box = moved(CORNERS, (4, 0, 0))
+    add_mesh(stage, "/World/Box", {t: box for t in range(2)}, [4] * 6, SIDES)
+    inner = [(4.25, 0.25, 0.25), (4.5, 0.5, 0.5), (4.75, 0.5, 0.5)]
+    add_rope(
+        stage, "/World/Two", {0: inner + moved(inner, (2, 0, 0)), 1: moved(inner + inner, (2, 0, 0))}, counts=[3, 3]
+    )
+    add_rope(stage, "/World/Tied", [tuple(box[0]), *moved(inner[1:], (0, 0, 0.125))])
+    add_rope(stage, "/World/Through", [*moved(inner, (0, 0.25, 0)), (9, 0, 0)])
+    add_points(stage, "/World/Dust", [inner[0]])
+    out = tmp_path / "overlay.usda"
+    found = find(stage, "--overlay", str(out))
+    inside = {(*span["meshes"], span["until"], span["last"]) for span in found["intersections"] if span["inside"]}
+    assert inside == {("/World/Two", "/World/Box", 0, 1), ("/World/Tied", "/World/Box", 1, 1)}
+    (row,) = [row for row in found["intervals"][0]["inside"] if row["meshes"][0] == "/World/Two"]
+    assert row["elements"][0] == "vertex 0" and row["position"] == list(inner[0])
+    assert {span["meshes"][1] for span in found["intersections"] if not span["inside"]} == {"/World/Through"}
 
 
 def test_a_thick_rope_meets_itself_only_where_it_comes_back(stage):
@@ -208,13 +315,17 @@ def test_emitted_points_split_the_motion(stage):
     assert any("/World/Dust changes its topology at time 1" in warning for warning in found["warnings"])
 
 
-def test_a_scene_without_faces(tmp_path):
+def test_a_scene_without_faces(tmp_path, capsys):
     stage = new_stage(tmp_path / "ropes.usda")
     add_rope(stage, "/World/Still", [(-1, 0, 0), (1, 0, 0)], [0.25])
     add_rope(stage, "/World/Falling", lowered([(0, -1, 0), (0, 1, 0)], 1, -1), [0.25])
     add_points(stage, "/World/Thin", lowered([(0.5, 0, 0)], 1, -1))
     words = [word for name in ("csv", "overlay", "report") for word in (f"--{name}", str(tmp_path / f"{name}.usda"))]
     found = find(stage, "--min-distance", "0.1", *words)
+    said = "at 2 times; between times, distances are not checked, nor are those of curves and points at all.\n"
+    assert said in capsys.readouterr().out
+    notes = Page((tmp_path / "report.usda").read_text()).data["notes"]
+    assert "Distances of curves and points are not checked, only their collisions." in notes
     assert [(contact["kind"], contact["triangle"]) for contact in found["intervals"][0]["contacts"]] == [
         ("edge-edge", None), ("vertex-edge", None)
     ]  # fmt: skip

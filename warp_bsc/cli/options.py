@@ -126,9 +126,12 @@ def positive_number(text: str) -> float:
     """The finite number that an argument holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is not finite or not more than 0.
+        argparse.ArgumentTypeError: If it is no number, not finite or not more than 0.
     """
-    number = float(text)
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
     if not 0.0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
     return number
@@ -138,9 +141,12 @@ def positive(text: str) -> int:
     """The integer that an argument holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is less than 1.
+        argparse.ArgumentTypeError: If it is no integer or less than 1.
     """
-    number = int(text)
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
     if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
+        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, not {text}")
     return number

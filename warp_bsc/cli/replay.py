@@ -53,8 +53,8 @@ obstacles are excluded, and so are contacts of a mesh with itself if only its
 transform moves it. Linear curves and points take part, with half their widths
 as radii. Rotations are sampled at every whole time code as well.
 At the time samples themselves, find the edges that pass through faces and the
-meshes that are wholly inside closed ones, obstacles included; where nothing
-moves, this is done at one time.
+meshes that are wholly inside closed ones, obstacles and linear curves included;
+where nothing moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
 finished intervals, marked partial."""
@@ -136,8 +136,8 @@ def add_to(commands: Commands) -> None:
         metavar="D",
         help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
         "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
-        "samples are not checked; an edge through a face is an intersection, however far their vertices are. Listed in "
-        "the tables, --json and --csv",
+        "samples are not checked, nor are those of curves and points; an edge through a face is an intersection, "
+        "however far their vertices are",
     )
     which.add_argument(
         "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
@@ -250,9 +250,12 @@ def add_to(commands: Commands) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
+    baseline = None
+    if arguments.baseline:
+        baseline = Baseline(arguments.baseline, arguments.min_distance, intersections=arguments.intersections)
     if arguments.scheduler:
         try:
-            return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device))
+            return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device), baseline)
         except ModuleNotFoundError as error:
             raise ValueError(f"--scheduler: {error}") from error
     device = find_device(arguments.device)
@@ -265,7 +268,7 @@ def _run(arguments: argparse.Namespace) -> int:
             proximities=arguments.min_distance is not None,
             strands=scene.has_strands,
         )
-    return run_replay(scene, arguments, str(device))
+    return run_replay(scene, arguments, str(device), baseline)
 
 
 def open_scene(arguments: argparse.Namespace) -> Scene:
@@ -330,13 +333,14 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     return scene
 
 
-def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
+def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baseline: Baseline | None) -> int:
     """Replays a scene, writes the files that the options name, and returns the exit status.
 
     Args:
         scene: The scene.
         arguments: The options.
         device: Name of the Warp device.
+        baseline: What an earlier replay has found, to compare with; None for nothing.
 
     Raises:
         ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
@@ -344,7 +348,6 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str) -> int:
     """
     settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
-    baseline = Baseline(arguments.baseline, arguments.min_distance) if arguments.baseline else None
     with contextlib.ExitStack() as stack:
         earlier = None
         if arguments.resume and os.path.exists(arguments.json):
@@ -602,4 +605,9 @@ def _frames(text: str) -> FrameRange:
 
 
 def _validate(text: str) -> int | None:
-    return None if text == "all" else positive(text)
+    if text == "all":
+        return None
+    try:
+        return positive(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"must be all or an integer of at least 1, not {text}") from error

@@ -247,6 +247,8 @@ def _print_proximities(console: Console, summary: Summary, min_distance: float) 
     """Prints which meshes come nearer each other than the distance at the times themselves, and where most."""
     samples, nearest = summary.proximities, summary.nearest
     times = f"{count(len(samples), 'time')}; between times, distances are not checked"
+    if summary.scene.has_strands:
+        times += ", nor are those of curves and points at all"
     if not nearest:
         say(console, f"No elements are at most {min_distance:g} apart, at {times}.")
         return

@@ -80,6 +80,7 @@ class FaceHierarchy:
 
     Attributes:
         all_faces: Whether all cells are faces.
+        only_free: Whether only pairs with a cell that is no face are wanted.
         face_count: Number of faces; greater cells are edges.
         point_start: First cell that is a point.
         order: Cell at each place, -1 for none.
@@ -98,6 +99,7 @@ class FaceHierarchy:
     """
 
     all_faces: wp.bool
+    only_free: wp.bool
     face_count: int
     point_start: int
     order: wp.array[int]
@@ -218,6 +220,8 @@ def _box_elements(dtype: type, padded: bool) -> wp.Kernel:
                 has_changed = 1
                 if changed:
                     has_changed = changed[a] | changed[b] | changed[c]
+                if mesh.only_free and mesh.order[i] < mesh.face_count:
+                    has_changed = 0
             mesh.places.lowers[i] = low
             mesh.places.uppers[i] = high
             mesh.places.changed[i] = has_changed
@@ -596,6 +600,7 @@ def _make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
 
     hierarchy.order = wp.array(order, dtype=int, device=device)
     hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
+    hierarchy.only_free = mesh.only_free
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
     hierarchy.faces = by_place(mesh.cells)
     hierarchy.face_edges = by_place(mesh.cell_edges)

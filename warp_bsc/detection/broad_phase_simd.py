@@ -155,6 +155,7 @@ def _pair_packets(
     level_starts: wp.array[int],
     # options
     symmetric: int,
+    ordered: int,
     keep_separated: int,
     at_end: int,
     # out
@@ -174,6 +175,7 @@ def _pair_packets(
         other_node_worlds,
         level_starts,
         symmetric,
+        ordered,
         keep_separated,
         at_end,
         counts,
@@ -270,7 +272,14 @@ class _Tree:
             _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
 
     def pair(
-        self, other: "_Tree", counts: wp.array, pairs: wp.array, *, keep_separated: bool = False, at_end: bool = False
+        self,
+        other: "_Tree",
+        counts: wp.array,
+        pairs: wp.array,
+        *,
+        ordered: bool = False,
+        keep_separated: bool = False,
+        at_end: bool = False,
     ) -> None:
         """Enqueues the candidates between this tree and another, or within this tree.
 
@@ -280,6 +289,7 @@ class _Tree:
             other: The other tree, or this tree.
             counts: By :class:`Count`, array of int64.
             pairs: Queue of the candidates, array of vec2i.
+            ordered: Whether the smaller number comes first; else that of this tree does.
             keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
         """
@@ -296,6 +306,7 @@ class _Tree:
             other._node_worlds.flatten(),
             other._level_starts,
             other is self,
+            ordered,
             keep_separated,
             at_end,
             counts,
@@ -315,7 +326,8 @@ class BroadPhaseSimd:
     """The broad phase by wide BVHs, one a kind of element; a :class:`warp_bsc.detection.broad_phase.BroadPhase`.
 
     It pairs elements directly, and has no queue for pairs of faces. Points and the edges that no face has, whose pairs
-    count with a minimum distance only, have trees of their own.
+    count with a minimum distance only, have trees of their own. Where only pairs with these edges and with vertices
+    that no face has are wanted, only their trees are paired with the others.
     """
 
     buffers: tuple[wp.array, ...] = ()
@@ -329,14 +341,25 @@ class BroadPhaseSimd:
             count: Not used.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+
+        def of_vertices(vertices: np.ndarray) -> _Tree:
+            return _Tree(vertices.reshape(-1, 1), vertices, mesh.world, padding)
+
+        def of_edges(edges: np.ndarray) -> _Tree:
+            return _Tree(mesh.edges[edges], edges, mesh.world, padding)
+
         self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
-        self._vertices = _Tree(mesh.vertices.reshape(-1, 1), mesh.vertices, mesh.world, padding)
-        self._edges = _Tree(mesh.edges, np.arange(len(mesh.edges)), mesh.world, padding)
         self._faces = _Tree(mesh.faces, np.arange(len(mesh.faces)), mesh.world, padding)
-        self._points = self._free_edges = None
+        self._edges_of_faces = self._points = self._free_edges = None
+        if mesh.only_free:
+            self._vertices = of_vertices(np.setdiff1d(mesh.vertices, mesh.faces))
+            self._edges = of_edges(mesh.free_edges)
+            self._edges_of_faces = of_edges(np.setdiff1d(np.arange(len(mesh.edges)), mesh.free_edges))
+        else:
+            self._vertices = of_vertices(mesh.vertices)
+            self._edges = of_edges(np.arange(len(mesh.edges)))
         if len(mesh.points):
-            self._points = _Tree(mesh.points.reshape(-1, 1), mesh.points, mesh.world, padding)
-            self._free_edges = _Tree(mesh.edges[mesh.free_edges], mesh.free_edges, mesh.world, padding)
+            self._points, self._free_edges = of_vertices(mesh.points), of_edges(mesh.free_edges)
 
     def grow(self, count: int) -> None:
         """Does nothing, as there is no queue."""
@@ -355,9 +378,11 @@ class BroadPhaseSimd:
         keep_separated: bool = False,
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates."""
-        self._build([self._vertices, self._edges, self._faces], x0, x1, refit, changed)
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=keep_separated)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=keep_separated)
+        trees = [self._vertices, self._edges, self._faces]
+        if self._edges_of_faces:
+            trees.append(self._edges_of_faces)
+        self._build(trees, x0, x1, refit, changed)
+        self._pair_elements(vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, keep_separated)
 
     def pair_points(
         self,
@@ -377,14 +402,15 @@ class BroadPhaseSimd:
             return
         self._build([self._points, self._free_edges], x0, x1, refit, changed)
         self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, keep_separated=keep_separated)
-        self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, keep_separated=keep_separated)
+        self._points.pair(
+            self._points, vertex_vertex_counts, vertex_vertex, ordered=True, keep_separated=keep_separated
+        )
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
     ) -> None:
         """Enqueues all candidates of the last run."""
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, keep_separated=True)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge, keep_separated=True)
+        self._pair_elements(vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, True)
 
     def pair_edges_with_faces(
         self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
@@ -393,6 +419,21 @@ class BroadPhaseSimd:
         if not is_end:
             self._build([self._edges, self._faces], x, x, refit)
         self._edges.pair(self._faces, counts, pairs, at_end=True)
+
+    def _pair_elements(
+        self,
+        vertex_face_counts: wp.array,
+        vertex_face: wp.array,
+        edge_edge_counts: wp.array,
+        edge_edge: wp.array,
+        keep_separated: bool,
+    ) -> None:
+        """Enqueues the candidates of the trees, with arguments as of :meth:`pair_elements`."""
+        options = {"keep_separated": keep_separated}
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
+        if self._edges_of_faces:
+            self._edges.pair(self._edges_of_faces, edge_edge_counts, edge_edge, ordered=True, **options)
 
     def _build(
         self, trees: Sequence[_Tree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None

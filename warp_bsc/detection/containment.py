@@ -34,10 +34,11 @@ class Containment:
 class ContainmentFinder:
     """Finds what is inside what, in one configuration after another, in meshes that consist of several bodies.
 
-    A part of a body is what its faces connect. A part is closed if an even number of its faces meet
-    at each edge. Closed parts enclose what they wind around; where the faces of a part are not oriented alike, what a
-    ray from it passes an odd number of times. All closed parts of a body count together, with their signs: what is in
-    the cavity of a hollow body, whose inner surface is turned inwards, is not inside. Open parts enclose nothing.
+    A part of a body is what its faces and its edges without faces connect. A part is closed if an even number of its
+    faces meet at each edge, and it has no other edges. Closed parts enclose what they wind around; where the faces of a
+    part are not oriented alike, what a ray from it passes an odd number of times. All closed parts of a body count
+    together, with their signs: what is in the cavity of a hollow body, whose inner surface is turned inwards, is not
+    inside. Open parts enclose nothing.
 
     A part is wholly inside a body if it is inside at one of its vertices and its edges and faces pass through none of
     the body's. A part that touches the body is inside if none of its vertices is outside, and not all are on the body.
@@ -50,7 +51,7 @@ class ContainmentFinder:
 
         Args:
             mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
-            bodies: Body of each face, integers from 0, shape [face_count].
+            bodies: Body of each face, then of each of ``mesh.free_edges``, integers from 0, shape [n].
         """
         self._mesh, self._bodies = mesh, bodies.astype(np.int64)
 
@@ -190,7 +191,7 @@ class ContainmentFinder:
         for bit, is_aside in enumerate((x[:, 0] < low[0], *(x[:, 1:] < low[1:]).T, *(x[:, 1:] > high[1:]).T)):
             sides |= is_aside.astype(np.uint8) << bit
         a, b, c = (sides[corners] for corners in self._mesh.faces.T)
-        return np.flatnonzero(is_wanted[self._parts.of_face] & (a & b & c == 0))
+        return np.flatnonzero(is_wanted[self._parts.of_face[: len(a)]] & (a & b & c == 0))
 
 
 class _Parts:
@@ -202,20 +203,21 @@ class _Parts:
         body: Body of each part, shape [part_count].
         closed: Whether an even number of its faces meet at each edge, shape [part_count].
         oriented: Whether its faces pass each edge as often in one direction as in the other, shape [part_count].
-        of_face: Part of each face, shape [face_count].
+        of_face: Part of each face, then of each edge without faces, shape [n].
         first_vertex: The first vertex of each part, shape [part_count].
     """
 
     def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
-        """Connects the faces of each body."""
+        """Connects the faces and the edges without faces of each body."""
         self._edges, count = mesh.edges, mesh.vertex_count
+        faces, face_edges = mesh.cells[: len(bodies)], mesh.cell_edges[: len(bodies)]
         # the nodes of a vertex that bodies share come after all vertices
         last_body = np.zeros(count, dtype=np.int64)
-        last_body[mesh.faces] = bodies[:, None]
+        last_body[faces] = bodies[:, None]
         is_shared = np.zeros(count, dtype=bool)
-        is_shared[mesh.faces[last_body[mesh.faces] != bodies[:, None]]] = True
-        nodes, self._node_vertices = _divide(mesh.faces, is_shared, bodies)
-        edges, of_edges = _divide(mesh.face_edges, is_shared[mesh.edges[:, 0]] & is_shared[mesh.edges[:, 1]], bodies)
+        is_shared[faces[last_body[faces] != bodies[:, None]]] = True
+        nodes, self._node_vertices = _divide(faces, is_shared, bodies)
+        edges, of_edges = _divide(face_edges, is_shared[mesh.edges[:, 0]] & is_shared[mesh.edges[:, 1]], bodies)
 
         roots = _connect(nodes, len(self._node_vertices))
         used = np.zeros(len(roots), dtype=bool)
@@ -238,7 +240,7 @@ class _Parts:
 
         proper = edges >= 0  # others are between corners in one vertex
         of_side = np.broadcast_to(self.of_face[:, None], edges.shape)[proper]
-        forward = mesh.faces == mesh.edges[mesh.face_edges, 0]
+        forward = faces == mesh.edges[face_edges, 0]
         counts = np.bincount(edges[proper], minlength=len(of_edges))
         sums = np.bincount(edges[proper], np.where(forward[proper], 1, -1), len(of_edges))
         self.closed = np.bincount(of_side, counts[edges[proper]] % 2, part_count) == 0

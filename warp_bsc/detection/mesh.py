@@ -36,6 +36,7 @@ class CollisionMesh:
             [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
+        only_free: Whether pairs of which faces have both elements are left out.
         device: Warp device of the arrays that the detector uses.
     """
 
@@ -48,6 +49,7 @@ class CollisionMesh:
         points: np.ndarray | wp.array | None = None,
         radius: float | np.ndarray | wp.array | None = None,
         world: np.ndarray | wp.array | None = None,
+        only_free: bool = False,
         device: wp.DeviceLike = None,
     ):
         """Finds the edges and puts the mesh on a device.
@@ -62,6 +64,8 @@ class CollisionMesh:
                 or Warp array; or one for all. A pair collides if it comes within the sum of its two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
+            only_free: Whether to find only the pairs with a vertex or an edge that no face has. The others, which
+                another detector can find, then cost no time.
             device: Warp device; default: Warp's default.
 
         Raises:
@@ -82,24 +86,32 @@ class CollisionMesh:
         given_points = self._checked_indices(() if points is None else points, 1, "point")
         self.faces = faces
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        all_edges, first_sides, edge_of_side = np.unique(
-            np.concatenate([sides, np.sort(given_edges, axis=1)]), axis=0, return_index=True, return_inverse=True
+        rows = np.concatenate([sides, np.sort(given_edges, axis=1)]).astype(np.int64)
+        # as one number for each pair of vertices: NumPy sorts rows much more slowly
+        keys, first_sides, edge_of_side = np.unique(
+            rows @ np.array([self.vertex_count, 1]), return_index=True, return_inverse=True
         )
+        all_edges = np.stack(np.divmod(keys, max(1, self.vertex_count)), axis=1).astype(np.int32)
         # a face that names a vertex twice has an edge without length: its point belongs to the other edge
         proper = all_edges[:, 0] != all_edges[:, 1]
         self.edges = all_edges[proper]
         face_edges = np.where(proper, np.cumsum(proper) - 1, -1)[edge_of_side.ravel()[: len(sides)]].reshape(-1, 3)
         self.free_edges = np.flatnonzero(first_sides[proper] >= len(sides)).astype(np.int32)
-        face_vertices, first_corners = np.unique(self.faces, return_index=True)
-        connected = np.union1d(face_vertices, given_edges)
-        self.points = np.setdiff1d(given_points, connected)
-        self.vertices = np.union1d(connected, self.points)
+        first_corner = np.full(self.vertex_count, -1)
+        first_corner[self.faces.ravel()[::-1]] = np.arange(self.faces.size)[::-1]  # the last one written stays
+        first_corners = first_corner[first_corner >= 0]
+        is_used = first_corner >= 0
+        is_used[given_edges] = True
+        self.points = np.unique(given_points[~is_used[given_points]])
+        is_used[self.points] = True
+        self.vertices = np.flatnonzero(is_used).astype(np.int32)
         # the representative of an element is the first face that has it: bits 0 to 2 corners, 3 to 5 edges
         owned = np.zeros(len(self.faces), dtype=np.int32)
         np.bitwise_or.at(owned, first_corners // 3, 1 << (first_corners % 3))
         first_sides = first_sides[proper & (first_sides < len(sides))]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
         self.face_edges, self.owned = face_edges.astype(np.int32), owned
+        self.only_free = only_free
         self.device = wp.get_device(device)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
@@ -206,20 +218,20 @@ class CollisionMesh:
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face or an edge."""
-        world = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
-        if world.shape != (self.vertex_count,) or not np.issubdtype(world.dtype, np.integer):
+        worlds: np.ndarray = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
+        if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):
             raise ValueError(
-                f"world must be {self.vertex_count} integers, one a vertex, got {world.dtype} {world.shape}"
+                f"world must be {self.vertex_count} integers, one a vertex, got {worlds.dtype} {worlds.shape}"
             )
-        bad = (world < 0) | (world >= 2**31)
+        bad = (worlds < 0) | (worlds >= 2**31)
         if bad.any():
-            raise ValueError(f"vertex {np.argmax(bad)} is in world {world[np.argmax(bad)]}; worlds are in [0, 2^31)")
-        worlds = world[self.faces]
-        mixed = np.flatnonzero((worlds != worlds[:, :1]).any(axis=1))
+            raise ValueError(f"vertex {np.argmax(bad)} is in world {worlds[np.argmax(bad)]}; worlds are in [0, 2^31)")
+        of_faces = worlds[self.faces]
+        mixed = np.flatnonzero((of_faces != of_faces[:, :1]).any(axis=1))
         if len(mixed):
-            raise ValueError(f"face {mixed[0]} has vertices in worlds {worlds[mixed[0]].tolist()}")
-        mixed = np.flatnonzero(world[self.edges[:, 0]] != world[self.edges[:, 1]])
+            raise ValueError(f"face {mixed[0]} has vertices in worlds {of_faces[mixed[0]].tolist()}")
+        mixed = np.flatnonzero(worlds[self.edges[:, 0]] != worlds[self.edges[:, 1]])
         if len(mixed):
             edge = self.edges[mixed[0]]
-            raise ValueError(f"edge {edge.tolist()} has vertices in worlds {world[edge].tolist()}")
-        return world.astype(np.int32)
+            raise ValueError(f"edge {edge.tolist()} has vertices in worlds {worlds[edge].tolist()}")
+        return worlds.astype(np.int32)

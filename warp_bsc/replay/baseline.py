@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import orjson
 
+from .._atomic_file import naming
 from .summary import Summary
 
 __all__ = ["Baseline", "NewFinding"]
@@ -30,23 +31,27 @@ class NewFinding(NamedTuple):
 class Baseline:
     """The times at which meshes collided, intersected and were near each other in an earlier replay."""
 
-    def __init__(self, path: str | os.PathLike, min_distance: float | None = None):
+    def __init__(self, path: str | os.PathLike, min_distance: float | None = None, *, intersections: bool = True):
         """Reads the JSON file of an earlier replay.
 
         Args:
             path: The file.
             min_distance: As of :class:`Summary`, of the replays that will be compared with it.
+            intersections: Whether these look for intersections.
 
         Raises:
             OSError: If it cannot be read.
-            ValueError: If it is not such a file, or its replay did not look for distances as large.
+            ValueError: If it is not such a file, or its replay was stopped, or did not look for intersections or
+                distances as large.
         """
         self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
             what: defaultdict(list) for what in ("collides", "crosses", "is inside", "is near")
         }
         try:
-            found = _read(path)
-            distance = found["min_distance"]
+            with naming(path):
+                found = _read(path)
+            distance, is_complete = found["min_distance"], found["complete"]
+            had_intersections = found["options"]["intersections"]
             for span in found["collision_spans"]:
                 self._add("collides", span)
             for span in found["intersections"]:
@@ -58,6 +63,10 @@ class Baseline:
                 self._add("is near", span)
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
+        if not is_complete:
+            raise ValueError(f"{path}: its replay was stopped, and does not say what there is later")
+        if intersections and not had_intersections:
+            raise ValueError(f"{path}: its replay had --no-intersections, and does not say what crossed")
         if min_distance is not None and (distance is None or distance < min_distance):
             had = "no --min-distance" if distance is None else f"--min-distance {distance:g}"
             raise ValueError(f"{path}: its replay had {had}, and does not say what was near at {min_distance:g}")

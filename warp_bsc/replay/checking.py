@@ -9,6 +9,7 @@ import numpy as np
 from ..detection.collisions import Collisions, add_stats
 from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
+from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
 from ..usd.interval import Interval
@@ -16,7 +17,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .results import IntervalResult, Work, summarize, summarize_intersections
-from .scene_contacts import SceneContacts, find_contacts, find_strand_contacts, join_contacts
+from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
@@ -100,11 +101,14 @@ class _SegmentChecker:
         self._checks = checks
         self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
         self._detector = CollisionDetector(self._mesh, method=checks.method)
+        self._strands = _StrandChecker(segment, checks) if segment.has_strands else None
         self._finder = self._containment = None
         if checks.intersections:
             self._finder = self._detector.intersection_finder()
-            self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
-        self._strands = _StrandDetector(segment, checks) if segment.has_strands else None
+            if self._strands:
+                self._containment = ContainmentFinder(self._strands.mesh, self._strands.bodies)
+            else:
+                self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
         self._last: SceneIntersections | None = None  # those found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
@@ -126,6 +130,9 @@ class _SegmentChecker:
         else:
             collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
+        strands = of_strands = None
+        if self._strands and not self._is_still:
+            strands, of_strands = self._strands, self._strands.detect(interval)
         intersections = None
         if start is not None:
             intersections = start, self.find(interval.x1, interval.end, is_end=not self._is_still)
@@ -133,12 +140,14 @@ class _SegmentChecker:
         if self._proximity_finder:
             near = self._find_near(interval.x0, interval.start)
             proximities = near, self._find_near(interval.x1, interval.end)
-        contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection, intersections)
+        contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection)
         certified, stats = collisions.certified, collisions.stats
-        if self._strands and not self._is_still:
-            more, of_strands = self._strands.find(interval, self._checks.selection, bool(intersections))
+        if strands and of_strands:
+            more = find_strand_contacts(interval, strands.mesh, of_strands, self._checks.selection)
             contacts, stats = join_contacts(contacts, more), add_stats(stats, of_strands.stats)
             certified &= of_strands.certified
+        if intersections:
+            contacts = compare_contacts(contacts, *intersections)
         validation = None
         if most != 0:
             validation = validate(
@@ -172,14 +181,16 @@ class _SegmentChecker:
         if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
             assert self._finder and self._containment
             selection, meshes = self._checks.selection, self.segment.meshes
-            found = self._finder.find(x, is_end=is_end)
+            found, mesh = self._finder.find(x, is_end=is_end), self._mesh
+            if self._strands:
+                found, mesh = self._strands.with_intersections(found, x, is_end=is_end), self._strands.mesh
 
             def are_wanted(pairs: np.ndarray) -> np.ndarray:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
                 return selection.counted_pairs(meshes, pairs) & ~ignored
 
             inside = self._containment.find(x, found, are_wanted)
-            self._last = last = name_intersections(self.segment, self._mesh, found, inside, x, time, selection)
+            self._last = last = name_intersections(self.segment, mesh, found, inside, x, time, selection)
         return last
 
     def _find_near(self, x: np.ndarray, time: float) -> SceneProximities:
@@ -195,31 +206,52 @@ class _SegmentChecker:
         return found
 
 
-class _StrandDetector:
-    """Finds the collisions of the curves and points of a segment, with each other and with its meshes."""
+class _StrandChecker:
+    """Finds the collisions of the curves and points of a segment, and the faces that its curves pass through.
+
+    Attributes:
+        mesh: The segment's meshes, curves and points.
+    """
 
     def __init__(self, segment: Segment, checks: Checks):
-        self._mesh = CollisionMesh(
+        self._segment = segment
+        self.mesh = CollisionMesh(
             segment.faces,
             segment.vertex_count,
             edges=segment.free_edges,
             points=segment.points,
             radius=segment.radius,
+            only_free=True,
             device=checks.device,
         )
-        self._detector = CollisionDetector(self._mesh, method=checks.method)
+        self._detector = CollisionDetector(self.mesh, method=checks.method)
+        self._finder = self._detector.intersection_finder() if checks.intersections else None
+        self._edges_of_faces = np.setdiff1d(np.arange(len(self.mesh.edges)), self.mesh.free_edges)
 
-    def find(self, interval: Interval, selection: Selection, is_compared: bool) -> tuple[SceneContacts, Collisions]:
-        """Returns the contacts in an interval, and the detection in which they are.
+    @property
+    def bodies(self) -> np.ndarray:
+        """Number of the scene's mesh that each face is in, then of the curves that each edge without faces is in."""
+        ends = self.mesh.edges[self.mesh.free_edges].astype(np.int64)
+        return np.concatenate([self._segment.face_meshes, self._segment.locate_edges(ends)[0]])
 
-        Args:
-            interval: The interval.
-            selection: Which pairs of meshes count.
-            is_compared: Whether contacts of meshes are compared with intersections.
-        """
+    def detect(self, interval: Interval) -> Collisions:
+        """Returns the collisions of curves and points in an interval."""
         collisions = self._detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        return find_strand_contacts(interval, self._mesh, collisions, selection, is_compared), collisions
+        return collisions
+
+    def with_intersections(self, found: Intersections, x: np.ndarray, *, is_end: bool) -> Intersections:
+        """Returns intersections of the meshes with those of curves after them, edges as in :attr:`mesh`.
+
+        Args:
+            found: Intersections of the meshes alone.
+            x: Positions, shape [vertex_count, 3].
+            is_end: Whether a motion that ends there has just been detected.
+        """
+        assert self._finder
+        more = self._finder.find(x, is_end=is_end)
+        own = np.stack([self._edges_of_faces[found.pairs[:, 0]], found.pairs[:, 1]], axis=1)
+        return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
 
 
 def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:

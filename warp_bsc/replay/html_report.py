@@ -168,10 +168,11 @@ class ReportPage(RecordFile):
             arrays |= {"kind": np.full(len(rows), _NEAR), "distance": found.distance[rows]}
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
-            curves = found.cuts.points if found.crossings else np.zeros((0, 2, 3))
+            curves = found.cuts.points
             arrays |= {
                 "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
                 "curves": self._placed(curves[_spread(len(curves), self._most_rows)]),
+                "through": self._placed(found.position[np.intersect1d(rows, found.of_curves)]),
             }
             facts["curves"] = len(curves)
         return len(rows), _block(f"{name}-{index}", facts, arrays)
@@ -222,6 +223,8 @@ class ReportPage(RecordFile):
     def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
         """Returns sentences on all that is not in the page."""
         notes = []
+        if summary.min_distance is not None and summary.scene.has_strands:
+            notes.append("Distances of curves and points are not checked, only their collisions.")
         most = f"an interval has at most {self._most_rows:,} rows, spread evenly, with at least one for each two meshes"
         rest = sum(at.crossings + at.touches + sum(at.inside.values()) for at in summary.intersections)
         near = sum(at.pairs for at in summary.proximities)

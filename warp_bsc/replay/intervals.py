@@ -31,7 +31,7 @@ def replay(
     Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
     if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end. The
     edges that pass through faces at the times themselves, and the meshes that are wholly inside others, are found as
-    well, between obstacles too. Curves and points are checked between the times only::
+    well, between obstacles too; among the edges are those of curves::
 
         import warp_bsc as bsc
 

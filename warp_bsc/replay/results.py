@@ -127,8 +127,7 @@ class IntervalSummary:
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
             move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes, and
-            where there are curves or points, all pairs of meshes twice.
+        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None if none was asked for.
         intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.

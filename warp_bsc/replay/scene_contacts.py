@@ -11,7 +11,7 @@ from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
 
-__all__ = ["PHASES", "SceneContacts", "find_contacts", "find_strand_contacts", "join_contacts"]
+__all__ = ["PHASES", "SceneContacts", "compare_contacts", "find_contacts", "find_strand_contacts", "join_contacts"]
 
 PHASES = ("passes", "enters", "leaves", "stays")
 """Whether the surfaces at two elements cross at the end of the interval, plus twice whether they do at its start.
@@ -35,9 +35,9 @@ class SceneContacts(ScenePairs):
         separate: Whether the two meshes did not intersect at the start of the interval, nor touch, shape [n]; for a
             mesh with itself, whether no part of it did. None if intersections were not looked for. False where
             ``phase`` is -1.
-        phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it.
-            None if intersections were not looked for. -1 for pairs with an element of curves or points, which do not
-            cross anything at rest.
+        phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it, that
+            of a curve all its edges that do. None if intersections were not looked for. -1 for two curves, and for
+            pairs with a point, which do not cross at rest.
     """
 
     interval: Interval = field(repr=False)
@@ -68,7 +68,6 @@ def find_contacts(
     mesh: CollisionMesh,
     collisions: Collisions,
     selection: Selection,
-    intersections: tuple[SceneIntersections, SceneIntersections] | None = None,
 ) -> SceneContacts:
     """Names the pairs that a detection found and that count.
 
@@ -82,7 +81,6 @@ def find_contacts(
         mesh: The detector's mesh, made of the interval's segment.
         collisions: Collisions of that mesh in the interval.
         selection: Which pairs of meshes count.
-        intersections: Those at the start and at the end of the interval; None if they were not looked for.
     """
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
@@ -100,8 +98,6 @@ def find_contacts(
             normal=np.zeros((0, 3)),
             counted=none.astype(bool),
             ignored={},
-            separate=none.astype(bool) if intersections else None,
-            phase=none if intersections else None,
         )
 
     named = name_elements(segment, vertices, faces, ends)
@@ -130,18 +126,17 @@ def find_contacts(
         "position": position,
         "normal": normal,
     }
-    contacts = SceneContacts(
+    return SceneContacts(
         segment,
         **{name: array[counted] for name, array in arrays.items()},
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
     )
-    return _compare(contacts, *intersections) if intersections else contacts
 
 
 def find_strand_contacts(
-    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection, is_compared: bool
+    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
 ) -> SceneContacts:
     """Names the pairs with an element of curves or points that a detection found and that count.
 
@@ -150,26 +145,23 @@ def find_strand_contacts(
 
     Args:
         interval: The interval.
-        mesh: The mesh of the detection, made of the interval's segment with its curves and points.
+        mesh: The mesh of the detection, made of the interval's segment with its curves and points. It leaves out pairs
+            of which faces have both elements.
         collisions: Collisions of that mesh in the interval.
         selection: Which pairs of meshes count.
-        is_compared: Whether contacts of meshes are compared with intersections.
     """
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
-    is_free = np.ones(segment.vertex_count, dtype=bool)
-    is_free[segment.faces] = False
-    with_face = is_free[collisions.vertex_face[:, 0]]
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)
     of_curves = np.isin(collisions.edge_edge, mesh.free_edges)
-    of_curve = of_curves.any(axis=1) & ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
-    vertices, faces = collisions.vertex_face[with_face].T.astype(np.int64)
-    ends = ends[of_curve]
+    apart = ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
+    vertices, faces = collisions.vertex_face.T.astype(np.int64)
+    ends = ends[apart]
     points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
     both = collisions.vertex_vertex.astype(np.int64)
     named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
     tois = (
-        collisions.vertex_face_toi[with_face],
-        collisions.edge_edge_toi[of_curve],
+        collisions.vertex_face_toi,
+        collisions.edge_edge_toi[apart],
         collisions.vertex_edge_toi,
         collisions.vertex_vertex_toi,
     )
@@ -178,18 +170,16 @@ def find_strand_contacts(
         times = times[:, None, None]
         return (1.0 - times) * x0[corners].astype(np.float64) + times * x1[corners].astype(np.float64)
 
-    on_edge = np.concatenate(
-        [collisions.edge_edge_coordinates[of_curve, :1], collisions.vertex_edge_coordinates[:, :1]]
-    )
+    on_edge = np.concatenate([collisions.edge_edge_coordinates[apart, :1], collisions.vertex_edge_coordinates[:, :1]])
     edges = np.concatenate([at_impact(ends[:, 0], tois[1]), at_impact(point_ends, tois[2])])
     position = [
-        np.einsum("ni,nij->nj", collisions.vertex_face_coordinates[with_face], at_impact(mesh.faces[faces], tois[0])),
+        np.einsum("ni,nij->nj", collisions.vertex_face_coordinates, at_impact(mesh.faces[faces], tois[0])),
         (1.0 - on_edge) * edges[:, 0] + on_edge * edges[:, 1],
         at_impact(both, tois[3]).mean(axis=1),
     ]
     normal = [
-        collisions.vertex_face_normal[with_face],
-        collisions.edge_edge_normal[of_curve],
+        collisions.vertex_face_normal,
+        collisions.edge_edge_normal[apart],
         collisions.vertex_edge_normal,
         collisions.vertex_vertex_normal,
     ]
@@ -206,22 +196,18 @@ def find_strand_contacts(
         "position": np.concatenate(position),
         "normal": np.concatenate(normal),
     }
-    count = int(counted.sum())
     return SceneContacts(
         segment,
         **{name: array[counted] for name, array in arrays.items()},
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
-        separate=np.zeros(count, dtype=bool) if is_compared else None,
-        phase=np.full(count, -1) if is_compared else None,
     )
 
 
 def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContacts:
     """Returns the contacts of one interval and others of it after them; ``counted`` is that of the first ones."""
     names = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position", "toi", "time", "normal")
-    names += ("separate", "phase") if contacts.phase is not None else ()
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
     ignored = {
         meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)
@@ -230,19 +216,33 @@ def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContac
     return replace(contacts, **joined, ignored=ignored)
 
 
-def _compare(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
-    """Returns contacts compared with the intersections at both ends of their interval."""
-    of_faces = contacts.segment.faces[contacts.faces[:, 1]]
-    firsts = contacts.vertices[:, 0]
-    seconds = np.where((contacts.kind == 0)[:, None], of_faces, contacts.vertices[:, 1][:, [0, 1, 1]])
-    pairs = [
-        np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
-        for first in firsts.T
-        for second in seconds.T
-    ]
-    phase = np.zeros(len(contacts), dtype=np.int64)
-    for weight, intersections in ((2, start), (1, end)):
-        if len(contacts) and len(tangled := intersections.tangled_vertices()):
-            crosses = [np.isin(intersections.pair_keys(pair), tangled) for pair in pairs]
-            phase += weight * np.any(crosses, axis=0)
-    return replace(contacts, separate=~np.isin(contacts.mesh_keys(), start.mesh_keys()), phase=phase)
+def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
+    """Returns contacts with the fields that come from the intersections at the start and at the end of the interval."""
+    separate, phase = np.zeros(len(contacts), dtype=bool), np.full(len(contacts), -1)
+    segment = contacts.segment
+    (rows,) = np.nonzero(_may_cross(contacts)) if len(contacts) else (np.zeros(0, dtype=np.int64),)
+    if len(rows):
+        separate[rows] = ~np.isin(contacts.mesh_keys()[rows], start.mesh_keys())
+        phase[rows] = 0
+        firsts, others = contacts.vertices[rows, 0], contacts.vertices[rows, 1][:, [0, 1, 1]]
+        seconds = np.where((contacts.kind[rows] == 0)[:, None], segment.faces[contacts.faces[rows, 1]], others)
+        pairs = [
+            np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
+            for first in firsts.T
+            for second in seconds.T
+        ]
+        for weight, intersections in ((2, start), (1, end)):
+            if len(tangled := intersections.tangled_vertices()):
+                crosses = [np.isin(intersections.pair_keys(pair), tangled) for pair in pairs]
+                phase[rows] += weight * np.any(crosses, axis=0)
+    return replace(contacts, separate=separate, phase=phase)
+
+
+def _may_cross(contacts: SceneContacts) -> np.ndarray:
+    """Returns which pairs are of a surface and another or a curve, whose elements can cross at rest, shape [n]."""
+    segment = contacts.segment
+    if not segment.has_strands:
+        return np.ones(len(contacts), dtype=bool)
+    has_faces = np.array([mesh.faces.stop > mesh.faces.start for mesh in segment.meshes])
+    of_point = (contacts.elements[:, 0] == VERTEX) & np.isin(contacts.vertices[:, 0, 0], segment.points)
+    return has_faces[contacts.meshes].any(axis=1) & ~of_point

@@ -69,6 +69,15 @@ class SceneIntersections(ScenePairs):
         return slice(self.edge_rows.stop, len(self))
 
     @cached_property
+    def of_curves(self) -> np.ndarray:
+        """Rows of the edges of curves that pass through faces, ascending, shape [m]."""
+        (rows,) = np.nonzero(self.crosses)
+        if not len(rows) or not self.segment.has_strands:
+            return rows[:0]
+        of_faces, _ = self.segment.faces_of_edges(self.vertices[rows, 0])
+        return np.delete(rows, of_faces)
+
+    @cached_property
     def cuts(self) -> Cuts:
         """The segments in which triangles cut each other, computed in floating point from the exact pairs.
 
@@ -76,6 +85,8 @@ class SceneIntersections(ScenePairs):
         the other, or the corner that both share.
         """
         segment = self.segment
+        if not self.crossings:
+            return Cuts(np.zeros((0, 2, 3)), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 2), dtype=np.int64))
         rows, sides = segment.faces_of_edges(self.vertices[self.edge_rows, 0])
         faces = np.sort(np.stack([sides, self.faces[rows, 1]], axis=1), axis=1)
         first, second = faces.T
@@ -93,10 +104,14 @@ class SceneIntersections(ScenePairs):
         return Cuts(ends[lasting], segment.locate_faces(faces)[0], faces)
 
     def tangled_vertices(self) -> np.ndarray:
-        """Returns the pairs of vertices of which a face of one crosses a face of the other, as :meth:`pair_keys`."""
+        """Returns the pairs of vertices of which a face, or edge of a curve, of one crosses a face of the other.
+
+        They are numbers as of :meth:`pair_keys`.
+        """
         rows, sides = self.segment.faces_of_edges(self.vertices[self.crosses, 0])
-        others = self.faces[self.crosses, 1][rows]
-        first, second = self.segment.faces[sides], self.segment.faces[others]
+        others = np.concatenate([self.faces[self.crosses, 1][rows], self.faces[self.of_curves, 1]])
+        of_curves = self.vertices[self.of_curves, 0][:, [0, 1, 1]]
+        first, second = np.concatenate([self.segment.faces[sides], of_curves]), self.segment.faces[others]
         pairs = np.stack(np.broadcast_arrays(first[:, :, None], second[:, None, :]), axis=-1).reshape(-1, 2)
         return np.unique(self.pair_keys(pairs))
 

@@ -30,11 +30,12 @@ COLORS = {
     "VertexEdge": (1.0, 0.7, 0.1),
     "VertexVertex": (1.0, 0.8, 0.5),
     "Intersections": (0.6, 0.2, 1.0),
+    "CurveIntersections": (0.85, 0.35, 1.0),
     "Inside": (0.1, 0.5, 1.0),
     "Near": (0.1, 0.85, 0.4),
 }
-"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut, vertices of
-parts that are inside others, places between what is near."""
+"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut, places where
+curves pass through faces, vertices of parts that are inside others, places between what is near."""
 
 LIFT = 2e-4
 """Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
@@ -71,12 +72,13 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
         _EXTENT
         | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
     ),
+    "CurveIntersections": ("PointInstancer", _PLACES | _ELEMENTS),
     "Inside": ("PointInstancer", _PLACES | _ELEMENTS),
     "Near": ("PointInstancer", _PLACES | {"primvars:distance": "float[]"} | _ELEMENTS),
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
 
-_ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "Inside", "Near"
+_ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "CurveIntersections", "Inside", "Near"
 """The prims that a layer has only if they are ever there."""
 
 
@@ -97,10 +99,11 @@ class Overlay:
     - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
       next. Each segment in which two triangles meet is a curve of its own, with ``primA`` and ``primB``. Elements that
       only touch make no curve;
+    - ``CurveIntersections``, if there is any, markers where edges of the scene's own curves pass through faces;
     - ``Inside``, if there is any, markers at a vertex of each part of a mesh that is wholly inside another mesh, which
       hides them until it is hidden itself;
     - ``Near``, if there is any, markers halfway between what is at most the minimum distance apart, with the primvar
-      ``distance``. Both are there from a time of the scene to the next, with the primvars of contact points but
+      ``distance``. All three are there from a time of the scene to the next, with the primvars of contact points but
       ``toi``.
 
     All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
@@ -232,7 +235,11 @@ class Overlay:
         if result.intersections:
             found = result.intersections[end]
             rows = np.arange(found.inside_rows.start, found.inside_rows.stop)
-            samples = {"Intersections": self._find_curves(found), "Inside": self._find_points(found, rows, {})}
+            samples = {
+                "Intersections": self._find_curves(found),
+                "CurveIntersections": self._find_points(found, found.of_curves, {}),
+                "Inside": self._find_points(found, rows, {}),
+            }
         if result.proximities:
             found = result.proximities[end]
             samples["Near"] = self._find_points(found, np.arange(len(found)), {"distance": found.distance})
@@ -256,9 +263,9 @@ class Overlay:
 
     def _find_curves(self, found: SceneIntersections):
         """Returns the segments in which triangles meet as curves, None if there are none."""
-        if not found.crossings:
-            return None
         cuts = found.cuts
+        if not len(cuts.points):
+            return None
         prims, points = self._number_prims(found.segment, cuts.meshes), cuts.points.reshape(-1, 3)
         return {
             "extent": _box(points, _CURVE_WIDTH * self._size / 2),

@@ -91,7 +91,7 @@ def find_meshes(
     if finder.other:
         warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
     if strands := Counter(mesh.type_name for mesh in meshes if mesh.is_strands):
-        how = "between the times alone, with half their widths as radii"
+        how = "with half their widths as radii between the times; at the times, curves as lines, points not at all"
         warnings.append(f"curves and points are checked {how}: {_listed(strands)}")
     if varying := [mesh for mesh in meshes if mesh.may_thicken]:
         warnings.append(

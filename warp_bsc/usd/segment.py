@@ -290,12 +290,11 @@ class Segment:
 
         # Triangles of one polygon are neighbours in the list.
         following = np.minimum(place + 1, max(0, len(keys) - 1))
-        of_faces = sides[following] < self._corners.size
-        face, other = (np.where(of_faces, sides[where] // 3, 0) for where in (place, following))
-        diagonal = (keys[following] == wanted) & (following > place) & of_faces
-        if diagonal.any():
-            same = np.stack(self.locate_faces(face)) == np.stack(self.locate_faces(other))
-            diagonal &= same.all(axis=0)
+        diagonal = (keys[following] == wanted) & (following > place) & (sides[following] < self._corners.size)
+        (rows,) = np.nonzero(diagonal)
+        if len(rows):
+            face, other = (np.stack(self.locate_faces(sides[where[rows]] // 3)) for where in (place, following))
+            diagonal[rows] = (face == other).all(axis=0)
         return meshes[:, 0], np.sort(points, axis=1), diagonal
 
     def faces_around(self, vertices: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ const REST_COLOR = [0.62, 0.64, 0.67];
 const LIT_COLOR = [0.93, 0.28, 0.22];
 const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1], [0.85, 0.75, 0.1], [0.6, 0.45, 0.2]]; // by kind
 const CURVE_COLOR = [0.55, 0.24, 0.92];
-const ROPE_COLOR = [0.12, 0.16, 0.2];
+const STRAND_SHADE = 0.7; // of curves and points, which no light falls on
 const NEAR_COLOR = [0.05, 0.6, 0.35];
 const CHOSEN_COLOR = [0.05, 0.75, 0.95];
 
@@ -35,7 +35,7 @@ in vec3 start; in vec3 end; in vec3 color;
 uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size;
 out vec3 tint;
 void main() {
-  tint = 0.4 * color;
+  tint = color;
   gl_Position = projection * view * vec4(mix(start, end, time), 1.0);
   gl_PointSize = size;
 }`;
@@ -70,8 +70,11 @@ void main() {
 // A segment is drawn as a rectangle of some pixels' width: two triangles, of four corners.
 const CURVE_SHADER = `#version 300 es
 in vec3 start; in vec3 end; in vec3 start_1; in vec3 end_1; // its ends at the start of the interval, and at the end
+in vec3 color;
 uniform mat4 view; uniform mat4 projection; uniform vec2 pixel; uniform float time;
+out vec3 tint;
 void main() {
+  tint = color;
   vec4 a = projection * view * vec4(mix(start, start_1, time), 1.0), b = projection * view * vec4(mix(end, end_1, time), 1.0);
   vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-6, 0.0));
   int corner = int[](0, 1, 2, 2, 1, 3)[gl_VertexID]; // two at a, two at b
@@ -82,9 +85,10 @@ void main() {
 }`;
 const CURVE_COLOR_SHADER = `#version 300 es
 precision highp float;
-uniform vec4 color;
+in vec3 tint;
+uniform float fade;
 out vec4 result;
-void main() { result = color; }`;
+void main() { result = vec4(tint, fade); }`;
 
 function multiply(a, b) {
   const result = new Float32Array(16);
@@ -144,6 +148,7 @@ function boxOf(arrays) {
 const NO_FLOATS = new Float32Array(0), NO_INTS = new Int32Array(0);
 const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`;
 const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_COLORS.length] : REST_COLOR);
+const strandColor = (mesh) => meshColor(mesh).map((value) => STRAND_SHADE * value);
 
 // Returns the blocks of an interval as the arrays that are drawn.
 async function loadView(index) {
@@ -162,6 +167,7 @@ async function loadView(index) {
     rest: atEnds.slice(0, 2).map((block) => (block ? block.position : NO_FLOATS)),
     curves: atEnds.slice(0, 2).map((block) => (block ? block.curves : NO_FLOATS)),
     inside: atEnds.slice(0, 2).map((block) => (block ? block.position.filter((_, i) => block.kind[Math.floor(i / 3)] === INSIDE) : NO_FLOATS)),
+    through: atEnds.slice(0, 2).map((block) => (block ? block.through : NO_FLOATS)),
     close: atEnds.slice(2).map((block) => (block ? block.position : NO_FLOATS)),
   };
 }
@@ -253,19 +259,22 @@ function makeViewer() {
     shown.some = vertexArray(gl, triangles, positions, lit);
     shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
     if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
+    if (shown.through.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "curve through a face");
     if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "near pair");
     // Marks of what is at the start, and at the end.
     shown.marks = shown.inside.map((inside, end) => {
-      const places = new Float32Array([...inside, ...shown.close[end]]), markColors = new Float32Array(places.length);
-      for (let i = 0; i < places.length; i += 3) markColors.set(i < inside.length ? CURVE_COLOR : NEAR_COLOR, i);
+      const at = [...inside, ...shown.through[end]], places = new Float32Array([...at, ...shown.close[end]]);
+      const markColors = new Float32Array(places.length);
+      for (let i = 0; i < places.length; i += 3) markColors.set(i < at.length ? CURVE_COLOR : NEAR_COLOR, i);
       return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
     });
-    const segments = (values, stride, places) => vertexArray(gl, lines, ["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]));
+    const segments = (values, stride, places, more = []) => vertexArray(gl, lines, [...["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]), ...more]);
     shown.cuts = shown.curves.map((curves) => segments(curves, 24, [0, 12, 0, 12]));
-    const ropes = new Float32Array(6 * shown.edges.length);
+    const ropes = new Float32Array(6 * shown.edges.length), ropeColors = new Float32Array(1.5 * shown.edges.length);
+    for (let i = 0; i < shown.edges.length; i += 2) ropeColors.set(strandColor(meshes[shown.edges[i]]), 1.5 * i);
     shown.edges.forEach((vertex, i) => [start, end].forEach((values, when) => ropes.set(values.subarray(3 * vertex, 3 * vertex + 3), 12 * (i >> 1) + 6 * when + 3 * (i % 2))));
-    shown.ropes = segments(ropes, 48, [0, 12, 24, 36]);
-    shown.dust = vertexArray(gl, strands, positions, shown.alone);
+    shown.ropes = segments(ropes, 48, [0, 12, 24, 36], [["color", ropeColors, 3, [12, 0]]]);
+    shown.dust = vertexArray(gl, strands, [...positions.slice(0, 2), ["color", colors.map((value) => STRAND_SHADE * value), 3]], shown.alone);
     state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks, shown.ropes, shown.dust];
 
     const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
@@ -347,7 +356,7 @@ function makeViewer() {
     }
     gl.disable(gl.POLYGON_OFFSET_FILL);
     const pixel = [(2 * scale) / width, (2 * scale) / height];
-    set(lines, { pixel, time: state.time, color: [...ROPE_COLOR, 1] });
+    set(lines, { pixel, time: state.time, fade: 1 });
     gl.bindVertexArray(shown.ropes.array);
     gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.edges.length / 2);
     set(strands, { time: state.time, size: 5 * scale });
@@ -361,7 +370,8 @@ function makeViewer() {
     const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
-      set(lines, { pixel, time: 0, color: [...CURVE_COLOR, fade] });
+      set(lines, { pixel, time: 0, fade });
+      gl.vertexAttrib3fv(gl.getAttribLocation(lines, "color"), CURVE_COLOR); // cut curves have one colour
       gl.bindVertexArray(shown.cuts[end].array);
       gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
       set(points, { time: state.time, fade, size, core: dots > 300 ? 2 : 0.68 });
