@@ -20,6 +20,7 @@ FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.rglob("example_*.py"))
 BULLET = FOLDER / "example_cloth_bullet.py"
 THROW = FOLDER / "example_diffsim_throw.py"
+GRIPPER = FOLDER / "example_gripper.py"
 PUSH = FOLDER / "example_diffsim_push.py"
 PAPER_SCENES = {
     "twisting": "degrees",
@@ -198,6 +199,18 @@ def test_push_is_learnt_through_the_stage():
     first, *_, last = run(PUSH, 5).loss_history
     assert (last < 0.5 * first).all()
     run(PUSH, 2, "--no-ccd").test_final()
+
+
+@pytest.mark.parametrize("robot", ["featherstone", "mujoco"])
+@pytest.mark.parametrize("friction", [0.5, 0.05])
+def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
+    if robot == "mujoco":
+        pytest.importorskip("mujoco_warp")
+    example = run(GRIPPER, 60, "--robot", robot, "--friction", str(friction))
+    example.test_final()
+    report = example.solver.report
+    assert report.steps == 240 and report.frozen_steps == 0
+    assert report.truncated_steps == 0 or friction < 0.5
 
 
 def test_bullet_passes_without_stage():

@@ -408,3 +408,29 @@ def test_captured_steps_retake_nothing_that_a_graph_completes(device):
         assert len(rollout.detector.find_intersections(rollout.positions)) == 0
     report = rollout.solver.report
     assert (steps.retaken, report.steps, report.undetected_steps, report.uncertified_steps) == (0, 12, 0, 0)
+
+
+@pytest.mark.parametrize("support", ["plane", "box"])
+def test_cloth_on_something_rigid_is_at_rest(support, device):
+    """At small steps too, in which it would fall for several steps through the separation between two contacts."""
+    builder = newton.ModelBuilder()
+    if support == "plane":
+        builder.add_ground_plane()
+    else:
+        at = wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity())
+        builder.add_shape_box(-1, xform=at, hx=0.5, hy=0.5, hz=0.1)
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.0006))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5)
+    start, end = model.state(), model.state()
+    speeds = []
+    for _ in range(144):
+        start.clear_forces()
+        solver.step(start, end, None, None, 1.0 / 960.0)
+        start, end = end, start
+        speeds.append(np.abs(start.particle_qd.numpy()[:, 2]).mean())
+    assert np.mean(speeds[96:]) < 5e-4  # m/s
+    assert start.particle_q.numpy()[:, 2].min() > 0.0
+    report = solver.report
+    assert (report.steps, report.uncertified_steps, report.truncated_steps) == (144, 0, 0)

@@ -185,7 +185,7 @@ class Progress:
     slow_velocity_sweeps: int  # most sweeps on velocities in these worlds
     max_truncations: int  # iterations of that; after them vertices are frozen
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
-    fast: wp.array[int]  # of each world, 1 if the wanted motion has a contact of fast elements, or of pushing ones
+    fast: wp.array[int]  # of each world, 1 if wanted paths of fast or pushing elements or bodies collide
 
 
 @wp.func

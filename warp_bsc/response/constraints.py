@@ -98,10 +98,12 @@ _RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
 _REST = wp.constant(wp.float64(0.25))
-"""Distance of a body from slow elements, as a share of their longest path, from which it does not grow: what is further
-apart than it comes in a step does not collide in the next, and what falls freely every few steps never rests."""
+"""Distance of what may rest from slow elements, as a share of their longest path, from which it does not grow: what is
+further apart than it comes in a step does not collide in the next, and falls freely every few steps."""
+_ROUNDING = wp.constant(wp.float64(2.0**-20))
+"""Least distance of what rests, as a share of its coordinates: 16 times their rounding, which closes smaller ones."""
 LEAST_DISTANCE = wp.constant(wp.float64(0.1))
-"""Least distance of slow elements as a share of the separation, however short their paths are: a distance that is
+"""Least distance of other slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
@@ -329,15 +331,29 @@ def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
+def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
+    """Returns whether one of two elements is of a body, or cannot be moved, or is a plane, so that the other may rest.
+
+    Cloth on cloth is in motion as long as one of the two is.
+    """
+    is_held = inverse_mass_of(motion, corners[0]) == 0.0 or inverse_mass_of(motion, corners[3]) == 0.0
+    return is_held or corners[0] == corners[3] or are_on_body(motion, corners)
+
+
+@wp.func
 def feasible(
     motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
 ) -> wp.float64:
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
     path = longest_path(motion, corners)
     before = start
-    if are_on_body(motion, corners):
+    least = LEAST_DISTANCE * separation
+    if _may_rest(motion, corners):
         before = wp.min(start, _REST * path)
-    recovered = wp.max(before + _RECOVERY * path, LEAST_DISTANCE * separation)
+        x = to_double(motion.x1[corners[0]])
+        rounding = _ROUNDING * wp.max(wp.abs(x[0]), wp.max(wp.abs(x[1]), wp.abs(x[2])))
+        least = wp.min(least, wp.max(_REST * path, rounding))
+    recovered = wp.max(before + _RECOVERY * path, least)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
 
 

@@ -33,6 +33,7 @@ from .constraints import (
     VERTEX_FACE_PROXIMITY,
     Contacts,
     add_constraint,
+    are_on_body,
     contact_friction,
     contact_vertices,
     contact_weights,
@@ -179,8 +180,11 @@ def _collect_contact(
         count_contact(progress, world)
         for j in range(4):
             vertices.changed[corners[j]] = 1
-        if iteration == 0 and (slow == 0 or is_pushing(motion, corners, weights, normal, least)):
-            progress.fast[world] = 1
+        if iteration == 0:
+            # planes stand still: they would stop a body that takes along what it pushes
+            moves = slow == 0 or are_on_body(motion, corners)
+            if moves or is_pushing(motion, corners, weights, normal, least):
+                progress.fast[world] = 1
     multiplier = wp.vec3d()
     if near and is_dividing(progress, world, iteration):
         return

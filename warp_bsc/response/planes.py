@@ -123,16 +123,11 @@ def offset_from(
     motion: Motion, planes: MovingPlanes, i: int, vertex: int, progress: Progress, separation: wp.float64
 ) -> wp.float64:
     """Returns the offset that constraints move a vertex to that a plane stops, without a minimum distance [m]."""
-    plane = planes.end[i]
-    distance = widened(separation, progress)
-    if is_on_body(motion, vertex):
-        least = level(motion, planes, i, vertex)
-        if least < _ZERO:
-            distance = least
-        else:
-            before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-            distance = feasible(motion, wp.vec4i(vertex), distance, before, separation)
-    return plane[3] + distance
+    distance = level(motion, planes, i, vertex)
+    if distance == _ZERO:
+        before, _error = signed_distance(planes.start[i], motion.x0[vertex])
+        distance = feasible(motion, wp.vec4i(vertex), widened(separation, progress), before, separation)
+    return planes.end[i][3] + distance
 
 
 @wp.func
@@ -196,6 +191,8 @@ def collect_penetrations(
         else:
             count_contact(progress, world)
             vertices.changed[vertex] = 1
+            if progress.status.iteration[0] == 0 and is_on_body(motion, vertex):
+                progress.fast[world] = 1  # as between elements, see kernels.collect_contacts
         plane = planes.end[i]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         multiplier = wp.vec3d()

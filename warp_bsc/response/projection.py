@@ -64,6 +64,8 @@ _OF_BODIES = wp.constant(wp.float64(0.1))
 """Tolerance of a constraint on a body as a share of that of others: a body moves as one, so that its motion shows."""
 _SHARE_OF_DISTANCE = wp.constant(wp.float64(0.5))
 """Largest tolerance of a position constraint as a share of its separation: elements that it holds stay apart."""
+_SHARE_OF_CHANGE = wp.constant(wp.float64(0.1))
+"""Largest tolerance of a contact with a plane as a share of its change by projection: what rests moves very little."""
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Units in a metre; sums are of integers in these units, so that they are the same in any order."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -288,7 +290,11 @@ def activate_position_constraints(
     if past or not is_projecting(progress, world):
         return
     distance = gap(vertices, constraints, i)
-    if constraints.kind[i] != PLANE_CONTACT:  # whose separation is an offset
+    if constraints.kind[i] == PLANE_CONTACT:  # whose separation is an offset
+        wanted = wp.dot(constraints.normal[i], relative(constraints.weights[i], constraints.vertices[i], motion.x1))
+        if wanted < constraints.separation[i]:
+            tolerance = wp.min(tolerance, _SHARE_OF_CHANGE * (constraints.separation[i] - wanted))
+    else:
         tolerance = wp.min(tolerance, _SHARE_OF_DISTANCE * (constraints.separation[i] - least_distance(constraints, i)))
     tolerance = _tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance

@@ -249,8 +249,9 @@ class SolverCCD(SolverBase, CouplingHooks):
                 a face is the largest one of its vertices, that of a shape 0.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
-                :mod:`.speed_limit`. Has no effect on other solvers, and none without a response;
-                ``report.speed_limit_lifted`` is true where it has.
+                :mod:`.speed_limit`. Where its iterations are too few for the step, VBD does not hold heavy bodies, and
+                only the limit brakes them: they sink faster without it, behind the stage or not. Has no effect on other
+                solvers, and none without a response; ``report.speed_limit_lifted`` is true where it has.
             respond: Whether to respond to collisions. False detects and reports them, and changes no position and no
                 velocity; separation, friction, restitution, coupling and bodies then have no meaning, and must not be
                 given. With a minimum distance, it counts the pairs that come nearer than they may.
