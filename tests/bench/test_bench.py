@@ -104,7 +104,7 @@ def test_usd_scene(capsys, request):
         (["detector", "flood:5000"], "flood:5000: there is no generator flood, only cloth, crash"),
         (["detector", "cloth:many"], "'many'"),
         (["detector", "cloth:3"], "[1000, 20000000], not '3'"),
-        (["detector", "cloth:1000", "--repeat", "0"], "--repeat: must be at least 1"),
+        (["detector", "cloth:1000", "--repeat", "0"], "--repeat: must be an integer of at least 1"),
         (["detector", "cloth:1000", "--threads", "100000"], "threads must be in [1, "),
         (["detector", "cloth:1000", "--device", "cuda:99"], "--device cuda:99"),
     ],
