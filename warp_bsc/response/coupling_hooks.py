@@ -86,7 +86,7 @@ class CouplingHooks(CouplingInterface):
     The source feels these impulses a step late. If a contact stops a proxy outright, as one of a finger and cloth on
     another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the source along
     the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may be more:
-    choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.5 in each step
+    choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in each step
     behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy to its
     source for a velocity: the two bounce apart.
 
