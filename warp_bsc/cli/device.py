@@ -58,8 +58,8 @@ def load_detector(
     detector = CollisionDetector(triangles, method=method)
     detector.detect(points, points)
     if strands:
-        elements = {"edges": np.array([[3, 4]]), "points": np.array([5])}
-        rope = CollisionMesh(np.array([[0, 1, 2]]), 6, **elements, radius=1.0, device=device)
+        face, edges, point = np.array([[0, 1, 2]]), np.array([[3, 4]]), np.array([5])
+        rope = CollisionMesh(face, 6, edges=edges, points=point, radius=1.0, device=device)
         CollisionDetector(rope, method=method).detect(points, points)
     if intersections:
         detector.find_intersections(points)
