@@ -13,6 +13,7 @@ from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
+from .contact_layer import ContactLayer
 from .coupling import SUBSTEPS, Coupling
 from .coupling_hooks import CouplingHooks
 from .friction import Friction
@@ -211,6 +212,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         bodies: bool | None = None,
         min_distance: float | None = None,
         radius: float | np.ndarray | wp.array | None = None,
+        contact_layer: float | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -247,6 +249,9 @@ class SolverCCD(SolverBase, CouplingHooks):
             radius: Radius of each particle [m], shape [particle_count], or one for all, such as
                 ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
                 a face is the largest one of its vertices, that of a shape 0.
+            contact_layer: Thickness of a layer around all surfaces [m] in which contacts push gradually, before hits
+                are resolved, see :mod:`.contact_layer`. Results are then continuous in what the inner solver wants, and
+                gradients hold across changes of the contacts. None: contacts act where they hit.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Where its iterations are too few for the step, VBD does not hold heavy bodies, and
@@ -271,7 +276,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self.respond = respond
         if not respond:
             numbers = {"separation": separation, "friction": friction, "restitution": restitution, "coupling": coupling}
-            numbers |= {"bodies": bodies}
+            numbers |= {"bodies": bodies, "contact_layer": contact_layer}
             for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
@@ -285,6 +290,10 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"coupling takes at least 2 substeps, or 'auto', not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
+        if contact_layer is not None and not 0.0 < contact_layer < np.inf:
+            raise ValueError(f"contact_layer must be more than 0, not {contact_layer!r}")
+        if contact_layer is not None and coupling is not None:
+            raise NotImplementedError("coupled steps have no contact layer: omit coupling, or contact_layer")
         keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
         self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
@@ -308,6 +317,16 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
         self._response.prepare(self._motion)
         self._recount_crossings()
+        self._layer = self._pushed = None
+        if contact_layer is not None:
+            self._layer = ContactLayer(
+                mesh,
+                self._motion.friction,
+                thickness=float(contact_layer),
+                restitution=restitution,
+                distances=mesh.min_distances(min_distance or 0.0, radius, reach=float(contact_layer)),
+            )
+            self._layer.prepare(self._motion)
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
@@ -446,7 +465,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         if tape is None or end.particle_q is None or not end.particle_q.requires_grad:
             run_on_host(lambda: self._resolve(end, dt), device)
             return
-        recorded = None
+        recorded = pushed = None
         arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
         if self.model.body_count:
             arrays += [state_in.body_q, end.body_q, end.body_qd]
@@ -457,9 +476,9 @@ class SolverCCD(SolverBase, CouplingHooks):
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
 
         def forward():
-            nonlocal recorded
+            nonlocal recorded, pushed
             resolution = self._resolve(end, dt, self._recorder)
-            recorded = None
+            pushed, recorded = self._pushed, None
             if device.is_capturing or self._changed(resolution.vertices):
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
                 inputs, outputs = [self._recorder.record.counts, recorded.complete], [self.report._totals]
@@ -468,6 +487,9 @@ class SolverCCD(SolverBase, CouplingHooks):
         def backward():
             if recorded is not None:
                 StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
+            if pushed is not None:
+                assert self._layer is not None
+                self._layer.backward(pushed, *(array.grad for array in arrays[:3]))
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
@@ -486,6 +508,9 @@ class SolverCCD(SolverBase, CouplingHooks):
             if self._reads_friction:
                 self._motion.friction.read()
             self._set_end(end, dt)
+            if self._layer is not None:
+                arrays = end.particle_q, end.particle_qd
+                self._pushed = self._layer.push(self._motion, *arrays, dt, record=record is not None)
             resolution = self._response.resolve(self._motion, dt, record)
             self._finish(resolution, end)
         return resolution

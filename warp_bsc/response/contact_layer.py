@@ -1,0 +1,583 @@
+"""A layer around all surfaces in which contacts push gradually, so that what comes of a step is continuous.
+
+A contact that acts from the moment of a hit makes trajectories jump: whether a hit falls into this step or the next
+decides which forces the inner solver computes next. In the layer a contact is a spring and a damper instead. They act
+on positions y between the start and the end of the step, y = x1 + theta (x0 - x1), and remove the share kappa of how
+far a pair is in the layer at y; velocities change by the change of positions over the length of the step. While the
+pair is in the layer, its depth obeys a linear recurrence with the roots rho exp(+-i phi): after pi / phi steps it
+leaves with rho^(pi / phi) of its speed, which is the restitution, whatever the phase of the hit.
+
+The push of a contact is divided among the contacts of its vertices in proportion to their depths (mass splitting, Tonge
+et al. 2012): one pass without sweeps, in which a contact that comes or goes changes nothing at that moment. All is
+differentiable, see :meth:`ContactLayer.backward`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..detection.approach_phase import MinDistances
+from ..detection.distance_phase import distance_of_corners, firsts_of
+from ..detection.launch import retry_until_fits
+from ..detection.pipeline import DetectionPipeline
+from ..detection.rings import are_within_rings
+from ..detection.settings import Count
+from ..kernels.closest import closest_coordinates
+from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.queues import is_filled
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from .body_adjoint import give_gradients, launch_adjoint
+from .buffers import Motion
+from .constraints import are_on_body, contact_friction, has_overflowed, to_double, to_single
+from .friction import Friction
+from .model_mesh import ModelMesh
+from .model_motion import ModelMotion
+from .planes import MovingPlanes, signed_distance
+from .projection import with_delta
+
+__all__ = ["ContactLayer", "PushedStep"]
+
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_UNITS = wp.constant(wp.float64(2.0**40))
+"""Units in a metre; sums are of integers in these units, so that they are the same in any order."""
+_HALF_PI = wp.constant(0.5 * np.pi)
+_QUARTER_PI = wp.constant(0.25 * np.pi)
+_PARALLEL = wp.constant(wp.float64(1e-3))
+"""Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
+points jump, and vertices hold them."""
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+
+_PAIRS_PER_FACE = 32
+"""Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow."""
+
+_KERNEL = {"enable_backward": False}
+
+
+@wp.struct
+class _Pairs:
+    """The pairs of one kind that may be in the layer."""
+
+    kind: int
+    elements: wp.array2d[int]
+    pairs: wp.array[wp.vec2i]
+    counts: wp.array[wp.int64]
+
+
+@wp.struct
+class _Layer:
+    """The layer and what is at its bottom."""
+
+    thickness: wp.float64  # [m]
+    distances: MinDistances  # of pairs [m]
+    restitution: wp.array[float]  # in [0, 1]
+
+
+@wp.func
+def _gains(restitution: float):
+    """Returns kappa and theta of the layer for a coefficient of restitution.
+
+    The roots of z^2 - (2 - 2 kappa + kappa theta) z + (1 - kappa + kappa theta) are rho exp(+-i phi). Four steps for a
+    bounce are gradual enough; a restitution below 1/4 needs less, as theta would be negative.
+    """
+    phi = _HALF_PI - _QUARTER_PI * wp.min(4.0 * restitution, 1.0)
+    rho = float(0.0)
+    if restitution > 0.0:  # at 0 there is no derivative
+        rho = wp.pow(restitution, phi / (2.0 * _HALF_PI))
+    turning = rho * wp.cos(phi)
+    kappa = 1.0 + rho * rho - 2.0 * turning
+    theta = 2.0 * rho * (rho - wp.cos(phi)) / kappa
+    return wp.float64(kappa), wp.float64(theta)
+
+
+@wp.func
+def _between(x0: wp.vec3, x1: wp.vec3, theta: wp.float64) -> wp.vec3d:
+    return to_double(x1) + theta * (to_double(x0) - to_double(x1))
+
+
+@wp.func
+def _weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
+    """Returns the weights of four vertices in the vector between the closest points of two elements."""
+    if kind == EDGE_EDGE:
+        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
+    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+
+
+@wp.func
+def _vector(weights: wp.vec4d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3d:
+    return weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
+
+
+@wp.func
+def _is_on_the_same_side(motion: Motion, kind: int, corners: wp.vec4i, normal: wp.vec3d) -> bool:
+    """Returns whether two elements were on the same sides of each other at the start: not if they have passed."""
+    a = to_double(motion.x0[corners[0]])
+    b = to_double(motion.x0[corners[1]])
+    c = to_double(motion.x0[corners[2]])
+    d = to_double(motion.x0[corners[3]])
+    return wp.dot(normal, _vector(_weights(kind, a, b, c, d), a, b, c, d)) > _ZERO
+
+
+@wp.func
+def _contact_of_pair(motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i):
+    """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not."""
+    _kappa, theta = _gains(layer.restitution[0])
+    a = _between(motion.x0[corners[0]], motion.x1[corners[0]], theta)
+    b = _between(motion.x0[corners[1]], motion.x1[corners[1]], theta)
+    c = _between(motion.x0[corners[2]], motion.x1[corners[2]], theta)
+    d = _between(motion.x0[corners[3]], motion.x1[corners[3]], theta)
+    weights = _weights(kind, a, b, c, d)
+    vector = _vector(weights, a, b, c, d)
+    distance = wp.length(vector)
+    depth = layer.thickness + distance_of_corners(kind, corners, layer.distances.radius) - distance
+    if depth <= _ZERO or distance <= _ZERO:
+        return weights, vector, _ZERO
+    normal = vector / distance
+    if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(motion, corners):
+        return weights, normal, _ZERO
+    if not _is_on_the_same_side(motion, kind, corners, normal):
+        return weights, normal, _ZERO
+    if kind == EDGE_EDGE:
+        u = b - a
+        v = d - c
+        sines = wp.length_sq(wp.cross(u, v))
+        depth *= sines / (sines + _PARALLEL * wp.length_sq(u) * wp.length_sq(v))
+    return weights, normal, depth
+
+
+@wp.func
+def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: _Layer, plane: int, vertex: int):
+    """Returns the normal of a contact of a vertex with a plane, and its depth in the layer [m], 0 if it is not."""
+    _kappa, theta = _gains(layer.restitution[0])
+    end = planes.end[plane]
+    normal = wp.vec3d(end[0], end[1], end[2])
+    if planes.world[plane] >= 0 and planes.world[plane] != motion.world[vertex]:
+        return normal, _ZERO
+    before, error = signed_distance(planes.start[plane], motion.x0[vertex])
+    after, _error = signed_distance(end, motion.x1[vertex])
+    least = layer.distances.radius[vertex] + layer.distances.of_planes
+    depth = layer.thickness + least - after - theta * (before - after)
+    if not (depth > _ZERO and before >= -error):
+        return normal, _ZERO
+    return normal, depth
+
+
+@wp.func
+def _push(
+    motion: Motion,
+    layer: _Layer,
+    normal: wp.vec3d,
+    depth: wp.float64,
+    path: wp.vec3d,
+    resistance: wp.float64,
+    friction: float,
+) -> wp.vec3d:
+    """Returns the push of a contact, an impulse times a time [kg m].
+
+    Args:
+        motion: The motion.
+        layer: The layer.
+        normal: The normal.
+        depth: The depth [m].
+        path: Of the first contact point relative to the second [m].
+        resistance: The sum of the inverse masses of vertices times weights and depths of all their contacts [m/kg].
+        friction: The coefficient.
+    """
+    kappa, _theta = _gains(layer.restitution[0])
+    part = depth / resistance  # the mass that the vertices have for this contact
+    along = kappa * depth * part
+    across = path - wp.dot(path, normal) * normal
+    length = wp.length(across)
+    if length == _ZERO:
+        return along * normal
+    return along * normal - across * wp.min(wp.float64(friction) * along / length, part)
+
+
+@wp.func
+def _resistance(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, depths: wp.array[wp.float64]) -> wp.float64:
+    resistance = _ZERO
+    for j in range(4):
+        vertex = corners[j]
+        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * depths[vertex]
+    return resistance
+
+
+@wp.func
+def _push_of_pair(
+    motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i, depths: wp.array[wp.float64]
+):
+    """Returns the weights of four vertices in a contact and its push, 0 if there is none."""
+    weights, normal, depth = _contact_of_pair(motion, layer, kind, corners)
+    resistance = _resistance(motion, corners, weights, depths)
+    if depth <= _ZERO or resistance <= _ZERO:
+        return weights, wp.vec3d()
+    path = wp.vec3d()
+    for j in range(4):
+        vertex = corners[j]
+        path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
+    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    return weights, _push(motion, layer, normal, depth, path, resistance, friction)
+
+
+@wp.func
+def _push_of_plane(
+    motion: Motion, planes: MovingPlanes, layer: _Layer, plane: int, vertex: int, depths: wp.array[wp.float64]
+) -> wp.vec3d:
+    """Returns the push of a plane on a vertex, 0 if there is none."""
+    normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+    resistance = wp.float64(motion.inverse_mass[vertex]) * depths[vertex]
+    if depth <= _ZERO or resistance <= _ZERO:
+        return wp.vec3d()
+    path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
+    friction = contact_friction(motion.friction[vertex], planes.friction[plane])
+    return _push(motion, layer, normal, depth, path, resistance, friction)
+
+
+@wp.kernel(**_KERNEL)
+def _place(motion: Motion, layer: _Layer, y: wp.array[wp.vec3]):
+    """Writes the positions at which contacts act, to which the detection is near enough in single precision."""
+    vertex = wp.tid()
+    _kappa, theta = _gains(layer.restitution[0])
+    y[vertex] = to_single(_between(motion.x0[vertex], motion.x1[vertex], theta))
+
+
+@wp.kernel(**_KERNEL)
+def _sum_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, sums: wp.array[wp.int64]):
+    """Adds the depths of contacts, by their weights, to the sums of their vertices."""
+    i = wp.tid()
+    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+        return
+    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
+    if depth > _ZERO:
+        for j in range(4):
+            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * depth)))
+
+
+@wp.kernel(**_KERNEL)
+def _finish_depths(
+    motion: Motion,
+    planes: MovingPlanes,
+    layer: _Layer,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    sums: wp.array[wp.int64],
+    depths: wp.array[wp.float64],
+    overflows: wp.array[int],
+):
+    """Adds the depths of contacts with planes, and writes the sums in metres; zeros if pairs are missing."""
+    vertex = wp.tid()
+    depth = wp.float64(sums[vertex]) / _UNITS
+    sums[vertex] = wp.int64(0)
+    for plane in range(planes.end.shape[0]):
+        _normal, more = _contact_with_plane(motion, planes, layer, plane, vertex)
+        depth += more
+    if has_overflowed(counts, capacities):
+        depth = _ZERO
+        if vertex == 0:
+            overflows[0] = overflows[0] + 1
+    depths[vertex] = depth
+
+
+@wp.kernel(**_KERNEL)
+def _sum_pushes(
+    motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64], sums: wp.array2d[wp.int64]
+):
+    """Adds what contacts move vertices by to their sums."""
+    i = wp.tid()
+    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+        return
+    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, depths)
+    for j in range(4):
+        vertex = corners[j]
+        share = weights[j] * wp.float64(motion.inverse_mass[vertex])
+        for axis in range(3):
+            wp.atomic_add(sums, vertex, axis, wp.int64(wp.rint(_UNITS * share * push[axis])))
+
+
+@wp.kernel(**_KERNEL)
+def _move(
+    motion: Motion,
+    planes: MovingPlanes,
+    layer: _Layer,
+    depths: wp.array[wp.float64],
+    dt: float,
+    sums: wp.array2d[wp.int64],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+):
+    """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
+    vertex = wp.tid()
+    moved = bool(False)
+    for plane in range(planes.end.shape[0]):
+        push = _push_of_plane(motion, planes, layer, plane, vertex, depths)
+        for axis in range(3):
+            sums[vertex, axis] += wp.int64(wp.rint(_UNITS * wp.float64(motion.inverse_mass[vertex]) * push[axis]))
+    for axis in range(3):
+        moved = moved or sums[vertex, axis] != wp.int64(0)
+    if moved and motion.is_lost[vertex] == 0:
+        motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
+        for axis in range(3):
+            motion.velocity[vertex][axis] += float(wp.float64(sums[vertex, axis]) / (_UNITS * wp.float64(dt)))
+        particle_q[vertex] = motion.x1[vertex]
+        particle_qd[vertex] = motion.velocity[vertex]
+    for axis in range(3):
+        sums[vertex, axis] = wp.int64(0)
+
+
+@wp.kernel
+def _add_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64]):
+    """Computes what :func:`_sum_depths` does."""
+    i = wp.tid()
+    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+        return
+    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
+    if depth > _ZERO:
+        for j in range(4):
+            wp.atomic_add(depths, corners[j], wp.abs(weights[j]) * depth)
+
+
+@wp.kernel
+def _add_depths_of_planes(motion: Motion, planes: MovingPlanes, layer: _Layer, depths: wp.array[wp.float64]):
+    """Computes what :func:`_finish_depths` adds, with a thread for each vertex and plane."""
+    vertex, plane = wp.tid()
+    _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+    wp.atomic_add(depths, vertex, depth)
+
+
+@wp.kernel
+def _add_pushes(
+    motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64], changes: wp.array[wp.vec3]
+):
+    """Computes what :func:`_sum_pushes` does."""
+    i = wp.tid()
+    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+        return
+    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, depths)
+    for j in range(4):
+        share = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
+        wp.atomic_add(changes, corners[j], to_single(share * push))
+
+
+@wp.kernel
+def _add_pushes_of_planes(
+    motion: Motion, planes: MovingPlanes, layer: _Layer, depths: wp.array[wp.float64], changes: wp.array[wp.vec3]
+):
+    """Computes what :func:`_move` adds, with a thread for each particle and plane."""
+    vertex, plane = wp.tid()
+    push = _push_of_plane(motion, planes, layer, plane, vertex, depths)
+    wp.atomic_add(changes, vertex, to_single(wp.float64(motion.inverse_mass[vertex]) * push))
+
+
+@wp.kernel(**_KERNEL)
+def _begin_backward(
+    is_lost: wp.array[int],
+    dt: float,
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    changes: wp.array[wp.vec3],
+):
+    """Writes the gradient with respect to what contacts move particles by."""
+    particle = wp.tid()
+    if is_lost[particle] == 0:
+        changes[particle] = particle_q[particle] + particle_qd[particle] / dt
+
+
+@wp.kernel(**_KERNEL)
+def _finish_backward(
+    x0: wp.array[wp.vec3],
+    x1: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    start_q: wp.array[wp.vec3],
+    particle_q: wp.array[wp.vec3],
+    particle_inv_mass: wp.array[float],
+):
+    """Adds to the gradients of the inputs of the step."""
+    particle = wp.tid()
+    start_q[particle] = start_q[particle] + x0[particle]
+    particle_q[particle] = particle_q[particle] + x1[particle]
+    if particle_inv_mass:
+        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle]
+
+
+@dataclass(frozen=True)
+class PushedStep:
+    """What :meth:`ContactLayer.backward` needs of a step.
+
+    Attributes:
+        motion: The motion that was wanted.
+        planes: The planes.
+        pairs: The pairs that may be in the layer, of each kind.
+        depths: The sums of the depths of the contacts of each vertex [m].
+        dt: Length of the step [s].
+    """
+
+    motion: Motion
+    planes: MovingPlanes
+    pairs: list[_Pairs]
+    depths: wp.array
+    dt: float
+
+
+class ContactLayer:
+    """Pushes what comes into a layer around all surfaces, before :class:`.response.Response` resolves hits.
+
+    Attributes:
+        overflows: Steps in a CUDA graph in which the layer pushed nothing, because a queue was too small, array of one
+            int.
+    """
+
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        friction: Friction,
+        *,
+        thickness: float,
+        restitution: wp.array[float],
+        distances: MinDistances,
+    ):
+        """Allocates buffers.
+
+        Args:
+            mesh: The mesh.
+            friction: The coefficients of its vertices and planes.
+            thickness: Of the layer [m].
+            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
+            distances: Minimum distances of pairs, above which the layer begins; their reach is the thickness.
+        """
+        self._mesh, self._friction, self._device = mesh, friction, mesh.device
+        self._layer = layer = _Layer()
+        layer.thickness, layer.distances, layer.restitution = thickness, distances, restitution
+        pairs_per_face = None if mesh.device.is_cpu else _PAIRS_PER_FACE
+        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=distances)
+        n = mesh.vertex_count
+        self._y = wp.zeros(n, dtype=wp.vec3, device=self._device)
+        self._depth_sums = wp.zeros(n, dtype=wp.int64, device=self._device)
+        self._depths = wp.zeros(n, dtype=wp.float64, device=self._device)
+        self._sums = wp.zeros((n, 3), dtype=wp.int64, device=self._device)
+        self.overflows = wp.zeros(1, dtype=int, device=self._device)
+
+    def prepare(self, motion: ModelMotion) -> None:
+        """Finds the pairs that may be in the layer; allocates buffers, which a CUDA graph cannot."""
+        detector = self._detector
+        self._launch(_place, len(self._y), [motion.vertices, self._layer, self._y])
+        retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self._device)
+
+    def push(
+        self,
+        motion: ModelMotion,
+        particle_q: wp.array[wp.vec3],
+        particle_qd: wp.array[wp.vec3],
+        dt: float,
+        *,
+        record: bool = False,
+    ) -> PushedStep | None:
+        """Changes the wanted motion, and the state that it was copied from, by the pushes of contacts in the layer.
+
+        Args:
+            motion: The motion.
+            particle_q: The wanted positions of particles.
+            particle_qd: Their wanted velocities.
+            dt: Length of the step [s].
+            record: Whether to return what :meth:`backward` needs; None otherwise.
+        """
+        self.prepare(motion)
+        vertices, layer, detector = motion.vertices, self._layer, self._detector
+        n = len(vertices.x1)
+        pairs = [self._pairs_of(narrow_phase) for narrow_phase in detector.narrow_phases]
+        for of_kind in pairs:
+            self._launch_over(_sum_depths, of_kind, [vertices, layer, of_kind, self._depth_sums])
+        inputs = [vertices, motion.planes, layer, detector.counters.array, detector.capacities]
+        self._launch(_finish_depths, n, [*inputs, self._depth_sums, self._depths, self.overflows])
+        for of_kind in pairs:
+            self._launch_over(_sum_pushes, of_kind, [vertices, layer, of_kind, self._depths, self._sums])
+        step = self._recorded(motion, pairs, dt) if record else None
+        inputs = [vertices, motion.planes, layer, self._depths, dt, self._sums]
+        self._launch(_move, len(particle_q), [*inputs, particle_q, particle_qd])
+        return step
+
+    def backward(
+        self,
+        step: PushedStep,
+        start_q: wp.array[wp.vec3],
+        particle_q: wp.array[wp.vec3],
+        particle_qd: wp.array[wp.vec3],
+    ) -> None:
+        """Turns gradients with respect to a pushed state into those with respect to the wanted one, in place.
+
+        Adds to the gradients of inverse masses, of what coefficients of friction are read from, and of restitution,
+        where these have such arrays.
+
+        Args:
+            step: The step.
+            start_q: Gradient with respect to positions at the start, shape [particle_count]; is added to.
+            particle_q: Gradient with respect to the pushed positions; becomes that with respect to the wanted ones.
+            particle_qd: The same for the velocities.
+        """
+        motion, planes, layer, device = step.motion, step.planes, self._layer, self._device
+        n, particles = len(motion.x0), len(particle_q)
+        of_changes, changes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
+        self._launch(_begin_backward, particles, [motion.is_lost, step.dt, particle_q, particle_qd, of_changes])
+        of_motion = give_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
+        of_planes = give_gradients(planes, ("friction",))
+        depths = step.depths[:]
+        depths.grad = of_depths = wp.zeros(n, dtype=wp.float64, device=device)
+        sums = wp.zeros(n, dtype=wp.float64, device=device)
+        over_planes = (particles, len(planes.end))
+        for of_kind in step.pairs:
+            inputs = [motion, layer, of_kind, depths]
+            launch_adjoint(_add_pushes, len(of_kind.pairs), inputs, [changes], [of_changes], device)
+        inputs = [motion, planes, layer, depths]
+        launch_adjoint(_add_pushes_of_planes, over_planes, inputs, [changes], [of_changes], device)
+        for of_kind in step.pairs:
+            inputs = [motion, layer, of_kind]
+            launch_adjoint(_add_depths, len(of_kind.pairs), inputs, [sums], [of_depths], device)
+        launch_adjoint(_add_depths_of_planes, over_planes, [motion, planes, layer], [sums], [of_depths], device)
+        inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
+        outputs = [start_q, particle_q, self._mesh.model.particle_inv_mass.grad]
+        self._launch(_finish_backward, particles, [*inputs, *outputs])
+        self._friction.adjoin(of_motion.friction, of_planes.friction)
+
+    def _recorded(self, motion, pairs, dt):
+        """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
+        copies = []
+        for of_kind in pairs:
+            copy = _Pairs()
+            copy.kind, copy.elements = of_kind.kind, of_kind.elements
+            count = len(of_kind.pairs)
+            if not self._device.is_capturing:
+                count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+            if count:
+                copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
+                copies.append(copy)
+        kept = Motion()
+        for name in ("x0", "x1", "is_lost", "friction"):
+            setattr(kept, name, wp.clone(getattr(motion.vertices, name)))
+        kept.inverse_mass, kept.world = motion.vertices.inverse_mass, motion.vertices.world
+        planes = MovingPlanes()
+        for name in MovingPlanes.vars:
+            array = getattr(motion.planes, name)
+            setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
+        return PushedStep(kept, planes, copies, wp.clone(self._depths), dt)
+
+    def _pairs_of(self, narrow_phase):
+        pairs = _Pairs()
+        pairs.kind, pairs.elements = int(narrow_phase.kind), self._mesh.device_elements(narrow_phase.kind)
+        pairs.pairs, pairs.counts = narrow_phase.contacts.pairs, narrow_phase.counts
+        return pairs
+
+    def _launch(self, kernel, size, inputs):
+        wp.launch(kernel, size, inputs=inputs, device=self._device)
+
+    def _launch_over(self, kernel, of_kind, inputs):
+        """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
+        count = len(of_kind.pairs)
+        if self._device.is_cpu:
+            count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+        self._launch(kernel, count, inputs)
