@@ -81,7 +81,7 @@ def _gains(restitution: float):
     The roots of z^2 - (2 - 2 kappa + kappa theta) z + (1 - kappa + kappa theta) are rho exp(+-i phi). Four steps for a
     bounce are gradual enough; a restitution below 1/4 needs less, as theta would be negative.
     """
-    phi = _HALF_PI - _QUARTER_PI * wp.min(4.0 * restitution, 1.0)
+    phi = _QUARTER_PI
     rho = float(0.0)
     if restitution > 0.0:  # at 0 there is no derivative
         rho = wp.pow(restitution, phi / (2.0 * _HALF_PI))
@@ -193,7 +193,9 @@ def _push(
     length = wp.length(across)
     if length == _ZERO:
         return along * normal
-    return along * normal - across * wp.min(wp.float64(friction) * along / length, part)
+    sliding = wp.float64(friction) * along / (length * part)
+    square = sliding * sliding
+    return along * normal - across * (part * sliding / wp.sqrt(wp.sqrt(_ONE + square * square)))
 
 
 @wp.func
