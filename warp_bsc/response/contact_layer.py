@@ -43,7 +43,7 @@ _UNITS = wp.constant(wp.float64(2.0**40))
 """Units in a metre; sums are of integers in these units, so that they are the same in any order."""
 _HALF_PI = wp.constant(0.5 * np.pi)
 _QUARTER_PI = wp.constant(0.25 * np.pi)
-_PARALLEL = wp.constant(wp.float64(1e-3))
+_PARALLEL = wp.constant(wp.float64(3e-2))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -145,7 +145,7 @@ def _contact_of_pair(motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i
         v = d - c
         sines = wp.length_sq(wp.cross(u, v))
         depth *= sines / (sines + _PARALLEL * wp.length_sq(u) * wp.length_sq(v))
-    return weights, normal, depth
+    return weights, normal, depth * depth / (depth + wp.float64(0.05) * layer.thickness)
 
 
 @wp.func
