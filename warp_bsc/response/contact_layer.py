@@ -145,7 +145,7 @@ def _contact_of_pair(motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i
         v = d - c
         sines = wp.length_sq(wp.cross(u, v))
         depth *= sines / (sines + _PARALLEL * wp.length_sq(u) * wp.length_sq(v))
-    return weights, normal, depth * depth / (depth + wp.float64(0.05) * layer.thickness)
+    return weights, normal, depth
 
 
 @wp.func
@@ -163,6 +163,12 @@ def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: _Layer, pla
     if not (depth > _ZERO and before >= -error):
         return normal, _ZERO
     return normal, depth
+
+
+@wp.func
+def _power(layer: _Layer, depth: wp.float64) -> wp.float64:
+    share = depth / layer.thickness
+    return share * share
 
 
 @wp.func
@@ -187,7 +193,7 @@ def _push(
         friction: The coefficient.
     """
     kappa, _theta = _gains(layer.restitution[0])
-    part = depth / resistance  # the mass that the vertices have for this contact
+    part = _power(layer, depth) / resistance  # the mass that the vertices have for this contact
     along = kappa * depth * part
     across = path - wp.dot(path, normal) * normal
     length = wp.length(across)
@@ -256,7 +262,7 @@ def _sum_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, sums: wp.array[w
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > _ZERO:
         for j in range(4):
-            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * depth)))
+            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * _power(layer, depth))))
 
 
 @wp.kernel(**_KERNEL)
@@ -276,7 +282,7 @@ def _finish_depths(
     sums[vertex] = wp.int64(0)
     for plane in range(planes.end.shape[0]):
         _normal, more = _contact_with_plane(motion, planes, layer, plane, vertex)
-        depth += more
+        depth += _power(layer, more)
     if has_overflowed(counts, capacities):
         depth = _ZERO
         if vertex == 0:
@@ -341,7 +347,7 @@ def _add_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > _ZERO:
         for j in range(4):
-            wp.atomic_add(depths, corners[j], wp.abs(weights[j]) * depth)
+            wp.atomic_add(depths, corners[j], wp.abs(weights[j]) * _power(layer, depth))
 
 
 @wp.kernel
@@ -349,7 +355,7 @@ def _add_depths_of_planes(motion: Motion, planes: MovingPlanes, layer: _Layer, d
     """Computes what :func:`_finish_depths` adds, with a thread for each vertex and plane."""
     vertex, plane = wp.tid()
     _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
-    wp.atomic_add(depths, vertex, depth)
+    wp.atomic_add(depths, vertex, _power(layer, depth))
 
 
 @wp.kernel
