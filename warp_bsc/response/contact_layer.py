@@ -1,20 +1,20 @@
 """A layer around all surfaces in which contacts push gradually, so that what comes of a step is continuous.
 
-A contact that acts from the moment of a hit makes trajectories jump: whether a hit falls into this step or the next
-decides which forces the inner solver computes next. In the layer a contact is a spring and a damper instead. They act
-on positions y between the start and the end of the step, y = x1 + theta (x0 - x1), and remove the share kappa of how
-far a pair is in the layer at y; velocities change by the change of positions over the length of the step. While the
-pair is in the layer, its depth obeys a linear recurrence with the roots rho exp(+-i phi): after pi / phi steps it
-leaves with rho^(pi / phi) of its speed, which is the restitution, whatever the phase of the hit.
+A contact that acts where it hits makes trajectories jump: whether a hit falls into this step or the next decides which
+velocities the inner solver sees in the next. In the layer a contact is a spring with a damper instead. It acts at the
+positions y = x1 + theta (x0 - x1) between start and end of the step, and removes the share kappa of the depth of its
+pair in the layer at y; velocities change by as much over the length of the step. Alone, such a depth obeys a linear
+recurrence, with kappa and theta such that its roots are rho exp(+-i pi / 4): four steps after it came in, the pair
+leaves with rho^4 of its speed, which is the restitution, whatever the speed and whatever part of a step it came in at.
 
-The push of a contact is divided among the contacts of its vertices in proportion to their depths (mass splitting, Tonge
-et al. 2012): one pass without sweeps, in which a contact that comes or goes changes nothing at that moment. All is
-differentiable, see :meth:`ContactLayer.backward`.
+Contacts of one vertex divide its mass among them, by the squares of their depths (mass splitting, Tonge et al. 2012):
+one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
+little less than one, so that up to 0.02 more of the speed comes back. Friction is that of Coulomb, but for speeds at
+which the contact hardly slides. All is differentiable, see :meth:`ContactLayer.backward`.
 """
 
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from ..detection.approach_phase import MinDistances
@@ -40,10 +40,9 @@ __all__ = ["ContactLayer", "PushedStep"]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _UNITS = wp.constant(wp.float64(2.0**40))
-"""Units in a metre; sums are of integers in these units, so that they are the same in any order."""
-_HALF_PI = wp.constant(0.5 * np.pi)
-_QUARTER_PI = wp.constant(0.25 * np.pi)
-_PARALLEL = wp.constant(wp.float64(3e-2))
+"""Units in a metre and in 1; sums are of integers in these units, so that they are the same in any order."""
+_ROOT_OF_2 = wp.constant(2.0**0.5)
+_PARALLEL = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -78,16 +77,14 @@ class _Layer:
 def _gains(restitution: float):
     """Returns kappa and theta of the layer for a coefficient of restitution.
 
-    The roots of z^2 - (2 - 2 kappa + kappa theta) z + (1 - kappa + kappa theta) are rho exp(+-i phi). Four steps for a
-    bounce are gradual enough; a restitution below 1/4 needs less, as theta would be negative.
+    The roots of z^2 - (2 - 2 kappa + kappa theta) z + (1 - kappa + kappa theta) are rho exp(+-i pi / 4). Below a
+    restitution of 1/4, theta is negative: contacts act where the motion would be somewhat later.
     """
-    phi = _QUARTER_PI
     rho = float(0.0)
     if restitution > 0.0:  # at 0 there is no derivative
-        rho = wp.pow(restitution, phi / (2.0 * _HALF_PI))
-    turning = rho * wp.cos(phi)
-    kappa = 1.0 + rho * rho - 2.0 * turning
-    theta = 2.0 * rho * (rho - wp.cos(phi)) / kappa
+        rho = wp.sqrt(wp.sqrt(restitution))
+    kappa = 1.0 + rho * (rho - _ROOT_OF_2)
+    theta = rho * (2.0 * rho - _ROOT_OF_2) / kappa
     return wp.float64(kappa), wp.float64(theta)
 
 
@@ -166,9 +163,9 @@ def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: _Layer, pla
 
 
 @wp.func
-def _power(layer: _Layer, depth: wp.float64) -> wp.float64:
-    share = depth / layer.thickness
-    return share * share
+def _share_of(layer: _Layer, depth: wp.float64) -> wp.float64:
+    """Returns what a contact of this depth counts where contacts divide the mass of a vertex."""
+    return (depth / layer.thickness) * (depth / layer.thickness)
 
 
 @wp.func
@@ -189,37 +186,34 @@ def _push(
         normal: The normal.
         depth: The depth [m].
         path: Of the first contact point relative to the second [m].
-        resistance: The sum of the inverse masses of vertices times weights and depths of all their contacts [m/kg].
+        resistance: The sum over its vertices of inverse mass, weight, and what all contacts of the vertex count [1/kg].
         friction: The coefficient.
     """
     kappa, _theta = _gains(layer.restitution[0])
-    part = _power(layer, depth) / resistance  # the mass that the vertices have for this contact
+    part = _share_of(layer, depth) / resistance  # the mass that the vertices have for this contact
     along = kappa * depth * part
     across = path - wp.dot(path, normal) * normal
     length = wp.length(across)
     if length == _ZERO:
         return along * normal
-    sliding = wp.float64(friction) * along / (length * part)
-    square = sliding * sliding
-    return along * normal - across * (part * sliding / wp.sqrt(wp.sqrt(_ONE + square * square)))
+    holding = wp.float64(friction) * along / (length * part)  # more than 1 if friction could stop the contact
+    return along * normal - across * (part * holding / wp.sqrt(_ONE + holding * holding))
 
 
 @wp.func
-def _resistance(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, depths: wp.array[wp.float64]) -> wp.float64:
+def _resistance(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, shares: wp.array[wp.float64]) -> wp.float64:
     resistance = _ZERO
     for j in range(4):
         vertex = corners[j]
-        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * depths[vertex]
+        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
     return resistance
 
 
 @wp.func
-def _push_of_pair(
-    motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i, depths: wp.array[wp.float64]
-):
+def _push_of_pair(motion: Motion, layer: _Layer, kind: int, corners: wp.vec4i, shares: wp.array[wp.float64]):
     """Returns the weights of four vertices in a contact and its push, 0 if there is none."""
     weights, normal, depth = _contact_of_pair(motion, layer, kind, corners)
-    resistance = _resistance(motion, corners, weights, depths)
+    resistance = _resistance(motion, corners, weights, shares)
     if depth <= _ZERO or resistance <= _ZERO:
         return weights, wp.vec3d()
     path = wp.vec3d()
@@ -232,11 +226,11 @@ def _push_of_pair(
 
 @wp.func
 def _push_of_plane(
-    motion: Motion, planes: MovingPlanes, layer: _Layer, plane: int, vertex: int, depths: wp.array[wp.float64]
+    motion: Motion, planes: MovingPlanes, layer: _Layer, plane: int, vertex: int, shares: wp.array[wp.float64]
 ) -> wp.vec3d:
     """Returns the push of a plane on a vertex, 0 if there is none."""
     normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
-    resistance = wp.float64(motion.inverse_mass[vertex]) * depths[vertex]
+    resistance = wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
     if depth <= _ZERO or resistance <= _ZERO:
         return wp.vec3d()
     path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
@@ -253,8 +247,8 @@ def _place(motion: Motion, layer: _Layer, y: wp.array[wp.vec3]):
 
 
 @wp.kernel(**_KERNEL)
-def _sum_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, sums: wp.array[wp.int64]):
-    """Adds the depths of contacts, by their weights, to the sums of their vertices."""
+def _sum_shares(motion: Motion, layer: _Layer, of_kind: _Pairs, sums: wp.array[wp.int64]):
+    """Adds what contacts count, by their weights, to the sums of their vertices."""
     i = wp.tid()
     if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
         return
@@ -262,44 +256,44 @@ def _sum_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, sums: wp.array[w
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > _ZERO:
         for j in range(4):
-            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * _power(layer, depth))))
+            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * _share_of(layer, depth))))
 
 
 @wp.kernel(**_KERNEL)
-def _finish_depths(
+def _finish_shares(
     motion: Motion,
     planes: MovingPlanes,
     layer: _Layer,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     sums: wp.array[wp.int64],
-    depths: wp.array[wp.float64],
-    overflows: wp.array[int],
+    shares: wp.array[wp.float64],
+    layerless_steps: wp.array[int],
 ):
-    """Adds the depths of contacts with planes, and writes the sums in metres; zeros if pairs are missing."""
+    """Adds what contacts with planes count, and writes the sums; zeros if pairs are missing, so that nothing pushes."""
     vertex = wp.tid()
-    depth = wp.float64(sums[vertex]) / _UNITS
+    share = wp.float64(sums[vertex]) / _UNITS
     sums[vertex] = wp.int64(0)
     for plane in range(planes.end.shape[0]):
-        _normal, more = _contact_with_plane(motion, planes, layer, plane, vertex)
-        depth += _power(layer, more)
+        _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+        share += _share_of(layer, depth)
     if has_overflowed(counts, capacities):
-        depth = _ZERO
+        share = _ZERO
         if vertex == 0:
-            overflows[0] = overflows[0] + 1
-    depths[vertex] = depth
+            layerless_steps[0] = layerless_steps[0] + 1
+    shares[vertex] = share
 
 
 @wp.kernel(**_KERNEL)
 def _sum_pushes(
-    motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64], sums: wp.array2d[wp.int64]
+    motion: Motion, layer: _Layer, of_kind: _Pairs, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]
 ):
     """Adds what contacts move vertices by to their sums."""
     i = wp.tid()
     if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
         return
     corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, depths)
+    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
     for j in range(4):
         vertex = corners[j]
         share = weights[j] * wp.float64(motion.inverse_mass[vertex])
@@ -312,7 +306,7 @@ def _move(
     motion: Motion,
     planes: MovingPlanes,
     layer: _Layer,
-    depths: wp.array[wp.float64],
+    shares: wp.array[wp.float64],
     dt: float,
     sums: wp.array2d[wp.int64],
     particle_q: wp.array[wp.vec3],
@@ -322,7 +316,7 @@ def _move(
     vertex = wp.tid()
     moved = bool(False)
     for plane in range(planes.end.shape[0]):
-        push = _push_of_plane(motion, planes, layer, plane, vertex, depths)
+        push = _push_of_plane(motion, planes, layer, plane, vertex, shares)
         for axis in range(3):
             sums[vertex, axis] += wp.int64(wp.rint(_UNITS * wp.float64(motion.inverse_mass[vertex]) * push[axis]))
     for axis in range(3):
@@ -338,8 +332,8 @@ def _move(
 
 
 @wp.kernel
-def _add_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64]):
-    """Computes what :func:`_sum_depths` does."""
+def _add_shares(motion: Motion, layer: _Layer, of_kind: _Pairs, shares: wp.array[wp.float64]):
+    """Computes what :func:`_sum_shares` does."""
     i = wp.tid()
     if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
         return
@@ -347,27 +341,27 @@ def _add_depths(motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > _ZERO:
         for j in range(4):
-            wp.atomic_add(depths, corners[j], wp.abs(weights[j]) * _power(layer, depth))
+            wp.atomic_add(shares, corners[j], wp.abs(weights[j]) * _share_of(layer, depth))
 
 
 @wp.kernel
-def _add_depths_of_planes(motion: Motion, planes: MovingPlanes, layer: _Layer, depths: wp.array[wp.float64]):
-    """Computes what :func:`_finish_depths` adds, with a thread for each vertex and plane."""
+def _add_shares_of_planes(motion: Motion, planes: MovingPlanes, layer: _Layer, shares: wp.array[wp.float64]):
+    """Computes what :func:`_finish_shares` adds, with a thread for each vertex and plane."""
     vertex, plane = wp.tid()
     _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
-    wp.atomic_add(depths, vertex, _power(layer, depth))
+    wp.atomic_add(shares, vertex, _share_of(layer, depth))
 
 
 @wp.kernel
 def _add_pushes(
-    motion: Motion, layer: _Layer, of_kind: _Pairs, depths: wp.array[wp.float64], changes: wp.array[wp.vec3]
+    motion: Motion, layer: _Layer, of_kind: _Pairs, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
 ):
     """Computes what :func:`_sum_pushes` does."""
     i = wp.tid()
     if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
         return
     corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, depths)
+    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
     for j in range(4):
         share = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
         wp.atomic_add(changes, corners[j], to_single(share * push))
@@ -375,11 +369,11 @@ def _add_pushes(
 
 @wp.kernel
 def _add_pushes_of_planes(
-    motion: Motion, planes: MovingPlanes, layer: _Layer, depths: wp.array[wp.float64], changes: wp.array[wp.vec3]
+    motion: Motion, planes: MovingPlanes, layer: _Layer, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
 ):
     """Computes what :func:`_move` adds, with a thread for each particle and plane."""
     vertex, plane = wp.tid()
-    push = _push_of_plane(motion, planes, layer, plane, vertex, depths)
+    push = _push_of_plane(motion, planes, layer, plane, vertex, shares)
     wp.atomic_add(changes, vertex, to_single(wp.float64(motion.inverse_mass[vertex]) * push))
 
 
@@ -422,23 +416,23 @@ class PushedStep:
         motion: The motion that was wanted.
         planes: The planes.
         pairs: The pairs that may be in the layer, of each kind.
-        depths: The sums of the depths of the contacts of each vertex [m].
+        shares: The sums of what the contacts of each vertex count.
         dt: Length of the step [s].
     """
 
     motion: Motion
     planes: MovingPlanes
     pairs: list[_Pairs]
-    depths: wp.array
+    shares: wp.array
     dt: float
 
 
 class ContactLayer:
     """Pushes what comes into a layer around all surfaces, before :class:`.response.Response` resolves hits.
 
-    Attributes:
-        overflows: Steps in a CUDA graph in which the layer pushed nothing, because a queue was too small, array of one
-            int.
+    Pairs that passed each other since the start of the step are left to that, and so are contacts with bodies that the
+    response moves. The linear momentum of particles that push each other is conserved, and so is the angular momentum
+    of their pushes without friction.
     """
 
     def __init__(
@@ -449,6 +443,7 @@ class ContactLayer:
         thickness: float,
         restitution: wp.array[float],
         distances: MinDistances,
+        layerless_steps: wp.array[int],
     ):
         """Allocates buffers.
 
@@ -458,18 +453,20 @@ class ContactLayer:
             thickness: Of the layer [m].
             restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
             distances: Minimum distances of pairs, above which the layer begins; their reach is the thickness.
+            layerless_steps: Is increased in a step in which a queue of a CUDA graph was too small, and the layer pushed
+                nothing, array of one int.
         """
         self._mesh, self._friction, self._device = mesh, friction, mesh.device
+        self._layerless_steps = layerless_steps
         self._layer = layer = _Layer()
         layer.thickness, layer.distances, layer.restitution = thickness, distances, restitution
         pairs_per_face = None if mesh.device.is_cpu else _PAIRS_PER_FACE
         self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=distances)
         n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=self._device)
-        self._depth_sums = wp.zeros(n, dtype=wp.int64, device=self._device)
-        self._depths = wp.zeros(n, dtype=wp.float64, device=self._device)
+        self._share_sums = wp.zeros(n, dtype=wp.int64, device=self._device)
+        self._shares = wp.zeros(n, dtype=wp.float64, device=self._device)
         self._sums = wp.zeros((n, 3), dtype=wp.int64, device=self._device)
-        self.overflows = wp.zeros(1, dtype=int, device=self._device)
 
     def prepare(self, motion: ModelMotion) -> None:
         """Finds the pairs that may be in the layer; allocates buffers, which a CUDA graph cannot."""
@@ -500,13 +497,13 @@ class ContactLayer:
         n = len(vertices.x1)
         pairs = [self._pairs_of(narrow_phase) for narrow_phase in detector.narrow_phases]
         for of_kind in pairs:
-            self._launch_over(_sum_depths, of_kind, [vertices, layer, of_kind, self._depth_sums])
+            self._launch_over(_sum_shares, of_kind, [vertices, layer, of_kind, self._share_sums])
         inputs = [vertices, motion.planes, layer, detector.counters.array, detector.capacities]
-        self._launch(_finish_depths, n, [*inputs, self._depth_sums, self._depths, self.overflows])
+        self._launch(_finish_shares, n, [*inputs, self._share_sums, self._shares, self._layerless_steps])
         for of_kind in pairs:
-            self._launch_over(_sum_pushes, of_kind, [vertices, layer, of_kind, self._depths, self._sums])
+            self._launch_over(_sum_pushes, of_kind, [vertices, layer, of_kind, self._shares, self._sums])
         step = self._recorded(motion, pairs, dt) if record else None
-        inputs = [vertices, motion.planes, layer, self._depths, dt, self._sums]
+        inputs = [vertices, motion.planes, layer, self._shares, dt, self._sums]
         self._launch(_move, len(particle_q), [*inputs, particle_q, particle_qd])
         return step
 
@@ -534,19 +531,19 @@ class ContactLayer:
         self._launch(_begin_backward, particles, [motion.is_lost, step.dt, particle_q, particle_qd, of_changes])
         of_motion = give_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
         of_planes = give_gradients(planes, ("friction",))
-        depths = step.depths[:]
-        depths.grad = of_depths = wp.zeros(n, dtype=wp.float64, device=device)
+        shares = step.shares[:]
+        shares.grad = of_shares = wp.zeros(n, dtype=wp.float64, device=device)
         sums = wp.zeros(n, dtype=wp.float64, device=device)
         over_planes = (particles, len(planes.end))
         for of_kind in step.pairs:
-            inputs = [motion, layer, of_kind, depths]
+            inputs = [motion, layer, of_kind, shares]
             launch_adjoint(_add_pushes, len(of_kind.pairs), inputs, [changes], [of_changes], device)
-        inputs = [motion, planes, layer, depths]
+        inputs = [motion, planes, layer, shares]
         launch_adjoint(_add_pushes_of_planes, over_planes, inputs, [changes], [of_changes], device)
         for of_kind in step.pairs:
             inputs = [motion, layer, of_kind]
-            launch_adjoint(_add_depths, len(of_kind.pairs), inputs, [sums], [of_depths], device)
-        launch_adjoint(_add_depths_of_planes, over_planes, [motion, planes, layer], [sums], [of_depths], device)
+            launch_adjoint(_add_shares, len(of_kind.pairs), inputs, [sums], [of_shares], device)
+        launch_adjoint(_add_shares_of_planes, over_planes, [motion, planes, layer], [sums], [of_shares], device)
         inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
         outputs = [start_q, particle_q, self._mesh.model.particle_inv_mass.grad]
         self._launch(_finish_backward, particles, [*inputs, *outputs])
@@ -572,7 +569,7 @@ class ContactLayer:
         for name in MovingPlanes.vars:
             array = getattr(motion.planes, name)
             setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
-        return PushedStep(kept, planes, copies, wp.clone(self._depths), dt)
+        return PushedStep(kept, planes, copies, wp.clone(self._shares), dt)
 
     def _pairs_of(self, narrow_phase):
         pairs = _Pairs()
