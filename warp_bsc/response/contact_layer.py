@@ -9,8 +9,9 @@ leaves with rho^4 of its speed, which is the restitution, whatever the speed and
 
 Contacts of one vertex divide its mass among them, by the squares of their depths (mass splitting, Tonge et al. 2012):
 one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
-little less than one, so that up to 0.02 more of the speed comes back. Friction is that of Coulomb, but for speeds at
-which the contact hardly slides. All is differentiable, see :meth:`ContactLayer.backward`.
+little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide fast; near
+its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable, see
+:meth:`ContactLayer.backward`.
 """
 
 from dataclasses import dataclass
@@ -431,8 +432,8 @@ class ContactLayer:
     """Pushes what comes into a layer around all surfaces, before :class:`.response.Response` resolves hits.
 
     Pairs that passed each other since the start of the step are left to that, and so are contacts with bodies that the
-    response moves. The linear momentum of particles that push each other is conserved, and so is the angular momentum
-    of their pushes without friction.
+    response moves. Pushes conserve linear momentum, but angular momentum only to the first order of the step, as they
+    act along directions at y.
     """
 
     def __init__(
