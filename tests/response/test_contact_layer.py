@@ -6,9 +6,9 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from newton_scenes import Rollout
 
 import warp_bsc as bsc
-from newton_scenes import Rollout
 
 DT = 1.0 / 600.0
 STEPS = 40

@@ -9,8 +9,8 @@ leaves with rho^4 of its speed, which is the restitution, whatever the speed and
 
 Contacts of one vertex divide its mass among them, by the squares of their depths (mass splitting, Tonge et al. 2012):
 one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
-little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide fast; near
-its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable, see
+little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide
+fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable, see
 :meth:`ContactLayer.backward`.
 """
 
