@@ -13,7 +13,6 @@ from .body_adjoint_kernels import (
     place_shape_vertices,
     place_vertices,
     project_poses,
-    project_vertices,
     restore_body_paths,
     restore_body_velocities,
     restore_poses,
@@ -26,9 +25,9 @@ from .body_adjoint_kernels import (
 )
 from .buffers import Bodies, Motion, MovedBodies, Vertices
 
-__all__ = ["BodyAdjoint", "copied", "give_gradients", "launch_adjoint"]
+__all__ = ["BODY_MOTION_ARRAYS", "BodyAdjoint", "copied", "give_gradients", "launch_adjoint"]
 
-_MOTION_ARRAYS = "start", "end", "velocity", "inverse_mass"
+BODY_MOTION_ARRAYS = "start", "end", "velocity", "inverse_mass"
 _OF_MODEL = {"com": "body_com", "mass": "body_mass", "inertia": "body_inertia", "inverse_inertia": "body_inv_inertia"}
 
 
@@ -99,7 +98,7 @@ class BodyAdjoint:
         self._device = device = step.mesh.device
         self.moves = step.moves_bodies
         count = step.mesh.model.body_count
-        bodies, names = Bodies(), _MOTION_ARRAYS[: 4 if self.moves else 2]
+        bodies, names = Bodies(), BODY_MOTION_ARRAYS[: 4 if self.moves else 2]
         self.shift = self.velocity_change = self.changes = None
         if not count:
             return
@@ -176,7 +175,6 @@ class BodyAdjoint:
         if self.moves:
             self._take(self._gradients.velocity, self._gradients.more_velocity)
             self._adjoin_over_vertices(vertex_velocities, [self._motion, self._vertices])
-            self._vertices.bodies.active.zero_()
 
     def leave_velocities(self):
         """Goes from changes of velocities on to those of positions, whose impulses act elsewhere."""
@@ -202,13 +200,6 @@ class BodyAdjoint:
             self._restore_poses()
             self._place()
 
-    def take_projected_positions(self):
-        """Turns gradients with respect to positions of vertices into those with respect to what constraints did."""
-        if self.moves:
-            self._take(self._gradients.x1, self._gradients.more_x1)
-            self._adjoin_over_vertices(project_vertices, [self._motion, self._vertices, self._sums])
-            self._vertices.bodies.active.zero_()
-
     def restore_paths(self, cursor):
         """Restores poses as they were before paths were truncated."""
         if self.moves:
@@ -216,15 +207,13 @@ class BodyAdjoint:
             wp.launch(restore_body_paths, len(self._step.record.vertex), inputs=inputs, device=self._device)
             self._place()
 
-    def through_truncation(self, cursor, planes):
-        """Goes back through the truncation of paths."""
+    def through_truncation(self, cursor, times):
+        """Goes back through the truncation of paths, to their poses and to the times of their contacts."""
         if self.moves:
             step = self._step
-            inputs = [self._motion, self._vertices, planes, step.record, cursor, step.dt]
+            inputs = [self._motion, self._vertices, times, step.record, cursor, step.dt]
             truncations = len(step.record.vertex)
-            launch_adjoint(
-                truncate_body_paths, truncations, inputs, self._of_paths, self._of_paths, device=self._device
-            )
+            launch_adjoint(truncate_body_paths, truncations, inputs, self._of_paths, self._of_paths, self._device)
 
     def finish(self, of_planes, of_starts, of_ends, of_velocities):
         """Writes the gradients of poses and velocities at the start and as wanted at the end of the step.
@@ -247,7 +236,7 @@ class BodyAdjoint:
         outputs = [of_planes.start, of_planes.end]
         launch_adjoint(place_planes, len(planes.body), inputs, outputs, outputs, self._device)
         inputs = [self._motion, self._of]
-        inputs += [getattr(of_bodies, name, None) for name in _MOTION_ARRAYS]
+        inputs += [getattr(of_bodies, name, None) for name in BODY_MOTION_ARRAYS]
         of_model = [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia]
         inputs += [self._step.complete, of_starts, of_ends, of_velocities]
         self._launch(finish_bodies, [*inputs, *(array.grad for array in of_model)])

@@ -6,7 +6,7 @@ from the pose that was wanted, and from the sums of the changes by constraints.
 
 import warp as wp
 
-from .adjoint_kernels import Cursor, torque_and_moments, truncation_time
+from .adjoint_kernels import Cursor, torque_and_moments
 from .angular_momentum import HELD, MASS, MOMENTS, body_change_by_turn, body_moments, body_turns
 from .bodies import (
     centre_of,
@@ -22,7 +22,7 @@ from .bodies import (
 from .buffers import Motion, SolveStatus, Vertices, has_final_velocity
 from .constraints import to_double, to_single
 from .model_motion import moves_with_body, wanted_velocity
-from .planes import MovingPlanes, transformed_plane
+from .planes import transformed_plane
 from .step_record import NO_CONTACT, StepRecord, truncation_at
 
 __all__ = [
@@ -34,7 +34,6 @@ __all__ = [
     "place_shape_vertices",
     "place_vertices",
     "project_poses",
-    "project_vertices",
     "restore_body_paths",
     "restore_body_velocities",
     "restore_poses",
@@ -78,35 +77,17 @@ def _spatial(linear: wp.vec3d, angular: wp.vec3d) -> wp.spatial_vector:
     return wp.spatial_vector(to_single(linear), to_single(angular))
 
 
-@wp.func
-def _pose_by(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], body: int) -> wp.transform:
-    """Returns the pose of a body by what constraints did to it."""
-    change = sums[body]
-    pose = motion.bodies.end[body]
-    if _has_moved(motion, vertices, body):
-        pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
-    return pose
-
-
 @wp.kernel
 def project_poses(
     motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], poses: wp.array[wp.transform]
 ):
     """Computes the poses of bodies by what constraints did to them, see :func:`.bodies.move_bodies`."""
     body = wp.tid()
-    poses[body] = _pose_by(motion, vertices, sums, body)
-
-
-@wp.kernel
-def project_vertices(
-    motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], positions: wp.array[wp.vec3]
-):
-    """Computes the positions of vertices in these poses, see :func:`.bodies.place_vertices`."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and _is_movable(motion, body):
-        pose = _pose_by(motion, vertices, sums, body)
-        positions[vertex] = wp.transform_point(pose, motion.bodies.position[wp.tid()])
+    change = sums[body]
+    pose = motion.bodies.end[body]
+    if _has_moved(motion, vertices, body):
+        pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
+    poses[body] = pose
 
 
 @wp.kernel
@@ -173,7 +154,7 @@ def truncate_body_paths(
     # in
     motion: Motion,
     vertices: Vertices,
-    planes: MovingPlanes,
+    times: wp.array[wp.float64],
     record: StepRecord,
     cursor: Cursor,
     dt: wp.float64,
@@ -193,7 +174,7 @@ def truncate_body_paths(
         poses[entry] = start
         velocities[entry] = wp.spatial_vector()
     else:
-        share = share_before(truncation_time(motion, vertices, planes, record, entry))
+        share = share_before(times[entry])
         end = pose_between(motion.bodies, body, start, vertices.bodies.pose[body], share)
         poses[entry] = end
         velocities[entry] = velocity_between(motion.bodies, body, start, end, dt)
