@@ -34,7 +34,7 @@ from .adjoint_kernels import (
     turn_velocities,
 )
 from .angular_momentum import SUMS
-from .body_adjoint import BODY_MOTION_ARRAYS, BodyAdjoint, copied, give_gradients, launch_adjoint
+from .body_adjoint import BODY_MOTION_ARRAYS, BodyAdjoint, attach_gradients, copy_arrays, launch_adjoint
 from .buffers import Bodies, Constraints, Motion, MovedBodies, Progress, SolveStatus, Vertices
 from .planes import MovingPlanes
 from .projection import SWEEPS_PER_BATCH
@@ -110,25 +110,25 @@ class RecordedStep:
                 int(getattr(record.counts, name).numpy()[0]) for name in ("sweeps", "entries", "truncations")
             )
         self.status = name_elements(SolveStatus, wp.clone(resolution.status_values))
-        self.planes = copied(motion.planes, MovingPlanes(), dict.fromkeys(("start", "end", "friction")))
-        self.motion = copied(motion.vertices, Motion(), dict.fromkeys((*_MOTION_ARRAYS, "is_lost", "friction")))
+        self.planes = copy_arrays(motion.planes, MovingPlanes(), dict.fromkeys(("start", "end", "friction")))
+        self.motion = copy_arrays(motion.vertices, Motion(), dict.fromkeys((*_MOTION_ARRAYS, "is_lost", "friction")))
         for name in ("inverse_mass", "world"):
             setattr(self.motion, name, getattr(motion.vertices, name))
-        self.vertices = copied(resolution.vertices, Vertices(), dict.fromkeys(_VERTEX_ARRAYS))
+        self.vertices = copy_arrays(resolution.vertices, Vertices(), dict.fromkeys(_VERTEX_ARRAYS))
         if motion.keeps_poses:
             bodies = Bodies()
             for name in Bodies.vars:
                 setattr(bodies, name, getattr(motion.vertices.bodies, name))
             names = BODY_MOTION_ARRAYS if motion.moves_bodies else ("start", "end")
-            self.motion.bodies = copied(bodies, bodies, dict.fromkeys(names))
+            self.motion.bodies = copy_arrays(bodies, bodies, dict.fromkeys(names))
         if motion.moves_bodies:
-            moved = copied(resolution.vertices.bodies, MovedBodies(), dict.fromkeys(_MOVED_BODY_ARRAYS))
+            moved = copy_arrays(resolution.vertices.bodies, MovedBodies(), dict.fromkeys(_MOVED_BODY_ARRAYS))
             self.vertices.bodies = moved
         lengths = {**dict.fromkeys(_CONSTRAINT_ARRAYS, count), "count": 1}
-        self.constraints = copied(constraints, Constraints(), lengths)
+        self.constraints = copy_arrays(constraints, Constraints(), lengths)
         lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}
         lengths |= {**dict.fromkeys(PER_ENTRY, entries), **dict.fromkeys(PER_TRUNCATION, truncations)}
-        self.record = copied(record, StepRecord(), lengths)
+        self.record = copy_arrays(record, StepRecord(), lengths)
         self.record.counts = name_elements(RecordCounts, wp.clone(recorder.counts))
         self.complete = wp.empty(1, dtype=int, device=device)
         inputs = [constraints.count, record, count]
@@ -155,22 +155,22 @@ class StepAdjoint:
         differentiable = *_MOTION_ARRAYS, "inverse_mass", "friction"
         for name in (*differentiable, "world", "is_lost"):
             setattr(motion, name, getattr(step.motion, name))
-        self._of_motion = give_gradients(motion, differentiable)
+        self._of_motion = attach_gradients(motion, differentiable)
         self._planes = planes = MovingPlanes()
         for name in ("start", "end", "friction"):
             setattr(planes, name, getattr(step.planes, name))
-        self._of_planes = give_gradients(planes, ("start", "end", "friction"))
-        self._vertices = vertices = copied(step.vertices, Vertices(), dict.fromkeys(_RESTORED_VERTEX_ARRAYS))
+        self._of_planes = attach_gradients(planes, ("start", "end", "friction"))
+        self._vertices = vertices = copy_arrays(step.vertices, Vertices(), dict.fromkeys(_RESTORED_VERTEX_ARRAYS))
         vertices.outcome = step.vertices.outcome
         vertices.active = wp.zeros(n, dtype=int, device=device)
         of_vertices = {"x1": gradients.more_x1, "velocity": gradients.more_velocity}
-        give_gradients(vertices, of_vertices, of_vertices)
-        self._constraints = constraints = copied(
+        attach_gradients(vertices, of_vertices, of_vertices)
+        self._constraints = constraints = copy_arrays(
             step.constraints, Constraints(), dict.fromkeys(_RESTORED_CONSTRAINT_ARRAYS)
         )
         for name in set(_CONSTRAINT_ARRAYS) - set(_RESTORED_CONSTRAINT_ARRAYS) | {"count"}:
             setattr(constraints, name, getattr(step.constraints, name))
-        self._of_constraints = give_gradients(constraints, _DIFFERENTIABLE)
+        self._of_constraints = attach_gradients(constraints, _DIFFERENTIABLE)
         truncations = len(step.record.vertex)
         self._truncation_times = wp.zeros(truncations, dtype=wp.float64, device=device, requires_grad=True)
         self._of_paths = [wp.zeros(truncations, dtype=wp.vec3, device=device) for _ in range(2)]
@@ -214,15 +214,15 @@ class StepAdjoint:
         self._through_turn()
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_velocity_sweep)
         self._through_initialization()
-        self._bodies.leave_velocities()
+        self._bodies.through_move_to_end()
         wp.capture_while(self._more_iterations, self._through_iteration)
-        self._bodies.take_positions()
+        self._bodies.through_placement()
         inputs = [motion, gradients, of_motion.x0, of_motion.x1, of_motion.velocity]
         inputs += [of_motion.inverse_mass, of_motion.friction, step.complete]
         outputs = [start_q, particle_q, particle_qd, step.mesh.model.particle_inv_mass.grad]
         self._launch(finish_gradients, len(motion.x0), inputs, [*outputs, self._response.restitution.grad])
         self._bodies.finish(self._of_planes, start_body_q, body_q, body_qd)
-        step.friction.adjoin(of_motion.friction, self._of_planes.friction)
+        step.friction.backward(of_motion.friction, self._of_planes.friction)
 
     def _through_turn(self):
         """Goes back through the turn that conserves angular momentum."""
@@ -234,11 +234,11 @@ class StepAdjoint:
         self._launch(add_torques, self._constraint_count, [motion, vertices, constraints], [totals])
         self._launch(add_moments, n, [motion, vertices], [totals])
         self._bodies.add_moments(totals)
-        self._adjoin(turn_velocities, n, [motion, vertices, totals], [self._gradients.velocity])
+        self._launch_adjoint(turn_velocities, n, [motion, vertices, totals], [self._gradients.velocity])
         self._bodies.through_turn(totals)
-        self._adjoin(add_moments, n, [motion, vertices], [totals.grad])
+        self._launch_adjoint(add_moments, n, [motion, vertices], [totals.grad])
         self._bodies.through_moments(totals)
-        self._adjoin(add_torques, self._constraint_count, [motion, vertices, constraints], [totals.grad])
+        self._launch_adjoint(add_torques, self._constraint_count, [motion, vertices, constraints], [totals.grad])
 
     def _batch(self, through):
         for _ in range(SWEEPS_PER_BATCH):
@@ -253,14 +253,14 @@ class StepAdjoint:
         self._bodies.restore_velocities()
         changes = [self._gradients.velocity_change, self._bodies.velocity_change]
         self._through_change(True, vertices.x1, self._of_constraints.velocity_multiplier, changes)
-        self._bodies.take_velocities()
+        self._bodies.through_vertex_velocities()
 
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         of_constraints = self._of_constraints
         self._restore(restore_velocities)
         self._bodies.restore_velocities()
-        self._adjoin(
+        self._launch_adjoint(
             initialize_multipliers,
             self._constraint_count,
             [self._motion, self._vertices, self._constraints, self._step.dt],
@@ -272,15 +272,15 @@ class StepAdjoint:
     def _through_iteration(self):
         """Goes back through an iteration: truncation, sweeps, and the constraints that its detection added."""
         self._restore(restore_positions)
-        self._bodies.take_positions()
+        self._bodies.through_placement()
         self._through_truncation()
         self._launch(enter_iteration, 1, [self._step.record, self._cursor], [self._more_sweeps])
         if self._bodies.moves:
-            wp.capture_if(self._more_sweeps, self._bodies.project)
+            wp.capture_if(self._more_sweeps, self._bodies.through_projection)
         wp.capture_while(self._more_sweeps, self._batch, through=self._through_position_sweep)
         self._launch(set_detection_iteration, 1, [self._cursor], [self._progress.status.iteration])
         step, of_constraints, separation = self._step, self._of_constraints, self._response.separation
-        self._adjoin(
+        self._launch_adjoint(
             make_constraints,
             self._constraint_count,
             [
@@ -312,15 +312,15 @@ class StepAdjoint:
         self._bodies.restore_positions()
         changes = [self._gradients.x1, self._bodies.shift]
         self._through_change(False, x, self._of_constraints.position_multiplier, changes)
-        self._bodies.take_positions()
-        self._bodies.project()
+        self._bodies.through_placement()
+        self._bodies.through_projection()
 
     def _through_change(self, of_velocities, x, of_multiplier, of_changes):
         """Goes back through what a sweep changes, at positions ``x``, given the gradients by what it changes."""
         inputs = [self._motion, self._vertices, self._constraints, self._progress, self._step.record, self._cursor]
         inputs += [self._response.restitution, of_velocities, x]
         of_outputs = [of_multiplier, self._of_constraints.previous_multiplier]
-        self._adjoin(change_multipliers, self._constraint_count, inputs, of_outputs, of_changes)
+        self._launch_adjoint(change_multipliers, self._constraint_count, inputs, of_outputs, of_changes)
         self._vertices.active.zero_()
         if self._bodies.moves:
             self._vertices.bodies.active.zero_()
@@ -333,9 +333,11 @@ class StepAdjoint:
         self._bodies.restore_paths(cursor)
         inputs = [motion, vertices, planes, record, cursor]
         self._launch(find_truncation_times, truncations, inputs, [times])
-        self._adjoin(truncate_paths, truncations, [motion, vertices, times, record, cursor, self._step.dt], of_paths)
+        self._launch_adjoint(
+            truncate_paths, truncations, [motion, vertices, times, record, cursor, self._step.dt], of_paths
+        )
         self._bodies.through_truncation(cursor, times)
-        self._adjoin(find_truncation_times, truncations, inputs, [times.grad])
+        self._launch_adjoint(find_truncation_times, truncations, inputs, [times.grad])
 
     def _restore(self, kernel):
         """Restores positions or velocities as they were before a sweep."""
@@ -349,7 +351,7 @@ class StepAdjoint:
     def _launch(self, kernel, dim, inputs, outputs=()):
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
 
-    def _adjoin(self, kernel, dim, inputs, of_outputs, of_changes=()):
+    def _launch_adjoint(self, kernel, dim, inputs, of_outputs, of_changes=()):
         """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
         ``of_changes`` are those with respect to changes of vertices and of bodies, which functions add to.

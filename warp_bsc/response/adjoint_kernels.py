@@ -455,7 +455,7 @@ def count_grazing(motion: Motion, vertices: Vertices, vertex_face: Contacts, edg
 
 @wp.struct
 class Gradients:
-    """Gradients with respect to positions and velocities at the place of the cursor."""
+    """Gradients with respect to positions and velocities at the cursor."""
 
     x1: wp.array[wp.vec3]
     velocity: wp.array[wp.vec3]
