@@ -22,7 +22,7 @@ def add_to_centre(
 
 
 @wp.kernel
-def judge(centres: wp.array[wp.vec3], mark: wp.vec3, radius: float, losses: wp.array[float], loss: wp.array[float]):
+def add_loss(centres: wp.array[wp.vec3], mark: wp.vec3, radius: float, losses: wp.array[float], loss: wp.array[float]):
     """Computes the loss of each world, 0 on the mark and 1 far from it, and adds it to the total."""
     world = wp.tid()
     value = 1.0 - wp.exp(-0.5 * wp.length_sq(centres[world] - mark) / (radius * radius))
@@ -54,8 +54,8 @@ def build_worlds(world, count):
 class DiffsimExample(ExampleBase):
     """Gradient descent in several worlds at once, in the format of Newton's examples; a frame is an iteration.
 
-    A derived class calls :meth:`start` and :meth:`descend` at the end of its ``__init__``, and makes its ``forward``
-    depend on the parameters.
+    A derived class calls :meth:`start` and :meth:`prepare_descent` at the end of its ``__init__``, and makes its
+    ``forward`` depend on the parameters.
 
     Attributes:
         loss_history: The losses of all worlds in each iteration so far.
@@ -67,22 +67,23 @@ class DiffsimExample(ExampleBase):
         super().__init__(viewer, args)
         self.sim_dt = 1.0 / 600.0
 
-    def descend(self, parameters, rate, cloth, mark, steps):
+    def prepare_descent(self, parameters, rate, cloth_count, mark, steps):
         """Prepares gradient descent.
 
         Args:
             parameters: The arrays to improve, an element for each world.
             rate: Learning rate of the first iteration.
-            cloth: How many particles, the first ones of each world, are those of the cloth that is to end on the mark.
+            cloth_count: Particles of the cloth that is to end on the mark, the first ones of each world.
             mark: Where its centre is to end [m].
             steps: How many steps a simulation has.
         """
         model, device = self.model, self.model.device
-        self.parameters, self.rate, self.cloth, self.mark = parameters, rate, cloth, mark
+        self.parameters, self.rate, self.cloth_count, self.mark = parameters, rate, cloth_count, mark
         self.states = [self.state_0, *(model.state() for _ in range(steps - 1)), self.state_1]
         self.worlds = model.world_count
-        is_cloth = np.arange(model.particle_count) % (model.particle_count // self.worlds) < cloth
-        self.shares = wp.array(is_cloth / cloth, dtype=float, device=device)  # of particles in the centre of the cloth
+        is_cloth = np.arange(model.particle_count) % (model.particle_count // self.worlds) < cloth_count
+        # of each particle in the centre of the cloth of its world
+        self.shares = wp.array(is_cloth / cloth_count, dtype=float, device=device)
         self.centres = wp.zeros(self.worlds, dtype=wp.vec3, device=device, requires_grad=True)
         self.losses = wp.zeros(self.worlds, dtype=float, device=device, requires_grad=True)
         self.loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
@@ -101,7 +102,7 @@ class DiffsimExample(ExampleBase):
         self.loss.zero_()
         inputs = [self.states[-1].particle_q, self.shares, self.model.particle_world]
         wp.launch(add_to_centre, self.model.particle_count, inputs=inputs, outputs=[self.centres])
-        wp.launch(judge, self.worlds, inputs=[self.centres, self.mark, RADIUS], outputs=[self.losses, self.loss])
+        wp.launch(add_loss, self.worlds, inputs=[self.centres, self.mark, RADIUS], outputs=[self.losses, self.loss])
 
     def simulate(self):
         """Simulates all worlds, and computes the gradient of their loss."""
@@ -126,7 +127,7 @@ class DiffsimExample(ExampleBase):
     def centre_paths(self):
         """Returns the paths of the centres of the cloths in the last simulation [m], shape [steps + 1, worlds, 3]."""
         positions = np.array([state.particle_q.numpy() for state in self.states])
-        return positions.reshape(len(positions), self.worlds, -1, 3)[:, :, : self.cloth].mean(axis=2)
+        return positions.reshape(len(positions), self.worlds, -1, 3)[:, :, : self.cloth_count].mean(axis=2)
 
     def render(self):
         """Shows where the cloths end, and their paths."""

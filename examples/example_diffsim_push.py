@@ -75,7 +75,7 @@ class Example(DiffsimExample):
         paths = [wp.array(start, dtype=wp.vec3, device=model.device, requires_grad=True) for start in starts]
         self.paddles = PaddleSolver(model, *paths, STEPS * self.sim_dt)
         self.start(model, self.paddles, (wp.vec3(0.2, -1.8, 0.4), -5.0, 90.0))
-        self.descend(paths, FIRST_RATE, world.particle_count, MARK, STEPS)
+        self.prepare_descent(paths, FIRST_RATE, world.particle_count, MARK, STEPS)
 
     def forward(self):
         """Simulates the pushes, and computes their losses."""

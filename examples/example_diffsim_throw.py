@@ -53,7 +53,7 @@ class Example(DiffsimExample):
         solver = newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
         self.start(model, solver, (wp.vec3(-0.3, -3.2, 0.5), -5.0, 90.0))
         self.throws = wp.array(STARTS, dtype=wp.vec3, device=model.device, requires_grad=True)
-        self.descend([self.throws], FIRST_RATE, patch, MARK, STEPS)
+        self.prepare_descent([self.throws], FIRST_RATE, patch, MARK, STEPS)
 
     def forward(self):
         """Simulates the throws, and computes their losses."""
