@@ -16,10 +16,10 @@ from ..kernels.distance import closest_points
 from ..kernels.min_distance import clears_at_once, closest_at
 from ..kernels.motion import doubles, motion_and_distance
 from ..kernels.pipeline.pairs import points_of_pair
-from ..kernels.pipeline.queues import append, is_filled
+from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF
-from .distance_phase import add_contact, distance_of_corners, firsts_of
+from .distance_phase import distance_of_corners, firsts_of
 from .kernels import PairStages
 from .launch import launch_over_queue
 from .mesh import CollisionMesh
@@ -32,6 +32,8 @@ __all__ = ["MinDistances", "distances_of_pair", "make_min_distances", "run_appro
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
 _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 """Share of its distance at the start that a pair keeps: the search certifies that it does at rest."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -176,7 +178,17 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
                 result.normal = near.normal
         elif status == FREE:
             return
-        add_contact(pair, status, result, stages)
+        slot = take_slot(stages.counts, _CONTACTS)
+        take_slot(stages.counts, _FOUND)
+        contacts = stages.contacts
+        if slot < wp.int64(contacts.pairs.shape[0]):
+            k = wp.int32(slot)
+            contacts.pairs[k] = pair
+            contacts.status[k] = wp.int8(status)
+            contacts.within_tolerance[k] = result.within_tolerance == 1
+            contacts.toi[k] = result.toi
+            contacts.coordinates[k] = result.coordinates
+            contacts.normal[k] = result.normal
 
     return cull_approaches, decide_approaches
 

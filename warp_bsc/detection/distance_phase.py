@@ -18,7 +18,6 @@ from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
-from ..kernels.time_of_impact import Impact
 from .contact_buffer import HostContacts
 from .kernels import PairStages
 from .launch import launch_over, launch_over_queue
@@ -28,7 +27,6 @@ from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
 from .stage_timer import StageTimer
 
 __all__ = [
-    "add_contact",
     "checked_distance",
     "decide_distances_on_host",
     "distance_of_corners",
@@ -82,35 +80,26 @@ def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) ->
 
 
 @wp.func
-def add_contact(pair: wp.vec2i, status: int, result: Impact, stages: PairStages) -> int:
-    """Adds a pair to the contacts, and returns its place; -1 if it does not fit, and is only counted."""
+def _add_contact(kind: int, pair: wp.vec2i, motion: Motion, search: Search, timed: bool, stages: PairStages):
+    """Adds a pair to the contacts, if it fits, after a search that has not found it free."""
+    result = end_search(kind, motion, search)
     slot = take_slot(stages.counts, _CONTACTS)
     take_slot(stages.counts, _FOUND)
-    contacts = stages.contacts
-    if slot >= wp.int64(contacts.pairs.shape[0]):
-        return -1
-    k = wp.int32(slot)
-    contacts.pairs[k] = pair
-    contacts.status[k] = wp.int8(status)
-    contacts.within_tolerance[k] = result.within_tolerance == 1
-    contacts.toi[k] = result.toi
-    contacts.coordinates[k] = result.coordinates
-    contacts.normal[k] = result.normal
-    return k
-
-
-@wp.func
-def _end_search(kind: int, pair: wp.vec2i, motion: Motion, search: Search, timed: bool, stages: PairStages):
-    """Adds a pair to the contacts after a search that has not found it free."""
-    result = end_search(kind, motion, search)
-    k = add_contact(pair, result.status, result, stages)
     if result.status == UNSURE:
         take_slot(stages.counts, _UNSURE)
     if result.status == UNSURE or (timed and result.within_tolerance == 0):
         take_slot(stages.counts, _FOR_EXACT)
         take_slot(stages.counts, _TOO_WIDE)
-    if k >= 0:
-        stages.contacts.decided[k] = wp.int8(result.status)
+    contacts = stages.contacts
+    if slot < wp.int64(contacts.pairs.shape[0]):
+        k = wp.int32(slot)
+        contacts.pairs[k] = pair
+        contacts.status[k] = wp.int8(result.status)
+        contacts.decided[k] = wp.int8(result.status)
+        contacts.within_tolerance[k] = result.within_tolerance == 1
+        contacts.toi[k] = result.toi
+        contacts.coordinates[k] = result.coordinates
+        contacts.normal[k] = result.normal
         stages.order[k] = k
         stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
 
@@ -184,7 +173,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
             if not search.ended:
                 search = visit_part(kind, motion, scaled, timed, search)
             if search.ended and search.status != FREE:
-                _end_search(kind, pair, motion, search, timed, stages)
+                _add_contact(kind, pair, motion, search, timed, stages)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_closest(

@@ -312,8 +312,7 @@ class StepAdjoint:
         self._bodies.restore_positions()
         changes = [self._gradients.x1, self._bodies.shift]
         self._through_change(False, x, self._of_constraints.position_multiplier, changes)
-        self._bodies.through_placement()
-        self._bodies.through_projection()
+        self._bodies.through_projected_placement()
 
     def _through_change(self, of_velocities, x, of_multiplier, of_changes):
         """Goes back through what a sweep changes, at positions ``x``, given the gradients by what it changes."""

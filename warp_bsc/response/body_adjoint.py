@@ -1,5 +1,6 @@
 """The part of the adjoint of a step that goes back through rigid bodies, see :mod:`.adjoint`."""
 
+import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -14,6 +15,7 @@ from .body_adjoint_kernels import (
     place_shape_vertices,
     place_vertices,
     project_poses,
+    project_vertices,
     restore_body_paths,
     restore_body_velocities,
     restore_poses,
@@ -56,6 +58,12 @@ def attach_gradients(struct, names, gradients=None):
     return into
 
 
+@functools.cache
+def _empty(struct_type):
+    """Returns a struct without arrays, in place of the gradient of one, whose arrays have gradients of their own."""
+    return struct_type()
+
+
 def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
     """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
@@ -67,7 +75,7 @@ def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
         dim,
         inputs=inputs,
         outputs=outputs,
-        adj_inputs=[value._cls() if hasattr(value, "_cls") else None for value in inputs],
+        adj_inputs=[_empty(value._cls) if hasattr(value, "_cls") else None for value in inputs],
         adj_outputs=of_outputs,
         adjoint=True,
         device=device,
@@ -199,6 +207,12 @@ class BodyAdjoint:
         if self.moves:
             self._restore_poses()
             self._place()
+
+    def through_projected_placement(self):
+        """Turns gradients with respect to positions of vertices into those with respect to what constraints did."""
+        if self.moves:
+            self._collect(self._gradients.x1, self._gradients.more_x1)
+            self._launch_adjoint_over_vertices(project_vertices, [self._motion, self._vertices, self._sums])
 
     def restore_paths(self, cursor):
         """Restores poses as they were before paths were truncated."""

@@ -35,6 +35,7 @@ __all__ = [
     "place_shape_vertices",
     "place_vertices",
     "project_poses",
+    "project_vertices",
     "restore_body_paths",
     "restore_body_velocities",
     "restore_poses",
@@ -77,17 +78,35 @@ def _spatial(linear: wp.vec3d, angular: wp.vec3d) -> wp.spatial_vector:
     return wp.spatial_vector(to_single(linear), to_single(angular))
 
 
+@wp.func
+def _pose_by(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], body: int) -> wp.transform:
+    """Returns the pose of a body by what constraints did to it."""
+    change = sums[body]
+    pose = motion.bodies.end[body]
+    if _has_moved(motion, vertices, body):
+        pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
+    return pose
+
+
 @wp.kernel
 def project_poses(
     motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], poses: wp.array[wp.transform]
 ):
     """Computes the poses of bodies by what constraints did to them, see :func:`.bodies.move_bodies`."""
     body = wp.tid()
-    change = sums[body]
-    pose = motion.bodies.end[body]
-    if _has_moved(motion, vertices, body):
-        pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
-    poses[body] = pose
+    poses[body] = _pose_by(motion, vertices, sums, body)
+
+
+@wp.kernel
+def project_vertices(
+    motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], positions: wp.array[wp.vec3]
+):
+    """Computes the positions of vertices in these poses, see :func:`.bodies.place_vertices`."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    body = motion.bodies.of_vertex[vertex]
+    if body >= 0 and _is_movable(motion, body):
+        pose = _pose_by(motion, vertices, sums, body)
+        positions[vertex] = wp.transform_point(pose, motion.bodies.position[wp.tid()])
 
 
 @wp.kernel
