@@ -16,15 +16,24 @@ functions of time, each of these proves that none is, over a whole part of the s
 - **corner**: some fixed g has g.q > d |g| at both ends, and both sides point away from q: q.e >= 0, q.i >= 0, in all
   coefficients. Then x = q + s e + r i has x.q >= q.q.
 
-Fixed directions are those of the closest points halfway through the part. A fixed direction alone would need parts as
-short as the gap where features turn; the others lose the square of their length only. At one time, two points of the
-features whose distance is certainly at most d are a HIT.
+Fixed directions are those of the closest points at some time. A fixed direction alone would need parts as short as the
+gap where features turn; the others lose the square of their length only. At one time, two points of the features whose
+distance is certainly at most d are a HIT.
 
-The search goes through the step from part to part: after a part that is free comes one twice as long, and a part that
-nothing decides is halved. Newton's method proposes a time, half the tolerance after the one at which the distance is
-about reached; if the distance is certainly reached there, the next part ends within the tolerance before it. The search
-ends at the first part as short as :data:`SHORTEST` that nothing decides, or after :data:`MAX_VISITS` parts. The start
-of the last part is a lower bound of the time at which the distance is reached.
+Two searches look for such parts. Most queries end in the first one.
+
+- **Advancement** evaluates the closest points at one time after another. Their direction clears all times around until
+  the first corner comes within the distance along it; if that includes all from the start of what is left, the start
+  advances to the end. Evaluated are the time at which the distance to the plane is about reached, by Newton's method on
+  Y and |n|, and the start where that leads nowhere. If the distance is certainly reached, the plane is tried over all
+  from the start to the tolerance before. This is given up where nothing advances, or after :data:`MAX_ADVANCES` times.
+- **Subdivision** goes through the step from part to part: after a part that is free comes one twice as long, and a part
+  that nothing decides is halved. Newton's method on the closest points proposes a time, half the tolerance after the
+  one at which the distance is about reached; if the distance is certainly reached there, the next part ends within the
+  tolerance before it. The search ends at the first part as short as :data:`SHORTEST` that nothing decides, or after
+  :data:`MAX_VISITS` parts.
+
+The start of what is left is a lower bound of the time at which the distance is reached.
 
 **Bounds.** r is the roundoff, U the sum of the sizes of u, v and w, component by component. Components of u, v and w
 at a time have at most 4 roundings: 1 of the difference of points, 3 of the interpolation between both ends; times are
@@ -39,7 +48,7 @@ With a roundoff of 0 the bounds are zero, and the status is the one that floatin
 import warp as wp
 
 from .closest import between, contact_at
-from .culling import centroid_direction, gaps_along
+from .culling import DIRECTION_ERROR, centroid_direction, gaps_along
 from .distance import nearest_pair
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity, cross_middle
 from .signs import FREE, HIT, UNDERFLOW, UNSURE
@@ -48,7 +57,9 @@ from .time_of_impact import Impact, clamped_tolerance, mix_vector, power_of_two,
 SHORTEST = wp.constant(wp.float64(2.0**-40))
 """Length of the shortest part of a step."""
 MAX_VISITS = wp.constant(128)
-"""Number of parts after which the search stops, unsure."""
+"""Number of parts after which subdivision stops, unsure."""
+MAX_ADVANCES = wp.constant(12)
+"""Number of times after which advancement is given up."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -58,7 +69,11 @@ _TWO = wp.constant(wp.float64(2.0))
 _FOUR = wp.constant(wp.float64(4.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
+_THREE = wp.constant(wp.float64(3.0))
 _NEWTON_STEPS = wp.constant(3)
+_PLANE_NEWTON_STEPS = wp.constant(6)
+_UNKNOWN = wp.constant(wp.float64(-1.0))
+_AWAY = wp.constant(wp.float64(1.0 + 2.0**-38))
 _SMALLEST = wp.constant(wp.float64(2.0**-400))
 _INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
 _POINT_ERROR = wp.constant(wp.float64(12.0))
@@ -437,9 +452,13 @@ class Search:
     limit: wp.float64  # end of what is to be searched
     found: bool  # whether the distance is certainly reached at the limit
     aimed: bool  # whether the part ends within the tolerance before the limit
+    time: (
+        wp.float64
+    )  # at which advancement evaluates the closest points next; less than the start if that is to be found
     visits: int
     status: int  # FREE if the whole step is free, else UNSURE
     ended: bool
+    given_up: bool  # whether advancement has ended without a result
 
 
 @wp.func
@@ -454,13 +473,143 @@ def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) ->
         search.far = distance
     search.width = _ONE
     search.limit = _ONE
+    search.time = _UNKNOWN
     search.status = UNSURE
     return search
 
 
 @wp.func
+def _plane_reached(motion: Motion, distance: wp.float64, time: wp.float64) -> wp.float64:
+    """Returns about when the plane of the polygon comes within a distance, by Newton's method from a time.
+
+    Returns:
+        The time, any number, not finite where that leads nowhere.
+    """
+    y = coplanarity(motion)
+    reached = time
+    for _ in range(_PLANE_NEWTON_STEPS):
+        s = _ONE - reached
+        t = reached
+        value = s * s * (s * y.k[0] + _THREE * t * y.k[1]) + t * t * (_THREE * s * y.k[2] + t * y.k[3])
+        slope = _THREE * (s * s * (y.k[1] - y.k[0]) + _TWO * s * t * (y.k[2] - y.k[1]) + t * t * (y.k[3] - y.k[2]))
+        normal = s * s * y.n0 + _TWO * s * t * y.nh + t * t * y.n1
+        turn = s * (y.nh - y.n0) + t * (y.n1 - y.nh)
+        side = wp.where(slope < _ZERO, _ONE, -_ONE)  # from which Y approaches zero
+        size = wp.length(normal)
+        # of side Y - d |n|
+        reached = t - (side * value - distance * size) * size / (
+            side * slope * size - _TWO * distance * wp.dot(normal, turn)
+        )
+    return reached
+
+
+@wp.func
+def _lowest_at(
+    kind: int,
+    # products of u, v and w with the direction, at both ends
+    u: wp.vec2d,
+    v: wp.vec2d,
+    w: wp.vec2d,
+    time: wp.float64,
+) -> wp.float64:
+    """Returns the least product of a corner of the polygon with a direction at a time."""
+    both = wp.vec2d(_ONE - time, time)
+    a = wp.dot(u, both)
+    b = wp.dot(v, both)
+    if kind == VERTEX_FACE:
+        return wp.dot(w, both) - wp.max(wp.max(a, b), _ZERO)
+    return wp.dot(w, both) - wp.max(a, _ZERO) + wp.min(b, _ZERO)
+
+
+@wp.func
+def _first_below(corner: wp.vec2d, needed: wp.float64, before: wp.float64) -> wp.float64:
+    """Returns about when the product of a corner with a direction falls to what is needed, if that is before a time."""
+    if corner[1] < needed:
+        return wp.min(before, (corner[0] - needed) / (corner[0] - corner[1]))
+    return before
+
+
+@wp.func
+def _cleared_until(motion: Motion, direction: wp.vec3d, start: wp.float64, distance: wp.float64) -> wp.float64:
+    """Returns a time until which a direction keeps the features farther apart than a distance, from a start on.
+
+    The direction points from the second feature to the first for a vertex and a face, otherwise from the first to the
+    second: along it lie the differences of points of :func:`.culling.gaps_along`.
+
+    Bound: products of a dot product have 1 rounding of the vector, 1 of the product and 2 of the sum; the interpolation
+    between both ends, by exact factors, has 2 more, and the differences 2: less than those of ``gaps_along``.
+
+    Returns:
+        The time, the start itself if the direction does not clear it.
+    """
+    u = wp.vec2d(wp.dot(direction, motion.u0), wp.dot(direction, motion.u1))
+    v = wp.vec2d(wp.dot(direction, motion.v0), wp.dot(direction, motion.v1))
+    w = wp.vec2d(wp.dot(direction, motion.w0), wp.dot(direction, motion.w1))
+    size = wp.dot(wp.abs(direction), motion.u_size + motion.v_size + motion.w_size)
+    bound = motion.roundoff * (DIRECTION_ERROR * size + UNDERFLOW)
+    needed = distance * _norm(direction)
+    if not _lowest_at(motion.kind, u, v, w, start) - bound > needed:
+        return start
+    # not certain, but checked: a little more than needed
+    more = needed * _AWAY + _TWO * bound
+    end = _first_below(w - u, more, _first_below(w, more, _ONE))
+    if motion.kind == VERTEX_FACE:
+        end = _first_below(w - v, more, end)
+    else:
+        end = _first_below(w + v - u, more, _first_below(w + v, more, end))
+    end = SHORTEST * wp.floor(end / SHORTEST)
+    if end > start and _lowest_at(motion.kind, u, v, w, end) - bound > needed:
+        return end
+    return start
+
+
+@wp.func
+def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
+    """Returns a search by advancement after its next time; it has ended if nothing is left to do, or is given up."""
+    search = before
+    start = search.start
+    limit = search.limit
+    first = search.visits == 0
+    time = search.time
+    if time < start:
+        reached = _plane_reached(motion, distance, wp.where(first, _HALF, start))
+        time = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
+        if not (time > start and time < limit):
+            time = wp.where(first, _HALF, start)
+    _at, gap = _nearest_at(motion, time)
+    if _is_within(motion, gap, search.near):
+        limit = time
+        search.limit = time
+        search.found = True
+        search.ended = not timed or time == start
+    else:
+        direction = _unit_scale(wp.where(motion.kind == VERTEX_FACE, gap, -gap))
+        search.start = _cleared_until(motion, direction, start, search.far)
+        search.ended = search.start >= limit
+        if search.ended and not search.found:
+            search.status = FREE
+    if not search.ended:
+        search.time = _UNKNOWN
+        search.given_up = time == start and search.start == start
+        if search.found:
+            aim = SHORTEST * wp.floor((limit - _AHEAD * search.length) / SHORTEST)
+            if aim <= search.start:
+                search.ended = True
+            elif _plane_clears(restrict_motion(motion, search.start, aim), search.far):
+                search.start = aim
+                search.ended = True
+            search.time = wp.where(time == start, aim, search.start)
+        elif search.start == start:
+            search.time = start
+    search.visits += 1
+    search.given_up = not search.ended and (search.given_up or search.visits == MAX_ADVANCES)
+    search.ended = search.ended or search.given_up
+    return search
+
+
+@wp.func
 def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
-    """Returns a search after its next part; it has ended if nothing is left to do."""
+    """Returns a search by subdivision after its next part; it has ended if nothing is left to do."""
     search = before
     start = search.start
     limit = search.limit
@@ -548,5 +697,9 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
     """
     search = begin_search(motion, distance, tolerance)
     while not search.ended:
-        search = visit_part(kind, motion, distance, timed, search)
+        search = advance(motion, distance, timed, search)
+    if search.given_up:
+        search = begin_search(motion, distance, tolerance)
+        while not search.ended:
+            search = visit_part(kind, motion, distance, timed, search)
     return end_search(kind, motion, search)
