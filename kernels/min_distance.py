@@ -47,7 +47,7 @@ With a roundoff of 0 the bounds are zero, and the status is the one that floatin
 
 import warp as wp
 
-from .closest import between, contact_at
+from .closest import between, closest_coordinates, contact_at
 from .culling import DIRECTION_ERROR, centroid_direction, gaps_along
 from .distance import nearest_pair
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity, cross_middle
@@ -72,6 +72,7 @@ _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
 _THREE = wp.constant(wp.float64(3.0))
 _NEWTON_STEPS = wp.constant(3)
 _PLANE_NEWTON_STEPS = wp.constant(6)
+_STEPS_TO_PLANE = wp.constant(3)
 _UNKNOWN = wp.constant(wp.float64(-1.0))
 _AWAY = wp.constant(wp.float64(1.0 + 2.0**-38))
 _SMALLEST = wp.constant(wp.float64(2.0**-400))
@@ -482,24 +483,32 @@ def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) ->
 def _plane_reached(motion: Motion, distance: wp.float64, time: wp.float64) -> wp.float64:
     """Returns about when the plane of the polygon comes within a distance, by Newton's method from a time.
 
+    The first steps approach the time at which the plane is reached, and are cheaper.
+
     Returns:
         The time, any number, not finite where that leads nowhere.
     """
     y = coplanarity(motion)
+    linear = _THREE * (y.k[1] - y.k[0])
+    square = _THREE * (y.k[2] - _TWO * y.k[1] + y.k[0])
+    cube = y.k[3] - y.k[0] + _THREE * (y.k[1] - y.k[2])
     reached = time
-    for _ in range(_PLANE_NEWTON_STEPS):
-        s = _ONE - reached
+    for step in range(_PLANE_NEWTON_STEPS):
         t = reached
-        value = s * s * (s * y.k[0] + _THREE * t * y.k[1]) + t * t * (_THREE * s * y.k[2] + t * y.k[3])
-        slope = _THREE * (s * s * (y.k[1] - y.k[0]) + _TWO * s * t * (y.k[2] - y.k[1]) + t * t * (y.k[3] - y.k[2]))
-        normal = s * s * y.n0 + _TWO * s * t * y.nh + t * t * y.n1
-        turn = s * (y.nh - y.n0) + t * (y.n1 - y.nh)
-        side = wp.where(slope < _ZERO, _ONE, -_ONE)  # from which Y approaches zero
-        size = wp.length(normal)
-        # of side Y - d |n|
-        reached = t - (side * value - distance * size) * size / (
-            side * slope * size - _TWO * distance * wp.dot(normal, turn)
-        )
+        value = y.k[0] + t * (linear + t * (square + t * cube))
+        slope = linear + t * (_TWO * square + t * _THREE * cube)
+        if step < _STEPS_TO_PLANE:
+            reached = t - value / slope
+        else:
+            s = _ONE - t
+            normal = s * s * y.n0 + _TWO * s * t * y.nh + t * t * y.n1
+            turn = s * (y.nh - y.n0) + t * (y.n1 - y.nh)
+            side = wp.where(slope < _ZERO, _ONE, -_ONE)  # from which Y approaches zero
+            size = wp.length(normal)
+            # of side Y - d |n|
+            reached = t - (side * value - distance * size) * size / (
+                side * slope * size - _TWO * distance * wp.dot(normal, turn)
+            )
     return reached
 
 
@@ -576,7 +585,10 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
         time = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
         if not (time > start and time < limit):
             time = wp.where(first, _HALF, start)
-    _at, gap = _nearest_at(motion, time)
+    u = mix_vector(motion.u0, motion.u1, time)
+    v = mix_vector(motion.v0, motion.v1, time)
+    w = mix_vector(motion.w0, motion.w1, time)
+    gap = between(motion.kind, closest_coordinates(motion.kind, u, v, w), u, v, w)
     if _is_within(motion, gap, search.near):
         limit = time
         search.limit = time
