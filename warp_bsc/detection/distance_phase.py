@@ -93,13 +93,20 @@ def _enqueue_contact(pair: wp.vec2i, stages: PairStages) -> int:
     return k
 
 
+@wp.struct
+class _PairSearch:
+    """A search, its motion, and the minimum distance in the scale of that."""
+
+    motion: Motion
+    distance: wp.float64
+    search: Search
+
+
 @wp.func
-def _decide_contact(k: int, kind: int, pair: wp.vec2i, motion: Motion, search: Search, timed: bool, stages: PairStages):
+def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, stages: PairStages):
     """Writes the result of a search to contact k, if that is not negative, and counts it if it is not free."""
-    result = end_search(kind, motion, search)
-    key = stages.last_key
+    result = end_search(kind, at.motion, at.search)
     if result.status != FREE:
-        key = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
         take_slot(stages.counts, _FOUND)
     if result.status == UNSURE:
         take_slot(stages.counts, _UNSURE)
@@ -114,7 +121,10 @@ def _decide_contact(k: int, kind: int, pair: wp.vec2i, motion: Motion, search: S
         contacts.toi[k] = result.toi
         contacts.coordinates[k] = result.coordinates
         contacts.normal[k] = result.normal
-        stages.keys[k] = key
+        pair = contacts.pairs[k]
+        stages.keys[k] = stages.last_key
+        if result.status != FREE:
+            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
 
 
 class _Kernels(NamedTuple):
@@ -158,26 +168,37 @@ def _kernels(dtype: type) -> _Kernels:
         append(pair, stages.survivors, stages.counts, _SURVIVORS)
 
     @wp.func
-    def search_of_pair(
+    def search_next(
+        before: _PairSearch,
         kind: int,
-        pair: wp.vec2i,
-        elements: wp.array2d[int],
+        # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
+        elements: wp.array2d[int],
         radius: wp.array[wp.float64],
+        # next pair
+        pairs: wp.array[wp.vec2i],
+        index: int,
+        # options
         roundoff: wp.float64,
         tolerance: wp.float64,
-    ):
-        """Returns the motion of a pair, its minimum distance in that scale, and a search that begins."""
-        v = points_of_pair(kind, elements, pair)
+    ) -> _PairSearch:
+        """Returns a search that has not ended as it is, otherwise one that begins with the next pair."""
+        # this return keeps Warp from selecting between two searches, which takes registers for both
+        if not before.search.ended:
+            return before
+        new = _PairSearch()
+        v = points_of_pair(kind, elements, pairs[index])
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         distance = distance_of_corners(kind, v, radius)
         motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
-        search = begin_search(motion, scaled, tolerance)
-        search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)
-        return motion, scaled, search
+        new.motion = motion
+        new.distance = scaled
+        new.search = begin_search(motion, scaled, tolerance)
+        new.search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)
+        return new
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def advance_distances(
@@ -196,25 +217,20 @@ def _kernels(dtype: type) -> _Kernels:
     ):
         filled = wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0]))
         i = wp.int64(first + wp.tid())
-        pair = wp.vec2i()
-        motion = Motion()
-        scaled = wp.float64(0.0)
-        search = Search()
-        search.ended = True
+        index = int(0)
+        at = _PairSearch()
+        at.search.ended = True
         # the threads of a warp advance together, whatever the pairs
-        while not search.ended or i < filled:
-            if search.ended:
-                pair = stages.survivors[wp.int32(i)]
+        while not at.search.ended or i < filled:
+            if at.search.ended:
+                index = wp.int32(i)
                 i += threads
-                motion, scaled, search = search_of_pair(
-                    kind, pair, stages.elements, x0, x1, radius, roundoff, tolerance
-                )
-            if not search.ended:
-                search = advance(motion, scaled, timed, search)
-            if search.ended and search.status != FREE:
-                k = _enqueue_contact(pair, stages)
-                if not search.given_up:
-                    _decide_contact(k, kind, pair, motion, search, timed, stages)
+            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, index, roundoff, tolerance)
+            at.search = advance(at.motion, at.distance, timed, at.search)
+            if at.search.ended and at.search.status != FREE:
+                k = _enqueue_contact(stages.survivors[index], stages)
+                if not at.search.given_up:
+                    _decide_contact(k, kind, at, timed, stages)
                 elif k >= 0:
                     stages.for_exact[wp.int32(take_slot(stages.counts, _SUBDIVIDED))] = k
 
@@ -235,25 +251,18 @@ def _kernels(dtype: type) -> _Kernels:
     ):
         filled = stages.counts[_SUBDIVIDED]
         i = wp.int64(first + wp.tid())
-        k = int(0)
-        pair = wp.vec2i()
-        motion = Motion()
-        scaled = wp.float64(0.0)
-        search = Search()
-        search.ended = True
-        # as in advance_distances
-        while not search.ended or i < filled:
-            if search.ended:
-                k = stages.for_exact[wp.int32(i)]
-                pair = stages.contacts.pairs[k]
+        index = int(0)
+        at = _PairSearch()
+        at.search.ended = True
+        while not at.search.ended or i < filled:
+            if at.search.ended:
+                index = stages.for_exact[wp.int32(i)]
                 i += threads
-                motion, scaled, search = search_of_pair(
-                    kind, pair, stages.elements, x0, x1, radius, roundoff, tolerance
-                )
-            if not search.ended:
-                search = visit_part(kind, motion, scaled, timed, search)
-            if search.ended:
-                _decide_contact(k, kind, pair, motion, search, timed, stages)
+            pairs = stages.contacts.pairs
+            at = search_next(at, kind, x0, x1, stages.elements, radius, pairs, index, roundoff, tolerance)
+            at.search = visit_part(kind, at.motion, at.distance, timed, at.search)
+            if at.search.ended:
+                _decide_contact(index, kind, at, timed, stages)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_closest(
