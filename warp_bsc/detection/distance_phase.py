@@ -36,8 +36,11 @@ __all__ = [
     "run_distance_phases",
 ]
 
-_BLOCK, _THREADS_OF_MULTIPROCESSOR = 64, 256
-"""Threads of a block, and of a multiprocessor, that search, each one pair after another. On a CPU a thread has one."""
+_BLOCK = 64
+"""Threads of a block that searches."""
+_ADVANCING, _SUBDIVIDING = 384, 256
+"""Threads of a multiprocessor that search, as many as their registers allow, each one pair after another. On a CPU a
+thread has one."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -211,28 +214,26 @@ def _kernels(dtype: type) -> _Kernels:
         roundoff: wp.float64,
         timed: bool,
         tolerance: wp.float64,
-        threads: wp.int64,
+        threads: wp.uint32,
         # in and out
         stages: PairStages,
     ):
-        filled = wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0]))
-        i = wp.int64(first + wp.tid())
-        index = int(0)
+        filled = wp.uint32(wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0])))
+        i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
         # the threads of a warp advance together, whatever the pairs
-        while not at.search.ended or i < filled:
-            if at.search.ended:
-                index = wp.int32(i)
-                i += threads
-            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, index, roundoff, tolerance)
+        while i < filled:
+            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, int(i), roundoff, tolerance)
             at.search = advance(at.motion, at.distance, timed, at.search)
             if at.search.ended and at.search.status != FREE:
-                k = _enqueue_contact(stages.survivors[index], stages)
+                k = _enqueue_contact(stages.survivors[int(i)], stages)
                 if not at.search.given_up:
                     _decide_contact(k, kind, at, timed, stages)
                 elif k >= 0:
                     stages.for_exact[wp.int32(take_slot(stages.counts, _SUBDIVIDED))] = k
+            if at.search.ended:
+                i += threads
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def subdivide_distances(
@@ -245,24 +246,21 @@ def _kernels(dtype: type) -> _Kernels:
         roundoff: wp.float64,
         timed: bool,
         tolerance: wp.float64,
-        threads: wp.int64,
+        threads: wp.uint32,
         # in and out
         stages: PairStages,
     ):
-        filled = stages.counts[_SUBDIVIDED]
-        i = wp.int64(first + wp.tid())
-        index = int(0)
+        filled = wp.uint32(stages.counts[_SUBDIVIDED])
+        i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
-        while not at.search.ended or i < filled:
-            if at.search.ended:
-                index = stages.for_exact[wp.int32(i)]
-                i += threads
-            pairs = stages.contacts.pairs
-            at = search_next(at, kind, x0, x1, stages.elements, radius, pairs, index, roundoff, tolerance)
+        while i < filled:
+            k = stages.for_exact[int(i)]
+            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.contacts.pairs, k, roundoff, tolerance)
             at.search = visit_part(kind, at.motion, at.distance, timed, at.search)
             if at.search.ended:
-                _decide_contact(index, kind, at, timed, stages)
+                _decide_contact(k, kind, at, timed, stages)
+                i += threads
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_closest(
@@ -324,14 +322,14 @@ def run_distance_phases(
             stages = phase.stages(elements)
             launch_over_queue(kernels.cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
     device = x0.device
-    for name, kernel, count in (
-        ("classify", kernels.advance, Count.SURVIVORS),
-        ("time of impact", kernels.subdivide, Count.SUBDIVIDED),
+    for name, kernel, count, threads_of_multiprocessor in (
+        ("classify", kernels.advance, Count.SURVIVORS, _ADVANCING),
+        ("time of impact", kernels.subdivide, Count.SUBDIVIDED, _SUBDIVIDING),
     ):
         with timer.stage(name):
             for phase, elements in phases:
                 stages = phase.stages(elements)
-                entries = threads = _THREADS_OF_MULTIPROCESSOR * device.sm_count
+                entries = threads = threads_of_multiprocessor * device.sm_count
                 if device.is_cpu:
                     entries = min(len(stages.survivors), int(phase.counts.numpy()[count]))
                     threads = 2**31
