@@ -268,89 +268,88 @@ def _polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64)
     first_high = at[0] >= _ONE
     second_low = at[1] <= _ZERO
     second_high = at[1] >= _ONE
-    u_size = part.u_size
-    v_size = part.v_size
-    if kind == EDGE_EDGE:
-        # x = s u - r v - w
-        on_first = first_low or first_high
-        on_second = second_low or second_high
-        if not (on_first or on_second):
-            return _plane_clears(part, distance)
-        q0 = -part.w0
-        q1 = -part.w1
-        u0 = part.u0
-        u1 = part.u1
-        v0 = -part.v0
-        v1 = -part.v1
-        if first_high:
-            q0 += u0
-            q1 += u1
-            u0 = -u0
-            u1 = -u1
-        if second_high:
-            q0 += v0
-            q1 += v1
-            v0 = -v0
-            v1 = -v1
-        if on_first and on_second:
-            if _corner_clears(part, q0, q1, u0, u1, v0, v1, u_size, v_size, distance):
-                return True
-        if on_first and _side_clears(part, False, q0, q1, v0, v1, u0, u1, v_size, u_size, distance):
-            return True
-        if on_second and _side_clears(part, False, q0, q1, u0, u1, v0, v1, u_size, v_size, distance):
-            return True
-        return _plane_clears(part, distance)
-    # x = w - beta u - gamma v
     alone = kind == VERTEX_EDGE
-    third = at[0] + at[1] >= _ONE
-    if not (first_low or second_low or third):
-        return _plane_clears(part, distance)
+    # the corner, both sides at it, and which of these are tried
     q0 = part.w0
     q1 = part.w1
     e0 = -part.u0
     e1 = -part.u1
-    e_size = u_size
+    e_size = part.u_size
     i0 = -part.v0
     i1 = -part.v1
-    i_size = v_size
-    if third and not second_high:  # from b on, along b c and b a; otherwise from c on, or from a on
-        q0 -= part.u0
-        q1 -= part.u1
-        e0 = part.u0 - part.v0
-        e1 = part.u1 - part.v1
-        i0 = part.u0
-        i1 = part.u1
-        e_size = u_size + v_size
-        i_size = u_size
-    elif second_high:
-        q0 -= part.v0
-        q1 -= part.v1
-        e0 = part.v0
-        e1 = part.v1
-        i0 = part.v0 - part.u0
-        i1 = part.v1 - part.u1
-        e_size = v_size
-        i_size = u_size + v_size
-    if (first_low and second_low) or first_high or second_high:
-        if alone:  # one side, twice
+    i_size = part.v_size
+    along_e = bool(False)
+    along_i = bool(False)
+    corner = bool(False)
+    if kind == EDGE_EDGE:
+        # x = s u - r v - w
+        along_i = first_low or first_high
+        along_e = second_low or second_high
+        corner = along_e and along_i
+        q0 = -q0
+        q1 = -q1
+        if first_high:
+            q0 += part.u0
+            q1 += part.u1
+        else:
+            e0 = part.u0
+            e1 = part.u1
+        if second_high:
+            q0 -= part.v0
+            q1 -= part.v1
+            i0 = part.v0
+            i1 = part.v1
+    else:
+        # x = w - beta u - gamma v
+        third = at[0] + at[1] >= _ONE
+        corner = (first_low and second_low) or first_high or second_high
+        along_i = not alone and (corner or (first_low and not third))
+        along_e = corner or ((third or second_low) and not along_i)
+        if third and not second_high:  # from b on, along b c and b a; otherwise from c on, or from a on
+            q0 -= part.u0
+            q1 -= part.u1
+            e0 = part.u0 - part.v0
+            e1 = part.u1 - part.v1
+            i0 = part.u0
+            i1 = part.u1
+            e_size = part.u_size + part.v_size
+            i_size = part.u_size
+        elif second_high:
+            q0 -= part.v0
+            q1 -= part.v1
+            e0 = part.v0
+            e1 = part.v1
+            i0 = part.v0 - part.u0
+            i1 = part.v1 - part.u1
+            e_size = part.v_size
+            i_size = part.u_size + part.v_size
+        if alone and corner:  # one side, twice
             i0 = wp.where(first_high, part.u0, -part.u0)
             i1 = wp.where(first_high, part.u1, -part.u1)
             e0 = i0
             e1 = i1
-            e_size = u_size
-            i_size = u_size
-        if _corner_clears(part, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
+            e_size = part.u_size
+            i_size = part.u_size
+    if corner and _corner_clears(part, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
+        return True
+    sides = int(2)  # not a constant, as the body would be repeated
+    for side in range(sides):
+        is_e = side == 0
+        if wp.where(is_e, along_e, along_i) and _side_clears(
+            part,
+            alone,
+            q0,
+            q1,
+            wp.where(is_e, e0, i0),
+            wp.where(is_e, e1, i1),
+            wp.where(is_e, i0, e0),
+            wp.where(is_e, i1, e1),
+            wp.where(is_e, e_size, i_size),
+            wp.where(is_e, i_size, e_size),
+            distance,
+        ):
             return True
-        if _side_clears(part, alone, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
-            return True
-        return not alone and (
-            _side_clears(part, False, q0, q1, i0, i1, e0, e1, i_size, e_size, distance) or _plane_clears(part, distance)
-        )
-    if first_low and not third:  # along a c
-        return _side_clears(part, alone, q0, q1, i0, i1, e0, e1, i_size, e_size, distance) or _plane_clears(
-            part, distance
-        )
-    return _side_clears(part, alone, q0, q1, e0, e1, i0, i1, e_size, i_size, distance) or _plane_clears(part, distance)
+    return not alone and _plane_clears(part, distance)
 
 
 @wp.func
@@ -388,7 +387,8 @@ def _about_reached(
     Returns:
         The time; 2 if that is not between both.
     """
-    for _ in range(_NEWTON_STEPS):
+    steps = int(_NEWTON_STEPS)  # not a constant, as the body would be repeated
+    for _ in range(steps):
         velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
         size = wp.length(gap)
         slope = wp.dot(gap, velocity)
@@ -651,20 +651,17 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
             search.ended = True
         else:
             reached = _about_reached(motion, distance, start, limit, time, at, gap)
-            if reached < limit:
-                reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
-                at, gap = _nearest_at(motion, reached)
-                if _is_within(motion, gap, search.near):
+            is_reached = reached < limit
+            reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
+            # then, in the first part, the ends of the step
+            times = wp.where(search.visits == 0, 3, 1)
+            for i in range(times):
+                time = wp.where(i == 0, reached, wp.where(i == 1, _ONE, _ZERO))
+                at, gap = _nearest_at(motion, time)
+                if (i > 0 or is_reached) and _is_within(motion, gap, search.near):
                     search.found = True
-                    search.limit = reached
-            if search.visits == 0:
-                at, gap = _nearest_at(motion, _ONE)
-                search.found = search.found or _is_within(motion, gap, search.near)
-                at, gap = _nearest_at(motion, _ZERO)
-                if _is_within(motion, gap, search.near):
-                    search.found = True
-                    search.limit = _ZERO
-                    search.ended = True
+                    search.limit = wp.min(search.limit, time)
+                    search.ended = time == _ZERO
             aim = search.limit - _AHEAD * search.length - start
             aim = SHORTEST * wp.floor(aim / SHORTEST)
             search.aimed = search.found and not search.aimed and aim > _ZERO and aim < span
