@@ -590,7 +590,12 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
     u = mix_vector(motion.u0, motion.u1, time)
     v = mix_vector(motion.v0, motion.v1, time)
     w = mix_vector(motion.w0, motion.w1, time)
-    gap = between(motion.kind, closest_coordinates(motion.kind, u, v, w), u, v, w)
+    at = closest_coordinates(motion.kind, u, v, w)
+    gap = between(motion.kind, at, u, v, w)
+    velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+    size = wp.length(gap)
+    reached = time + (distance - size) * size / wp.dot(gap, velocity)
+    reached = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
     if _is_within(motion, gap, search.near):
         limit = time
         search.limit = time
@@ -603,8 +608,8 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
         if search.ended and not search.found:
             search.status = FREE
     if not search.ended:
-        search.time = _UNKNOWN
-        search.given_up = time == start and search.start == start
+        stays = search.start == start
+        search.time = wp.where(stays, start, _UNKNOWN)
         if search.found:
             aim = SHORTEST * wp.floor((limit - _AHEAD * search.length) / SHORTEST)
             if aim <= search.start:
@@ -613,8 +618,9 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
                 search.start = aim
                 search.ended = True
             search.time = wp.where(time == start, aim, search.start)
-        elif search.start == start:
-            search.time = start
+        if (search.found or (stays and time == start)) and reached > search.start and reached < limit:
+            search.time = reached
+        search.given_up = search.time == time
     search.visits += 1
     search.given_up = not search.ended and (search.given_up or search.visits == MAX_ADVANCES)
     search.ended = search.ended or search.given_up
