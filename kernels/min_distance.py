@@ -405,8 +405,8 @@ def _about_reached(
 def _is_within(motion: Motion, gap: wp.vec3d, distance: wp.float64) -> bool:
     """Returns whether the vector between two points of the features is certainly no longer than a distance.
 
-    Bound: w has 4 roundings, u and v with the product 5, and the sum 2. Coordinates in a triangle may add up to 1 + r,
-    which is as far from the triangle as r of its size.
+    Bound: w has 4 roundings, u and v with the product 5, and the sum 2. Coordinates in a triangle may add up to
+    1 + 3r: the sum that is compared, and quotients, are rounded. That is as far from the triangle as 3r of its size.
     """
     size = _sum(motion.u_size + motion.v_size + motion.w_size)
     return _norm(gap) + _POINT_ERROR * motion.roundoff * size + _underflow(motion.roundoff) <= distance
