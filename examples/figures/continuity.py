@@ -8,6 +8,8 @@ Needs matplotlib (``pip install matplotlib``).
 
 import argparse
 import itertools
+import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import newton
@@ -17,25 +19,20 @@ from rich.progress import track
 
 import warp_bsc as bsc
 
+sys.path.append(str(Path(__file__).parents[1]))  # for the examples
+from diffsim import add_cloth, add_to_centre, build_worlds
+
 _DT, _STEPS = 1.0 / 600.0, 40
 _LAYER = 0.012  # thickness [m]
 _MARK = wp.vec3(0.03, 0.05, 0.06)  # [m]
 _THROW = np.array([0.7, 0.3, -2.0])  # [m/s]
 _VELOCITIES = np.linspace(-0.05, 0.05, 201)  # added to its last component, each in a world of its own
-_CELLS, _CELL = 5, 0.03
-_ELASTICITY = {"tri_ke": 50.0, "tri_ka": 50.0, "tri_kd": 1e-2, "edge_ke": 1e-2, "edge_kd": 1e-3}
 
 
 @wp.kernel
 def _throw(throws: wp.array[wp.vec3], patch: int, particle_qd: wp.array[wp.vec3]):
     particle = wp.tid()
     particle_qd[particle] = throws[particle / patch]
-
-
-@wp.kernel
-def _add_to_centres(particle_q: wp.array[wp.vec3], patch: int, centres: wp.array[wp.vec3]):
-    particle = wp.tid()
-    wp.atomic_add(centres, particle / patch, particle_q[particle] / float(patch))
 
 
 @wp.kernel
@@ -47,27 +44,11 @@ def _judge(centres: wp.array[wp.vec3], losses: wp.array[float]):
 def losses_and_gradients(layer):
     """Returns the loss of each throw [m^2] and its derivative by the last component of the velocity [m s]."""
     world = newton.ModelBuilder()
-    turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.62, -0.78, 0.13)), 0.35)
-    corner = wp.quat_rotate(turn, wp.vec3(-0.5 * _CELLS * _CELL, -0.5 * _CELLS * _CELL, 0.0))
-    world.add_cloth_grid(
-        pos=wp.vec3(0.02, 0.015, 0.115) + corner,
-        rot=turn,
-        vel=wp.vec3(),
-        dim_x=_CELLS,
-        dim_y=_CELLS,
-        cell_x=_CELL,
-        cell_y=_CELL,
-        mass=0.001,
-        **_ELASTICITY,
-    )
+    add_cloth(world, 5, 0.03, wp.vec3(0.02, 0.015, 0.115), wp.vec3(0.62, -0.78, 0.13), 0.35, tri_kd=1e-2)
     tilt = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.7, 0.2)), 0.3)
     config = newton.ModelBuilder.ShapeConfig(mu=0.3, density=0.0)
     world.add_shape_box(-1, xform=wp.transform(wp.vec3(), tilt), hx=0.05, hy=0.06, hz=0.05, cfg=config)
-    builder = newton.ModelBuilder()
-    builder.replicate(world, len(_VELOCITIES))
-    model = builder.finalize(requires_grad=True)
-    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
-    model.particle_grid = None
+    model = build_worlds(world, len(_VELOCITIES))
     inner = newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
     solver = bsc.SolverCCD(inner, friction=0.3, restitution=0.2, contact_layer=layer)
     states = [model.state() for _ in range(_STEPS + 1)]
@@ -84,8 +65,9 @@ def losses_and_gradients(layer):
         for start, end in track(pairs, "without" if layer is None else "with a contact layer"):
             start.clear_forces()
             solver.step(start, end, None, None, _DT)
-        inputs = [states[-1].particle_q, world.particle_count]
-        wp.launch(_add_to_centres, model.particle_count, inputs=inputs, outputs=[centres])
+        shares = wp.full(model.particle_count, 1.0 / world.particle_count, dtype=float)
+        inputs = [states[-1].particle_q, shares, model.particle_world]
+        wp.launch(add_to_centre, model.particle_count, inputs=inputs, outputs=[centres])
         wp.launch(_judge, len(throws), inputs=[centres], outputs=[losses])
     tape.backward(grads={losses: wp.full(len(throws), 1.0, dtype=float)})
     return losses.numpy().astype(float), velocities.grad.numpy()[:, 2]

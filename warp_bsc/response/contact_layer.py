@@ -28,7 +28,7 @@ from ..kernels.closest import closest_coordinates
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from .body_adjoint import give_gradients, launch_adjoint
+from .body_adjoint import attach_gradients, launch_adjoint
 from .buffers import Motion
 from .constraints import are_on_body, contact_friction, has_overflowed, to_double, to_single
 from .friction import Friction
@@ -530,8 +530,8 @@ class ContactLayer:
         n, particles = len(motion.x0), len(particle_q)
         of_changes, changes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
         self._launch(_begin_backward, particles, [motion.is_lost, step.dt, particle_q, particle_qd, of_changes])
-        of_motion = give_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
-        of_planes = give_gradients(planes, ("friction",))
+        of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
+        of_planes = attach_gradients(planes, ("friction",))
         shares = step.shares[:]
         shares.grad = of_shares = wp.zeros(n, dtype=wp.float64, device=device)
         sums = wp.zeros(n, dtype=wp.float64, device=device)
@@ -548,7 +548,7 @@ class ContactLayer:
         inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
         outputs = [start_q, particle_q, self._mesh.model.particle_inv_mass.grad]
         self._launch(_finish_backward, particles, [*inputs, *outputs])
-        self._friction.adjoin(of_motion.friction, of_planes.friction)
+        self._friction.backward(of_motion.friction, of_planes.friction)
 
     def _recorded(self, motion, pairs, dt):
         """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
