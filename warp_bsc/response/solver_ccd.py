@@ -253,8 +253,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 contacts push gradually, see :mod:`.contact_layer`; what it leaves is resolved where it hits. Results
                 are then continuous in what the inner solver wants, and gradients hold across changes of the contacts.
                 It should be thicker than the longest path of a step, and thinner than half of the shortest edge, as
-                neighbours beyond the next push each other as well. Cloth rests on the layer, and should start outside of it:
-                within a few steps, it is pushed out. None: contacts act where they hit.
+                neighbours beyond the next push each other as well. Cloth rests on the layer, and should start outside
+                of it: within a few steps, it is pushed out. None: contacts act where they hit.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Where its iterations are too few for the step, VBD does not hold heavy bodies, and
