@@ -215,7 +215,8 @@ def test_pushes_conserve_momentum(friction, device):
 
 
 def test_many_worlds_are_each_bit_for_bit_as_alone(device):
-    world = colliding_patches(**SOFT)
+    """Of cloth without forces, which the inner solver would add in any order on a GPU."""
+    world = colliding_patches(**FREE)
     world.add_ground_plane(height=-0.03)
     many = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     many.replicate(world, 3)
@@ -224,8 +225,10 @@ def test_many_worlds_are_each_bit_for_bit_as_alone(device):
         model = builder.finalize(device=device)
         solver = bsc.SolverCCD(semi_implicit(model), friction=0.3, restitution=0.5, contact_layer=LAYER)
         rollout = Rollout(model, solver)
+        start = rollout.states[0].particle_qd.numpy().copy()
         for _ in range(15):
             rollout.step(DT)
+        assert np.abs(rollout.states[0].particle_qd.numpy() - start).max() > 0.3
         ends.append(rollout.states[0].particle_q.numpy())
     np.testing.assert_array_equal(ends[1].reshape(3, -1, 3), np.broadcast_to(ends[0], (3, *ends[0].shape)))
 
