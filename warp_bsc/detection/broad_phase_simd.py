@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.boxes import lowered, raised, rounded
-from ..kernels.pipeline.wide_bvh import pair_packet
+from ..kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 from .launch import launch_over
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count
@@ -28,7 +28,7 @@ _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
 @functools.cache
-def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels that encode elements and fill packets, for one type of position, with or without a padding.
 
     Without one, code for it is not compiled, as ``padded`` is a constant of the kernel.
@@ -62,81 +62,55 @@ def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
         codes[i] = code
         order[i] = i
 
+    fit_packet = fit_packet_of(dtype)
+
     @wp.kernel(**NO_GRADIENTS)
-    def fill_packets(
+    def fit_packets(
         first: int,
         # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        corners: wp.array2d[int],
-        numbers: wp.array[int],
-        worlds: wp.array[int],
-        order: wp.array[int],
+        corners: int,
+        count: int,
         changed: wp.array[int],
         padding: wp.array[wp.float64],
+        # in and out
+        elements: wp.array[int],
         # out
-        boxes: wp.array3d[wp.float32],
-        elements: wp.array2d[int],
-        nodes: wp.array3d[wp.float32],
-        node_worlds: wp.array3d[int],
+        boxes: wp.array[wp.float32],
+        nodes: wp.array[wp.float32],
     ):
-        """Writes the boxes and the elements of each packet, and its entry in its node."""
+        """Writes the boxes of each packet, and its entry in its node."""
         packet = first + wp.tid()
-        count = wp.min(8, corners.shape[0] - 8 * packet)
-        low = wp.vec3(wp.inf)
-        high = wp.vec3(-wp.inf)
-        changed_lanes = int(0)
-        for lane in range(count):
-            i = order[8 * packet + lane]
-            low0 = wp.vec3(wp.inf)
-            high0 = wp.vec3(-wp.inf)
-            low1 = wp.vec3(wp.inf)
-            high1 = wp.vec3(-wp.inf)
-            finite = bool(True)
-            pad = wp.float64(0.0)
-            if wp.static(padded):
-                for corner in range(corners.shape[1]):
-                    pad = wp.max(pad, padding[corners[i, corner]])
-            elements[packet, lane] = numbers[i]
-            elements[packet, 32 + lane] = worlds[i]
-            for corner in range(corners.shape[1]):
-                vertex = corners[i, corner]
-                elements[packet, 8 + 8 * corner + lane] = vertex
-                if not changed or changed[vertex] != 0:
-                    changed_lanes = changed_lanes | (1 << lane)
-                finite = finite and wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
-                if wp.static(padded):
-                    low0 = wp.min(low0, lowered(x0[vertex], pad))
-                    high0 = wp.max(high0, raised(x0[vertex], pad))
-                    low1 = wp.min(low1, lowered(x1[vertex], pad))
-                    high1 = wp.max(high1, raised(x1[vertex], pad))
-                else:
-                    start = rounded(x0[vertex])
-                    end = rounded(x1[vertex])
-                    low0 = wp.min(low0, start)
-                    high0 = wp.max(high0, start)
-                    low1 = wp.min(low1, end)
-                    high1 = wp.max(high1, end)
-            if not finite:  # an empty box overlaps none
-                low0 = wp.vec3(wp.inf)
-                high0 = wp.vec3(-wp.inf)
-                low1 = wp.vec3(wp.inf)
-                high1 = wp.vec3(-wp.inf)
-            for axis in range(3):
-                boxes[packet, 4 * axis, lane] = low0[axis]
-                boxes[packet, 4 * axis + 1, lane] = high0[axis]
-                boxes[packet, 4 * axis + 2, lane] = low1[axis]
-                boxes[packet, 4 * axis + 3, lane] = high1[axis]
-            low = wp.min(low, wp.min(low0, low1))
-            high = wp.max(high, wp.max(high0, high1))
-        elements[packet, 40] = changed_lanes
-        for axis in range(3):
-            nodes[packet / 8, 2 * axis, packet % 8] = low[axis]
-            nodes[packet / 8, 2 * axis + 1, packet % 8] = high[axis]
-        node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
-        node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
+        lanes = wp.min(8, count - 8 * packet)
+        fit_packet(packet, lanes, x0, x1, corners, changed, padding, elements, boxes, nodes)
 
-    return encode, fill_packets
+    return encode, fit_packets
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _fill_packets(
+    first: int,
+    # in
+    corners: wp.array2d[int],
+    numbers: wp.array[int],
+    worlds: wp.array[int],
+    order: wp.array[int],
+    # out
+    elements: wp.array2d[int],
+    node_worlds: wp.array3d[int],
+):
+    """Writes the elements of each packet, and its worlds in its node."""
+    packet = first + wp.tid()
+    count = wp.min(8, corners.shape[0] - 8 * packet)
+    for lane in range(count):
+        i = order[8 * packet + lane]
+        elements[packet, lane] = numbers[i]
+        elements[packet, 32 + lane] = worlds[i]
+        for corner in range(corners.shape[1]):
+            elements[packet, 8 + 8 * corner + lane] = corners[i, corner]
+    node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
+    node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -240,11 +214,13 @@ class _Tree:
             low: Lowest corner of the grid, float64, shape [3].
             scale: Cells of the grid per unit of length along each axis, float64, shape [3].
         """
-        encode, _ = _kernels(x0.dtype, self._padding is not None)
+        encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
+        inputs, outputs = [self._corners, self._numbers, self._worlds, self._order], [self._elements, self._node_worlds]
+        launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         self._sorted_size = 0.0
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
@@ -255,11 +231,11 @@ class _Tree:
             x1: Positions at the end, of the same type.
             changed: Nonzero for each changed vertex, array of int; None for all.
         """
-        _, fill_packets = _kernels(x0.dtype, self._padding is not None)
-        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed, self._padding]
-        outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
+        _, fit_packets = _kernels(x0.dtype)
+        inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]
+        outputs = [self._elements.flatten(), self._boxes.flatten(), self._nodes.flatten()]
         device = self._corners.device
-        launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
+        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
         with np.errstate(over="ignore"):
             sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]

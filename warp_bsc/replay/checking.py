@@ -110,6 +110,7 @@ class _SegmentChecker:
             else:
                 self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
         self._last: SceneIntersections | None = None  # those found last
+        self._found: Intersections | None = None  # those of meshes found last
         distance = checks.min_distance
         self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
         self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
@@ -135,7 +136,7 @@ class _SegmentChecker:
             strands, of_strands = self._strands, self._strands.detect(interval)
         intersections = None
         if start is not None:
-            intersections = start, self.find(interval.x1, interval.end, is_end=not self._is_still)
+            intersections = start, self.find(interval.x1, interval.end, None if self._is_still else collisions)
         proximities = None
         if self._proximity_finder:
             near = self._find_near(interval.x0, interval.start)
@@ -169,21 +170,27 @@ class _SegmentChecker:
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
 
-    def find(self, x: np.ndarray, time: float, *, is_end: bool = False) -> SceneIntersections:
+    def find(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> SceneIntersections:
         """Returns the intersections at a time, those found last if these are the ones.
 
         Args:
             x: Positions at that time, shape [vertex_count, 3].
             time: Time code.
-            is_end: Whether a motion that ends there has just been detected.
+            collisions: Those of the motion that has just been detected, from where intersections were found last to
+                these positions; None if there is none.
         """
         last = self._last
         if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
             assert self._finder and self._containment
             selection, meshes = self._checks.selection, self.segment.meshes
-            found, mesh = self._finder.find(x, is_end=is_end), self._mesh
+            if collisions and self._found:
+                self._found = self._finder.find_at_end(x, self._found, collisions)
+            else:
+                self._found = self._finder.find(x)
+            found, mesh = self._found, self._mesh
             if self._strands:
-                found, mesh = self._strands.with_intersections(found, x, is_end=is_end), self._strands.mesh
+                found = self._strands.with_intersections(found, x, is_end=collisions is not None)
+                mesh = self._strands.mesh
 
             def are_wanted(pairs: np.ndarray) -> np.ndarray:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
