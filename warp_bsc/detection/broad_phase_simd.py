@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import lowered, raised, rounded
 from ..kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 from .launch import launch_over
 from .mesh import CollisionMesh

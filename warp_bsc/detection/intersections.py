@@ -12,8 +12,8 @@ from .._arrays import check_finite
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
-from .collisions import Collisions
 from .broad_phase import BroadPhase, make_broad_phase
+from .collisions import Collisions
 from .launch import launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
@@ -161,9 +161,7 @@ class IntersectionFinder:
         Raises:
             ValueError: If the positions have another shape or type, or are not finite.
         """
-        found = self._find(
-            x, lambda positions: self._candidates.find(positions, refit=self._has_run, is_end=is_end)
-        )
+        found = self._find(x, lambda positions: self._candidates.find(positions, refit=self._has_run, is_end=is_end))
         self._has_run = True
         return found
 
