@@ -37,7 +37,7 @@ import warp as wp
 
     // the packet's own box, over all of the time, and its worlds, sorted as they are
     Floats lows[3], highs[3];
-    float low[3], high[3];
+    float low[3], high[3], lane_lows[3][8], lane_highs[3][8];
     for (int axis = 0; axis < 3; ++axis) {
         const float* at = box + 32 * axis;
         lows[axis] = at_end ? floats(at + 16) : __builtin_elementwise_min(floats(at), floats(at + 16));
@@ -48,6 +48,9 @@ import warp as wp
             low[axis] = lowest(low[axis], lows[axis][lane]);
             high[axis] = highest(high[axis], highs[axis][lane]);
         }
+        // a copy in memory: to take a lane whose number is not constant from a register stores all of it each time
+        __builtin_memcpy(lane_lows[axis], &lows[axis], sizeof(lane_lows[axis]));
+        __builtin_memcpy(lane_highs[axis], &highs[axis], sizeof(lane_highs[axis]));
     }
     int first_world = element[32], last_world = element[32];
     for (int lane = 1; lane < 8; ++lane)
@@ -93,7 +96,7 @@ import warp as wp
             const int lane = __builtin_ctz(lanes);
             Ints overlap = ints(other_element + 32) == element[32 + lane];
             for (int axis = 0; axis < 3; ++axis)
-                overlap &= (other_low[axis] <= highs[axis][lane]) & (other_high[axis] >= lows[axis][lane]);
+                overlap &= (other_low[axis] <= lane_highs[axis][lane]) & (other_high[axis] >= lane_lows[axis][lane]);
             unsigned mask = bits(overlap);
             if (!(changed >> lane & 1))
                 mask &= other_changed;
@@ -106,6 +109,8 @@ import warp as wp
                 for (int j = 0; j < other_corners; ++j)
                     shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
             mask &= ~bits(shared);
+            if (!mask)
+                continue;
             overlapping += __builtin_popcount(mask);
             if (!keep_separated && !at_end) {
                 Ints apart = 0;
@@ -267,6 +272,18 @@ _FIT_SNIPPET = """
 
 @functools.cache
 def fit_packet_of(dtype: type) -> wp.Function:
+    """Returns the function that fits the boxes of a packet to a motion, for one type of position.
+
+    Args:
+        dtype: Type of a position, vec3 or vec3d.
+
+    Returns:
+        Device function for the CPU. It takes the packet, the number of its elements, the positions at both ends, the
+        number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach beyond
+        each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which elements
+        have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an element with
+        a position that is not finite is empty. No index is checked.
+    """
     snippet = _FIT_SNIPPET.format(scalar="float" if dtype is wp.vec3 else "double")
 
     @wp.func_native(snippet)

@@ -1,10 +1,11 @@
 """The broad phase on the CPU: a wide BVH of packets of eight boxes, compared by SIMD instructions.
 
-The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are sorted along a Morton curve of a grid
-with 2^10 cells an axis, world by world.
+The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are sorted along a Hilbert curve of a grid
+with 2^10 cells an axis, world by world. Along a Morton curve, packets are larger, and a third more of them overlap.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,7 +19,7 @@ from .settings import NO_GRADIENTS, UNLIMITED, Count
 __all__ = ["BroadPhaseSimd"]
 
 _CODE_BITS = 10
-"""Bits of a Morton code an axis."""
+"""Bits of a Hilbert code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LOOSE = 1.5
@@ -26,12 +27,35 @@ _LOOSE = 1.5
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
+@wp.func
+def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
+    """Returns the place of a cell along a Hilbert curve: its bits are those of the three numbers, taken in turns.
+
+    J. Skilling, Programming the Hilbert Curve, AIP Conference Proceedings 707, 2004, doi:10.1063/1.1751381.
+    """
+    for level in range(_CODE_BITS - 1):
+        bit = _CODE_BITS - 1 - level
+        below = (1 << bit) - 1
+        for axis in range(3):
+            if (cells[axis] >> bit) & 1 == 1:
+                cells[0] = cells[0] ^ below
+            else:
+                exchanged = (cells[0] ^ cells[axis]) & below
+                cells[0] = cells[0] ^ exchanged
+                cells[axis] = cells[axis] ^ exchanged
+    cells[1] = cells[1] ^ cells[0]
+    cells[2] = cells[2] ^ cells[1]
+    turned = int(0)
+    for bit in range(1, _CODE_BITS):
+        if (cells[2] >> bit) & 1 == 1:
+            turned = turned ^ ((1 << bit) - 1)
+    return wp.vec3i(cells[0] ^ turned, cells[1] ^ turned, cells[2] ^ turned)
+
+
 @functools.cache
 def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that encode elements and fill packets, for one type of position, with or without a padding.
-
-    Without one, code for it is not compiled, as ``padded`` is a constant of the kernel.
-    """
+    """Returns the kernels that encode elements and fit packets, for one type of position."""
+    fit_packet = fit_packet_of(dtype)
 
     @wp.kernel(**NO_GRADIENTS)
     def encode(
@@ -47,7 +71,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         codes: wp.array[wp.int64],
         order: wp.array[int],
     ):
-        """Writes for each element its world and the Morton code of its first corner halfway, as one number to sort."""
+        """Writes for each element its world and the Hilbert code of its first corner halfway, as one number to sort."""
         i = first + wp.tid()
         vertex = corners[i, 0]
         code = wp.int64(worlds[i])
@@ -55,13 +79,12 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         for axis in range(3):
             x = wp.float64(0.5) * (wp.float64(x0[vertex][axis]) + wp.float64(x1[vertex][axis]))
             cells[axis] = wp.int32(wp.clamp((x - low[axis]) * scale[axis], wp.float64(0.0), _LARGEST_CELL))
+        cells = hilbert_transpose(cells)
         for bit in range(_CODE_BITS):
             for axis in range(3):
                 code = (code << wp.int64(1)) | wp.int64((cells[axis] >> (_CODE_BITS - 1 - bit)) & 1)
         codes[i] = code
         order[i] = i
-
-    fit_packet = fit_packet_of(dtype)
 
     @wp.kernel(**NO_GRADIENTS)
     def fit_packets(
@@ -99,7 +122,7 @@ def _fill_packets(
     elements: wp.array2d[int],
     node_worlds: wp.array3d[int],
 ):
-    """Writes the elements of each packet, and its worlds in its node."""
+    """Writes the elements of each packet in their order, and its worlds in its node."""
     packet = first + wp.tid()
     count = wp.min(8, corners.shape[0] - 8 * packet)
     for lane in range(count):
@@ -158,6 +181,36 @@ def _pair_packets(
     )
 
 
+@wp.kernel(**NO_GRADIENTS)
+def _join_nodes(
+    first: int,
+    # in
+    start: int,
+    above: int,
+    # in and out
+    nodes: wp.array3d[wp.float32],
+    node_worlds: wp.array3d[int],
+):
+    """Writes the box and the worlds of each node of a level to the level above, given where both levels start."""
+    i = first + wp.tid()
+    node = start + i
+    parent = above + i / 8
+    lane = i % 8
+    for axis in range(3):
+        low = wp.float32(wp.inf)
+        high = wp.float32(-wp.inf)
+        for child in range(8):
+            low = wp.min(low, nodes[node, 2 * axis, child])
+            high = wp.max(high, nodes[node, 2 * axis + 1, child])
+        nodes[parent, 2 * axis, lane] = low
+        nodes[parent, 2 * axis + 1, lane] = high
+    last = int(-1)
+    for child in range(8):
+        last = wp.max(last, node_worlds[node, 1, child])
+    node_worlds[parent, 0, lane] = node_worlds[node, 0, 0]
+    node_worlds[parent, 1, lane] = last
+
+
 class _Tree:
     """A wide BVH over the elements of one kind: vertices, edges or faces."""
 
@@ -205,7 +258,7 @@ class _Tree:
         return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
-        """Sorts the elements along a Morton curve of a motion's grid.
+        """Sorts the elements along a Hilbert curve of a motion's grid.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
@@ -235,16 +288,14 @@ class _Tree:
         outputs = [self._elements.flatten(), self._boxes.flatten(), self._nodes.flatten()]
         device = self._corners.device
         launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
-        nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
+        nodes, starts = self._nodes.numpy(), self._level_starts.numpy().tolist()
         with np.errstate(over="ignore"):
             sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
         self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
-        for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
-            _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
-            _join(nodes[start:end, 1::2].max(axis=2), nodes[end:above, 1::2])
-            _join(worlds[start:end, :1, 0], worlds[end:above, :1])
-            _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
+        for start, above in itertools.pairwise(starts[:-1]):
+            inputs, outputs = [start, above], [self._nodes, self._node_worlds]
+            launch_over(_join_nodes, above - start, inputs=inputs, outputs=outputs, device=device, chunk=2048)
 
     def pair(
         self,
@@ -287,14 +338,6 @@ class _Tree:
             counts,
         ]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
-
-
-def _join(children: np.ndarray, parents: np.ndarray) -> None:
-    """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
-    whole = len(children) // 8
-    parents[:whole] = children[: 8 * whole].reshape(whole, 8, children.shape[1]).transpose(0, 2, 1)
-    if 8 * whole < len(children):
-        parents[whole, :, : len(children) - 8 * whole] = children[8 * whole :].T
 
 
 class BroadPhaseSimd:

@@ -294,9 +294,8 @@ class _Incidence:
             parts: Indices of the parts of each element, or -1, shape [n, k].
             count: Number of parts.
         """
-        order = np.argsort(parts, axis=None)
-        self._starts = np.searchsorted(parts.ravel()[order], np.arange(count + 1))
-        self._elements = order // parts.shape[1]
+        self._elements = np.argsort(parts, axis=None) // parts.shape[1]
+        self._starts = np.cumsum(np.bincount(parts.ravel() + 1, minlength=count + 1))
 
     def of(self, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns for some parts all elements that have them: the row of the part, and the element, shape [m] each."""
