@@ -23,7 +23,7 @@ __all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_in
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _PAIRS_OF_HIT = 8
-"""Pairs of an edge and a face that a collision has at most, mostly: so many take longer than to search all edges."""
+"""Pairs of an edge and a face for each collision, roughly. More of them than edges take longer than a search."""
 
 
 @functools.cache
@@ -166,7 +166,7 @@ class IntersectionFinder:
         return found
 
     def find_at_end(self, x: np.ndarray | wp.array, start: Intersections, collisions: Collisions) -> Intersections:
-        """Returns the intersections at the end of a motion: those of :meth:`find`, in less time if collisions are few.
+        """Returns the intersections at the end of a motion: those of :meth:`find`, on a CPU in less time.
 
         An edge and a face that are apart at the start and meet at the end have a first contact in between. There, an
         end of the edge is in the face, or the edge meets a side of the face: if only their interiors met, they would
@@ -183,7 +183,8 @@ class IntersectionFinder:
             ValueError: As :meth:`find`.
         """
         hits = len(collisions.vertex_face) + len(collisions.edge_edge)
-        if not collisions.certified or not self._has_sides or _PAIRS_OF_HIT * hits > len(self._mesh.edges):
+        is_slower = self._mesh.device.is_cuda or _PAIRS_OF_HIT * hits > len(self._mesh.edges)
+        if is_slower or not collisions.certified or not self._has_sides:
             return self.find(x, is_end=True)
         pairs = self._pairs_that_may_meet(start, collisions)
         return self._find(x, lambda _: self._candidates.put(pairs))
@@ -255,9 +256,9 @@ class IntersectionFinder:
         )
 
     def _pairs_that_may_meet(self, start: Intersections, collisions: Collisions) -> np.ndarray:
-        """Returns the pairs (edge, face) that have met at the start or are of collisions, without those of neighbours.
+        """Returns the pairs (edge, face) that met at the start, or of which a part of each is in a collision.
 
-        Each pair is there once. Shape [n, 2], int32.
+        Pairs that share a vertex are left out. Each other one is there once. Shape [n, 2], int32.
         """
         mesh = self._mesh
         rows, edges = self._edges_of_vertices.of(collisions.vertex_face[:, 0])
