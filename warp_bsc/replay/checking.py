@@ -75,9 +75,9 @@ class IntervalChecker:
             ValueError: If the positions at some time are broken, or there is no such method.
         """
         detections = self._detect(first, stop)
-        for work, namer, detection in (
-            read_ahead(detections) if wp.get_device(self._checks.device).is_cpu else detections
-        ):
+        if wp.get_device(self._checks.device).is_cpu:
+            detections = read_ahead(detections)
+        for work, namer, detection in detections:
             started = time.perf_counter()
             result = namer.name(detection)
             yield replace(result, work=replace(work, checking=work.checking + time.perf_counter() - started))
