@@ -486,3 +486,22 @@ def test_a_box_falls_on_a_static_one_and_stays(device):
     pose, twist = rollout.states[0].body_q.numpy()[0], rollout.states[0].body_qd.numpy()[0]
     assert 0.05 < pose[2] < 0.0505 and np.abs(twist).max() < 0.05
     assert len(solver.report.uncertified_bodies) == 0
+
+
+def test_a_light_box_rests_on_a_pile(device):
+    """On sheets that lie on the ground, no path is cut: the box is only near the cloth that the projection moves."""
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    for layer in range(5):
+        add_patch(builder, 7, 0.02, (0.003 * layer, 0.002 * layer, 0.004 * (layer + 1)))
+    at = wp.transform(wp.vec3(0.07, 0.07, 0.06), wp.quat_identity())
+    size = {"hx": 0.03, "hy": 0.03, "hz": 0.03}
+    builder.add_shape_box(builder.add_body(xform=at), cfg=newton.ModelBuilder.ShapeConfig(density=80.0), **size)
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.3))
+    for _ in range(48):
+        rollout.step()
+    report = rollout.solver.report
+    assert (report.uncertified_steps, report.truncated_steps, rollout.collisions) == (0, 0, 0)
+    assert np.linalg.norm(rollout.states[0].body_qd.numpy()[0]) < 0.1

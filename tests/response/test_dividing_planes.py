@@ -303,3 +303,20 @@ def test_the_end_is_the_nearest_position_above_all_planes(seed, count, spread, d
     moved = np.linalg.norm(end - x1.astype(float))
     assert distance_above(planes, x1.astype(float), 0.0) - 1e-6 <= moved
     assert moved <= distance_above(planes, x1.astype(float), 1.0) + 1e-6
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), tilt=st.sampled_from([1e-6, 1e-4, 1e-2]))
+@example(seed=0, tilt=1e-4)
+def test_planes_take_a_vertex_no_farther_than_its_path(seed, tilt, device):
+    """Nearly parallel planes that the start is nearer to than their margins, which meet far away."""
+    rng = np.random.default_rng(seed)
+    low, high = unit(0.0, 0.0, 1.0), unit(*rng.uniform(-tilt, tilt, 2), -1.0)
+    x0 = np.float32([0.1, 0.2, 3e-7])
+    planes = [(low, 0.0, 5e-6), (high, high @ x0.astype(float) - 2e-6, 5e-7)]
+    x1 = x0 + np.float32(1e-5 * rng.standard_normal(3))
+    end, _cut = divide(planes, x0, x1, device)
+    assert all(normal @ end > offset for normal, offset, _ in planes)
+    below = max(offset + margin - normal @ x0.astype(float) for normal, offset, margin in planes)
+    most = np.linalg.norm(x1.astype(float) - x0) + 4.0 * below
+    assert np.linalg.norm(end - x1.astype(float)) <= most + 1e-7

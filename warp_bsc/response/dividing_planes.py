@@ -42,6 +42,8 @@ _NEAR_MARGIN = wp.constant(wp.float64(0.45))
 """The same of elements that are so near that they may hardly come nearer, step after step: positions are rounded."""
 _ROOM = wp.constant(wp.float64(0.05))
 """How much farther than that both are from the plane at the start at least, as a share of their distance."""
+_WEDGE = wp.constant(wp.float64(4.0))
+"""Most that a vertex may be moved, beyond its path, in multiples of how far the start is below a plane."""
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
@@ -414,22 +416,41 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
+def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: wp.vec3d) -> wp.float64:
+    """Returns how far from the end of its path planes may take a vertex [m]: as far as it is from the start.
+
+    The start is in the convex region above the planes, so that the nearest point of that region is no farther. Planes
+    that move, and cannot be moved, may have passed the start: then what lies between is added, and some more, as planes
+    that are nearly parallel meet far away.
+    """
+    below = _ZERO
+    node = planes.first[vertex]
+    while node >= 0:
+        normal, least, margin = _half_space(planes, node)
+        below = wp.max(below, least + margin - wp.dot(normal, start))
+        node = planes.next[node]
+    return wp.length(end - start) + _WEDGE * below
+
+
+@wp.func
 def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec3):
     """Returns an end of a vertex's path above all of its planes, near to ``x1``, and whether the path was cut for that.
 
     Where projection does not find one, the path is cut; where rounding leaves none, it ends at ``x0``.
     """
-    x = to_double(x1)
-    if _is_above(planes, vertex, x):
+    wanted = to_double(x1)
+    if _is_above(planes, vertex, wanted):
         return x1, False
-    x = _projected(planes, vertex, x)
+    start = to_double(x0)
+    x = _projected(planes, vertex, wanted)
+    if wp.length(x - wanted) > _most_correction(planes, vertex, start, wanted):
+        x = wanted
     end = to_single(x)
     if _is_above(planes, vertex, to_double(end)):
         return end, False
     end = _rounded(planes, vertex, x)  # elements may be nearer to each other than their coordinates are precise
     if _is_above(planes, vertex, to_double(end)):
         return end, False
-    start = to_double(x0)
     x = to_double(end)
     end = to_single(start + share_of_path(planes, vertex, start, x) * (x - start))
     if _is_above(planes, vertex, to_double(end)):

@@ -39,6 +39,8 @@ _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
 _TINY = wp.constant(wp.float64(1e-300))
 _MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
+_NEARER = wp.constant(wp.float64(0.25))
+"""Most of that, as a share of how far the vertex would be where it stands still: see :mod:`.dividing_planes`."""
 _DEEPER = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
@@ -200,7 +202,8 @@ def collect_penetrations(
             update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)
             if not dividing.first:
                 continue
-            margin = _MARGIN * separation
+            stays, _error_stays = signed_distance(plane, motion.x0[vertex])
+            margin = wp.min(_MARGIN * separation, _NEARER * wp.max(stays - least, _ZERO))
             offset = plane[3] + least + wp.min(wp.float64(2.0) * error_after, margin)
             if least < _ZERO:
                 offset = plane[3] + least - _DEEPER * separation

@@ -14,6 +14,7 @@ from .constraints import (
     RESTING,
     VERTEX_FACE_PROXIMITY,
     add_constraint,
+    are_on_body,
     contact_friction,
     distances_at_start,
     feasible,
@@ -230,6 +231,8 @@ def _collect_proximity(
     target = least + feasible(motion, corners, separation, distance - least, separation)
     slow = wp.where(path <= MOST_AT_REST * separation, RESTING, 1)
     kind = wp.where(near.edges == 1, EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY)
+    if are_on_body(motion, corners):
+        progress.fast[motion.world[corners[0]]] = 1  # as where bodies are in contact, see kernels.collect_contacts
     add_constraint(
         motion,
         vertices,
