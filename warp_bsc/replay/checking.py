@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
-import warp as wp
 
 from ..detection.collisions import Collisions, add_stats
 from ..detection.containment import ContainmentFinder
@@ -17,6 +16,7 @@ from ..detection.detector import CollisionDetector
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import Proximities, ProximityFinder
+from ..detection.start import is_cpu
 from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment
@@ -75,7 +75,7 @@ class IntervalChecker:
             ValueError: If the positions at some time are broken, or there is no such method.
         """
         detections = self._detect(first, stop)
-        if wp.get_device(self._checks.device).is_cpu:
+        if is_cpu(self._checks.device):
             detections = read_ahead(detections)
         for work, namer, detection in detections:
             started = time.perf_counter()
