@@ -1,4 +1,4 @@
-"""Reads ahead and writes behind, one item each, in threads beside the one that detects."""
+"""Reads and detects ahead, and writes behind, one item each, in threads."""
 
 import contextvars
 from collections.abc import Callable, Iterable, Iterator
