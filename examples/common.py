@@ -96,18 +96,16 @@ class ExampleBase:
 
     @classmethod
     def create_parser(cls):
-        """Returns the options."""
-        return create_parser(cls.num_frames)
-
-
-def create_parser(num_frames):
-    """Returns Newton's options with a number of frames, and ``--no-ccd``."""
-    parser = newton.examples.create_parser()
-    parser.set_defaults(num_frames=num_frames)
-    parser.add_argument(
-        "--ccd", action=argparse.BooleanOptionalAction, default=True, help="Put the collision stage behind the solver."
-    )
-    return parser
+        """Returns Newton's options with a number of frames, and ``--no-ccd``."""
+        parser = newton.examples.create_parser()
+        parser.set_defaults(num_frames=cls.num_frames)
+        parser.add_argument(
+            "--ccd",
+            action=argparse.BooleanOptionalAction,
+            default=True,
+            help="Put the collision stage behind the solver.",
+        )
+        return parser
 
 
 class ViewerProgress(ViewerNull):

@@ -14,7 +14,7 @@ import newton
 import newton.examples
 import numpy as np
 import warp as wp
-from common import ExampleBase, create_parser, main
+from common import ExampleBase, main
 from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledProxy
 
 import warp_bsc as bsc
@@ -190,7 +190,7 @@ class Example(ExampleBase):
     @classmethod
     def create_parser(cls):
         """Returns the options."""
-        parser = create_parser(cls.num_frames)
+        parser = super().create_parser()
         parser.add_argument("--friction", type=float, default=0.5, help="Coefficient between cloth and fingers.")
         parser.add_argument("--robot", choices=ROBOTS, default="featherstone", help="Solver of the robot.")
         return parser

@@ -16,15 +16,24 @@ functions of time, each of these proves that none is, over a whole part of the s
 - **corner**: some fixed g has g.q > d |g| at both ends, and both sides point away from q: q.e >= 0, q.i >= 0, in all
   coefficients. Then x = q + s e + r i has x.q >= q.q.
 
-Fixed directions are those of the closest points halfway through the part. A fixed direction alone would need parts as
-short as the gap where features turn; the others lose the square of their length only. At one time, two points of the
-features whose distance is certainly at most d are a HIT.
+Fixed directions are those of the closest points at some time. A fixed direction alone would need parts as short as the
+gap where features turn; the others lose the square of their length only. At one time, two points of the features whose
+distance is certainly at most d are a HIT.
 
-The search goes through the step from part to part: after a part that is free comes one twice as long, and a part that
-nothing decides is halved. Newton's method proposes a time, half the tolerance after the one at which the distance is
-about reached; if the distance is certainly reached there, the next part ends within the tolerance before it. The search
-ends at the first part as short as :data:`SHORTEST` that nothing decides, or after :data:`MAX_VISITS` parts. The start
-of the last part is a lower bound of the time at which the distance is reached.
+Two searches look for such parts. Most queries end in the first one.
+
+- **Advancement** evaluates the closest points at one time after another. Their direction clears all times around until
+  the first corner comes within the distance along it; if that includes all from the start of what is left, the start
+  advances to the end. Evaluated are the time at which the distance to the plane is about reached, by Newton's method on
+  Y and |n|, and the start where that leads nowhere. If the distance is certainly reached, the plane is tried over all
+  from the start to the tolerance before. This is given up where nothing advances, or after :data:`MAX_ADVANCES` times.
+- **Subdivision** goes through the step from part to part: after a part that is free comes one twice as long, and a part
+  that nothing decides is halved. Newton's method on the closest points proposes a time, half the tolerance after the
+  one at which the distance is about reached; if the distance is certainly reached there, the next part ends within the
+  tolerance before it. The search ends at the first part as short as :data:`SHORTEST` that nothing decides, or after
+  :data:`MAX_VISITS` parts.
+
+The start of what is left is a lower bound of the time at which the distance is reached.
 
 **Bounds.** r is the roundoff, U the sum of the sizes of u, v and w, component by component. Components of u, v and w
 at a time have at most 4 roundings: 1 of the difference of points, 3 of the interpolation between both ends; times are
@@ -38,8 +47,8 @@ With a roundoff of 0 the bounds are zero, and the status is the one that floatin
 
 import warp as wp
 
-from .closest import between, contact_at
-from .culling import centroid_direction, gaps_along
+from .closest import between, closest_coordinates, contact_at
+from .culling import DIRECTION_ERROR, centroid_direction, gaps_along
 from .distance import nearest_pair
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity, cross_middle
 from .signs import FREE, HIT, UNDERFLOW, UNSURE
@@ -48,7 +57,9 @@ from .time_of_impact import Impact, clamped_tolerance, mix_vector, power_of_two,
 SHORTEST = wp.constant(wp.float64(2.0**-40))
 """Length of the shortest part of a step."""
 MAX_VISITS = wp.constant(128)
-"""Number of parts after which the search stops, unsure."""
+"""Number of parts after which subdivision stops, unsure."""
+MAX_ADVANCES = wp.constant(12)
+"""Number of times after which advancement is given up."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -58,7 +69,12 @@ _TWO = wp.constant(wp.float64(2.0))
 _FOUR = wp.constant(wp.float64(4.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
+_THREE = wp.constant(wp.float64(3.0))
 _NEWTON_STEPS = wp.constant(3)
+_PLANE_NEWTON_STEPS = wp.constant(6)
+_STEPS_TO_PLANE = wp.constant(3)
+_UNKNOWN = wp.constant(wp.float64(-1.0))
+_AWAY = wp.constant(wp.float64(1.0 + 2.0**-38))
 _SMALLEST = wp.constant(wp.float64(2.0**-400))
 _INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
 _POINT_ERROR = wp.constant(wp.float64(12.0))
@@ -252,89 +268,88 @@ def _polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64)
     first_high = at[0] >= _ONE
     second_low = at[1] <= _ZERO
     second_high = at[1] >= _ONE
-    u_size = part.u_size
-    v_size = part.v_size
-    if kind == EDGE_EDGE:
-        # x = s u - r v - w
-        on_first = first_low or first_high
-        on_second = second_low or second_high
-        if not (on_first or on_second):
-            return _plane_clears(part, distance)
-        q0 = -part.w0
-        q1 = -part.w1
-        u0 = part.u0
-        u1 = part.u1
-        v0 = -part.v0
-        v1 = -part.v1
-        if first_high:
-            q0 += u0
-            q1 += u1
-            u0 = -u0
-            u1 = -u1
-        if second_high:
-            q0 += v0
-            q1 += v1
-            v0 = -v0
-            v1 = -v1
-        if on_first and on_second:
-            if _corner_clears(part, q0, q1, u0, u1, v0, v1, u_size, v_size, distance):
-                return True
-        if on_first and _side_clears(part, False, q0, q1, v0, v1, u0, u1, v_size, u_size, distance):
-            return True
-        if on_second and _side_clears(part, False, q0, q1, u0, u1, v0, v1, u_size, v_size, distance):
-            return True
-        return _plane_clears(part, distance)
-    # x = w - beta u - gamma v
     alone = kind == VERTEX_EDGE
-    third = at[0] + at[1] >= _ONE
-    if not (first_low or second_low or third):
-        return _plane_clears(part, distance)
+    # the corner, both sides at it, and which of these are tried
     q0 = part.w0
     q1 = part.w1
     e0 = -part.u0
     e1 = -part.u1
-    e_size = u_size
+    e_size = part.u_size
     i0 = -part.v0
     i1 = -part.v1
-    i_size = v_size
-    if third and not second_high:  # from b on, along b c and b a; otherwise from c on, or from a on
-        q0 -= part.u0
-        q1 -= part.u1
-        e0 = part.u0 - part.v0
-        e1 = part.u1 - part.v1
-        i0 = part.u0
-        i1 = part.u1
-        e_size = u_size + v_size
-        i_size = u_size
-    elif second_high:
-        q0 -= part.v0
-        q1 -= part.v1
-        e0 = part.v0
-        e1 = part.v1
-        i0 = part.v0 - part.u0
-        i1 = part.v1 - part.u1
-        e_size = v_size
-        i_size = u_size + v_size
-    if (first_low and second_low) or first_high or second_high:
-        if alone:  # one side, twice
+    i_size = part.v_size
+    along_e = bool(False)
+    along_i = bool(False)
+    corner = bool(False)
+    if kind == EDGE_EDGE:
+        # x = s u - r v - w
+        along_i = first_low or first_high
+        along_e = second_low or second_high
+        corner = along_e and along_i
+        q0 = -q0
+        q1 = -q1
+        if first_high:
+            q0 += part.u0
+            q1 += part.u1
+        else:
+            e0 = part.u0
+            e1 = part.u1
+        if second_high:
+            q0 -= part.v0
+            q1 -= part.v1
+            i0 = part.v0
+            i1 = part.v1
+    else:
+        # x = w - beta u - gamma v
+        third = at[0] + at[1] >= _ONE
+        corner = (first_low and second_low) or first_high or second_high
+        along_i = not alone and (corner or (first_low and not third))
+        along_e = corner or ((third or second_low) and not along_i)
+        if third and not second_high:  # from b on, along b c and b a; otherwise from c on, or from a on
+            q0 -= part.u0
+            q1 -= part.u1
+            e0 = part.u0 - part.v0
+            e1 = part.u1 - part.v1
+            i0 = part.u0
+            i1 = part.u1
+            e_size = part.u_size + part.v_size
+            i_size = part.u_size
+        elif second_high:
+            q0 -= part.v0
+            q1 -= part.v1
+            e0 = part.v0
+            e1 = part.v1
+            i0 = part.v0 - part.u0
+            i1 = part.v1 - part.u1
+            e_size = part.v_size
+            i_size = part.u_size + part.v_size
+        if alone and corner:  # one side, twice
             i0 = wp.where(first_high, part.u0, -part.u0)
             i1 = wp.where(first_high, part.u1, -part.u1)
             e0 = i0
             e1 = i1
-            e_size = u_size
-            i_size = u_size
-        if _corner_clears(part, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
+            e_size = part.u_size
+            i_size = part.u_size
+    if corner and _corner_clears(part, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
+        return True
+    sides = int(2)  # not a constant, as the body would be repeated
+    for side in range(sides):
+        is_e = side == 0
+        if wp.where(is_e, along_e, along_i) and _side_clears(
+            part,
+            alone,
+            q0,
+            q1,
+            wp.where(is_e, e0, i0),
+            wp.where(is_e, e1, i1),
+            wp.where(is_e, i0, e0),
+            wp.where(is_e, i1, e1),
+            wp.where(is_e, e_size, i_size),
+            wp.where(is_e, i_size, e_size),
+            distance,
+        ):
             return True
-        if _side_clears(part, alone, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
-            return True
-        return not alone and (
-            _side_clears(part, False, q0, q1, i0, i1, e0, e1, i_size, e_size, distance) or _plane_clears(part, distance)
-        )
-    if first_low and not third:  # along a c
-        return _side_clears(part, alone, q0, q1, i0, i1, e0, e1, i_size, e_size, distance) or _plane_clears(
-            part, distance
-        )
-    return _side_clears(part, alone, q0, q1, e0, e1, i0, i1, e_size, i_size, distance) or _plane_clears(part, distance)
+    return not alone and _plane_clears(part, distance)
 
 
 @wp.func
@@ -372,7 +387,8 @@ def _about_reached(
     Returns:
         The time; 2 if that is not between both.
     """
-    for _ in range(_NEWTON_STEPS):
+    steps = int(_NEWTON_STEPS)  # not a constant, as the body would be repeated
+    for _ in range(steps):
         velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
         size = wp.length(gap)
         slope = wp.dot(gap, velocity)
@@ -389,8 +405,8 @@ def _about_reached(
 def _is_within(motion: Motion, gap: wp.vec3d, distance: wp.float64) -> bool:
     """Returns whether the vector between two points of the features is certainly no longer than a distance.
 
-    Bound: w has 4 roundings, u and v with the product 5, and the sum 2. Coordinates in a triangle may add up to 1 + r,
-    which is as far from the triangle as r of its size.
+    Bound: w has 4 roundings, u and v with the product 5, and the sum 2. Coordinates in a triangle may add up to
+    1 + 3r: the sum that is compared, and quotients, are rounded. That is as far from the triangle as 3r of its size.
     """
     size = _sum(motion.u_size + motion.v_size + motion.w_size)
     return _norm(gap) + _POINT_ERROR * motion.roundoff * size + _underflow(motion.roundoff) <= distance
@@ -437,9 +453,13 @@ class Search:
     limit: wp.float64  # end of what is to be searched
     found: bool  # whether the distance is certainly reached at the limit
     aimed: bool  # whether the part ends within the tolerance before the limit
+    time: (
+        wp.float64
+    )  # at which advancement evaluates the closest points next; less than the start if that is to be found
     visits: int
     status: int  # FREE if the whole step is free, else UNSURE
     ended: bool
+    given_up: bool  # whether advancement has ended without a result
 
 
 @wp.func
@@ -454,13 +474,164 @@ def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) ->
         search.far = distance
     search.width = _ONE
     search.limit = _ONE
+    search.time = _UNKNOWN
     search.status = UNSURE
     return search
 
 
 @wp.func
+def _plane_reached(motion: Motion, distance: wp.float64, time: wp.float64) -> wp.float64:
+    """Returns about when the plane of the polygon comes within a distance, by Newton's method from a time.
+
+    The first steps approach the time at which the plane is reached, and are cheaper.
+
+    Returns:
+        The time, any number, not finite where that leads nowhere.
+    """
+    y = coplanarity(motion)
+    linear = _THREE * (y.k[1] - y.k[0])
+    square = _THREE * (y.k[2] - _TWO * y.k[1] + y.k[0])
+    cube = y.k[3] - y.k[0] + _THREE * (y.k[1] - y.k[2])
+    reached = time
+    for step in range(_PLANE_NEWTON_STEPS):
+        t = reached
+        value = y.k[0] + t * (linear + t * (square + t * cube))
+        slope = linear + t * (_TWO * square + t * _THREE * cube)
+        if step < _STEPS_TO_PLANE:
+            reached = t - value / slope
+        else:
+            s = _ONE - t
+            normal = s * s * y.n0 + _TWO * s * t * y.nh + t * t * y.n1
+            turn = s * (y.nh - y.n0) + t * (y.n1 - y.nh)
+            side = wp.where(slope < _ZERO, _ONE, -_ONE)  # from which Y approaches zero
+            size = wp.length(normal)
+            # of side Y - d |n|
+            reached = t - (side * value - distance * size) * size / (
+                side * slope * size - _TWO * distance * wp.dot(normal, turn)
+            )
+    return reached
+
+
+@wp.func
+def _lowest_at(
+    kind: int,
+    # products of u, v and w with the direction, at both ends
+    u: wp.vec2d,
+    v: wp.vec2d,
+    w: wp.vec2d,
+    time: wp.float64,
+) -> wp.float64:
+    """Returns the least product of a corner of the polygon with a direction at a time."""
+    both = wp.vec2d(_ONE - time, time)
+    a = wp.dot(u, both)
+    b = wp.dot(v, both)
+    if kind == VERTEX_FACE:
+        return wp.dot(w, both) - wp.max(wp.max(a, b), _ZERO)
+    return wp.dot(w, both) - wp.max(a, _ZERO) + wp.min(b, _ZERO)
+
+
+@wp.func
+def _first_below(corner: wp.vec2d, needed: wp.float64, before: wp.float64) -> wp.float64:
+    """Returns about when the product of a corner with a direction falls to what is needed, if that is before a time."""
+    if corner[1] < needed:
+        return wp.min(before, (corner[0] - needed) / (corner[0] - corner[1]))
+    return before
+
+
+@wp.func
+def _cleared_until(motion: Motion, direction: wp.vec3d, start: wp.float64, distance: wp.float64) -> wp.float64:
+    """Returns a time until which a direction keeps the features farther apart than a distance, from a start on.
+
+    The direction points from the second feature to the first for a vertex and a face, otherwise from the first to the
+    second: along it lie the differences of points of :func:`.culling.gaps_along`.
+
+    Bound: products of a dot product have 1 rounding of the vector, 1 of the product and 2 of the sum; the interpolation
+    between both ends, by exact factors, has 2 more, and the differences 2: less than those of ``gaps_along``.
+
+    Returns:
+        The time, the start itself if the direction does not clear it.
+    """
+    u = wp.vec2d(wp.dot(direction, motion.u0), wp.dot(direction, motion.u1))
+    v = wp.vec2d(wp.dot(direction, motion.v0), wp.dot(direction, motion.v1))
+    w = wp.vec2d(wp.dot(direction, motion.w0), wp.dot(direction, motion.w1))
+    size = wp.dot(wp.abs(direction), motion.u_size + motion.v_size + motion.w_size)
+    bound = motion.roundoff * (DIRECTION_ERROR * size + UNDERFLOW)
+    needed = distance * _norm(direction)
+    if not _lowest_at(motion.kind, u, v, w, start) - bound > needed:
+        return start
+    # not certain, but checked: a little more than needed
+    more = needed * _AWAY + _TWO * bound
+    end = _first_below(w - u, more, _first_below(w, more, _ONE))
+    if motion.kind == VERTEX_FACE:
+        end = _first_below(w - v, more, end)
+    else:
+        end = _first_below(w + v - u, more, _first_below(w + v, more, end))
+    end = SHORTEST * wp.floor(end / SHORTEST)
+    if end > start and _lowest_at(motion.kind, u, v, w, end) - bound > needed:
+        return end
+    return start
+
+
+@wp.func
+def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
+    """Returns a search by advancement after its next time; it has ended if nothing is left to do, or is given up."""
+    if before.ended:
+        return before
+    search = before
+    start = search.start
+    limit = search.limit
+    first = search.visits == 0
+    time = search.time
+    if time < start:
+        reached = _plane_reached(motion, distance, wp.where(first, _HALF, start))
+        time = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
+        if not (time > start and time < limit):
+            time = wp.where(first, _HALF, start)
+    u = mix_vector(motion.u0, motion.u1, time)
+    v = mix_vector(motion.v0, motion.v1, time)
+    w = mix_vector(motion.w0, motion.w1, time)
+    at = closest_coordinates(motion.kind, u, v, w)
+    gap = between(motion.kind, at, u, v, w)
+    velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+    size = wp.length(gap)
+    reached = time + (distance - size) * size / wp.dot(gap, velocity)
+    reached = SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST)
+    if _is_within(motion, gap, search.near):
+        limit = time
+        search.limit = time
+        search.found = True
+        search.ended = not timed or time == start
+    else:
+        direction = _unit_scale(wp.where(motion.kind == VERTEX_FACE, gap, -gap))
+        search.start = _cleared_until(motion, direction, start, search.far)
+        search.ended = search.start >= limit
+        if search.ended and not search.found:
+            search.status = FREE
+    if not search.ended:
+        stays = search.start == start
+        search.time = wp.where(stays, start, _UNKNOWN)
+        if search.found:
+            aim = SHORTEST * wp.floor((limit - _AHEAD * search.length) / SHORTEST)
+            if aim <= search.start:
+                search.ended = True
+            elif _plane_clears(restrict_motion(motion, search.start, aim), search.far):
+                search.start = aim
+                search.ended = True
+            search.time = wp.where(time == start, aim, search.start)
+        if (search.found or (stays and time == start)) and reached > search.start and reached < limit:
+            search.time = reached
+        search.given_up = search.time == time
+    search.visits += 1
+    search.given_up = not search.ended and (search.given_up or search.visits == MAX_ADVANCES)
+    search.ended = search.ended or search.given_up
+    return search
+
+
+@wp.func
 def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
-    """Returns a search after its next part; it has ended if nothing is left to do."""
+    """Returns a search by subdivision after its next part; it has ended if nothing is left to do."""
+    if before.ended:
+        return before
     search = before
     start = search.start
     limit = search.limit
@@ -486,20 +657,17 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
             search.ended = True
         else:
             reached = _about_reached(motion, distance, start, limit, time, at, gap)
-            if reached < limit:
-                reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
-                at, gap = _nearest_at(motion, reached)
-                if _is_within(motion, gap, search.near):
+            is_reached = reached < limit
+            reached = wp.min(SHORTEST * wp.floor((reached + _HALF * search.length) / SHORTEST), limit)
+            # then, in the first part, the ends of the step
+            times = wp.where(search.visits == 0, 3, 1)
+            for i in range(times):
+                time = wp.where(i == 0, reached, wp.where(i == 1, _ONE, _ZERO))
+                at, gap = _nearest_at(motion, time)
+                if (i > 0 or is_reached) and _is_within(motion, gap, search.near):
                     search.found = True
-                    search.limit = reached
-            if search.visits == 0:
-                at, gap = _nearest_at(motion, _ONE)
-                search.found = search.found or _is_within(motion, gap, search.near)
-                at, gap = _nearest_at(motion, _ZERO)
-                if _is_within(motion, gap, search.near):
-                    search.found = True
-                    search.limit = _ZERO
-                    search.ended = True
+                    search.limit = wp.min(search.limit, time)
+                    search.ended = time == _ZERO
             aim = search.limit - _AHEAD * search.length - start
             aim = SHORTEST * wp.floor(aim / SHORTEST)
             search.aimed = search.found and not search.aimed and aim > _ZERO and aim < span
@@ -548,5 +716,9 @@ def min_distance_impact(kind: int, motion: Motion, distance: wp.float64, timed: 
     """
     search = begin_search(motion, distance, tolerance)
     while not search.ended:
-        search = visit_part(kind, motion, distance, timed, search)
+        search = advance(motion, distance, timed, search)
+    if search.given_up:
+        search = begin_search(motion, distance, tolerance)
+        while not search.ended:
+            search = visit_part(kind, motion, distance, timed, search)
     return end_search(kind, motion, search)

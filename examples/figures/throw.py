@@ -35,7 +35,7 @@ def learn(ccd):
 def draw_paths(axes, example, first):
     """Draws the sheet, the mark and the paths from the side."""
     rest = example.model.particle_q.numpy()
-    sheet = rest[example.thrown.numpy() == 0]
+    sheet = rest[example.shares.numpy() == 0]
     low, high = sheet[sheet[:, 2].argmin()], sheet[sheet[:, 2].argmax()]
     axes.plot([low[0], high[0]], [low[2], high[2]], color="#555555", linewidth=3.0, label="sheet")
     for world, color in enumerate(_COLORS):

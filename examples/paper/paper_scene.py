@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 sys.path.append(str(Path(__file__).parents[1]))  # for common.py, whichever script of this folder runs
-from common import ExampleBase, create_parser, main
+from common import ExampleBase, main
 
 __all__ = [
     "PaperScene",
@@ -173,7 +173,7 @@ class PaperScene(ExampleBase):
     @classmethod
     def create_parser(cls):
         """Returns the options."""
-        parser = create_parser(cls.num_frames)
+        parser = super().create_parser()
         parser.add_argument("--triangles", type=int, default=cls.triangles, help="About how many triangles.")
         return parser
 

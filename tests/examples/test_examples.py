@@ -304,9 +304,9 @@ def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypat
             array.grad.fill_(wp.nan)
 
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    example.run_iteration._graph = "a graph"
+    example.run_frame._graph = "a graph"
     example.step()
-    assert example.run_iteration.retaken == 1
+    assert example.run_frame.retaken == 1
     assert example.solver.report.lost_gradients == 0
     np.testing.assert_allclose(example.throws.numpy(), expected.throws.numpy(), rtol=1e-4)
 

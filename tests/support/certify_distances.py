@@ -26,7 +26,7 @@ from rich.table import Table
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.distance_phase import run_distance_phases
-from warp_bsc.detection.launch import one_core
+from warp_bsc.detection.launch import cores
 from warp_bsc.detection.narrow_phase import NarrowPhase
 from warp_bsc.detection.rings import Rings
 from warp_bsc.detection.settings import Count, DistanceKind, PairCounts
@@ -157,7 +157,7 @@ def time_queries(kind, points, distance, timed, repeat):
     elements = wp.array(elements, dtype=int)
     times = []
     options = {"method": "conservative", "timed": timed, "timer": StageTimer(None)}
-    with one_core():
+    with cores(1):
         while len(times) < repeat:
             counts.assign(PairCounts(queued=len(rows)).values())
             start = time.perf_counter()

@@ -1,18 +1,19 @@
-"""The narrow phase of pairs with a minimum distance: culls -> certified search -> order; the host decides the rest.
+"""The narrow phase of pairs with a minimum distance: culls -> advancement -> subdivision -> order.
 
-The stages write to the buffers of a :class:`.narrow_phase.NarrowPhase`, which sorts the contacts. The minimum distance
-of a pair is the sum of two radii, rounded to double precision: the radius of a vertex is its own, that of an edge or a
-face the largest one of its vertices.
+The host decides the rest. The stages write to the buffers of a :class:`.narrow_phase.NarrowPhase`, which sorts the
+contacts. The minimum distance of a pair is the sum of two radii, rounded to double precision: the radius of a vertex is
+its own, that of an edge or a face the largest one of its vertices.
 """
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from .. import checker
-from ..kernels.min_distance import Search, begin_search, clears_at_once, closest_at, end_search, visit_part
+from ..kernels.min_distance import Search, advance, begin_search, clears_at_once, closest_at, end_search, visit_part
 from ..kernels.motion import all_finite, motion_and_distance, relative_motion
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
@@ -35,8 +36,11 @@ __all__ = [
     "run_distance_phases",
 ]
 
-_BLOCK, _THREADS_OF_MULTIPROCESSOR = 64, 256
-"""Threads of a block, and of a multiprocessor, that search, each one pair after another. On a CPU a thread has one."""
+_BLOCK = 64
+"""Threads of a block that searches."""
+_ADVANCING, _SUBDIVIDING = 384, 256
+"""Threads of a multiprocessor that search, as many as their registers allow, each one pair after another. On a CPU a
+thread has one."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -44,6 +48,7 @@ _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
+_SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
 
 
@@ -80,33 +85,63 @@ def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) ->
 
 
 @wp.func
-def _add_contact(kind: int, pair: wp.vec2i, motion: Motion, search: Search, timed: bool, stages: PairStages):
-    """Adds a pair to the contacts, if it fits, after a search that has not found it free."""
-    result = end_search(kind, motion, search)
+def _enqueue_contact(pair: wp.vec2i, stages: PairStages) -> int:
+    """Returns the index of a new contact, -1 if it does not fit."""
     slot = take_slot(stages.counts, _CONTACTS)
-    take_slot(stages.counts, _FOUND)
+    if slot >= wp.int64(stages.contacts.pairs.shape[0]):
+        return -1
+    k = wp.int32(slot)
+    stages.contacts.pairs[k] = pair
+    stages.order[k] = k
+    return k
+
+
+@wp.struct
+class _PairSearch:
+    """A search, its motion, and the minimum distance in the scale of that."""
+
+    motion: Motion
+    distance: wp.float64
+    search: Search
+
+
+@wp.func
+def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, stages: PairStages):
+    """Writes the result of a search to contact k, if that is not negative, and counts it if it is not free."""
+    result = end_search(kind, at.motion, at.search)
+    if result.status != FREE:
+        take_slot(stages.counts, _FOUND)
     if result.status == UNSURE:
         take_slot(stages.counts, _UNSURE)
-    if result.status == UNSURE or (timed and result.within_tolerance == 0):
+    if result.status == UNSURE or (timed and result.status == HIT and result.within_tolerance == 0):
         take_slot(stages.counts, _FOR_EXACT)
         take_slot(stages.counts, _TOO_WIDE)
-    contacts = stages.contacts
-    if slot < wp.int64(contacts.pairs.shape[0]):
-        k = wp.int32(slot)
-        contacts.pairs[k] = pair
+    if k >= 0:
+        contacts = stages.contacts
         contacts.status[k] = wp.int8(result.status)
         contacts.decided[k] = wp.int8(result.status)
         contacts.within_tolerance[k] = result.within_tolerance == 1
         contacts.toi[k] = result.toi
         contacts.coordinates[k] = result.coordinates
         contacts.normal[k] = result.normal
-        stages.order[k] = k
-        stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+        pair = contacts.pairs[k]
+        stages.keys[k] = stages.last_key
+        if result.status != FREE:
+            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+
+
+class _Kernels(NamedTuple):
+    """The kernels for one type of position, in the order in which they run."""
+
+    cull: wp.Kernel
+    advance: wp.Kernel
+    subdivide: wp.Kernel
+    find_closest: wp.Kernel
 
 
 @functools.cache
-def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Returns the kernels that cull, decide and find closest points, for one type of position."""
+def _kernels(dtype: type) -> _Kernels:
+    """Returns the kernels for one type of position, each in a module of its own."""
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_distances(
@@ -135,8 +170,41 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
             return
         append(pair, stages.survivors, stages.counts, _SURVIVORS)
 
+    @wp.func
+    def search_next(
+        before: _PairSearch,
+        kind: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        radius: wp.array[wp.float64],
+        # next pair
+        pairs: wp.array[wp.vec2i],
+        index: int,
+        # options
+        roundoff: wp.float64,
+        tolerance: wp.float64,
+    ) -> _PairSearch:
+        """Returns a search that has not ended as it is, otherwise one that begins with the next pair."""
+        # this return keeps Warp from selecting between two searches, which takes registers for both
+        if not before.search.ended:
+            return before
+        new = _PairSearch()
+        v = points_of_pair(kind, elements, pairs[index])
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, radius)
+        motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
+        new.motion = motion
+        new.distance = scaled
+        new.search = begin_search(motion, scaled, tolerance)
+        new.search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)
+        return new
+
     @wp.kernel(**NO_FUSED_OPERATIONS)
-    def decide_distances(
+    def advance_distances(
         first: int,
         # mesh
         x0: wp.array[dtype],
@@ -146,34 +214,53 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         roundoff: wp.float64,
         timed: bool,
         tolerance: wp.float64,
-        threads: wp.int64,
+        threads: wp.uint32,
         # in and out
         stages: PairStages,
     ):
-        filled = wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0]))
-        i = wp.int64(first + wp.tid())
-        pair = wp.vec2i()
-        motion = Motion()
-        scaled = wp.float64(0.0)
-        search = Search()
-        search.ended = True
-        # the threads of a warp go through parts together, whatever the pairs that these belong to
-        while not search.ended or i < filled:
-            if search.ended:
-                pair = stages.survivors[wp.int32(i)]
+        filled = wp.uint32(wp.min(stages.counts[_SURVIVORS], wp.int64(stages.survivors.shape[0])))
+        i = wp.uint32(first + wp.tid())
+        at = _PairSearch()
+        at.search.ended = True
+        # the threads of a warp advance together, whatever the pairs
+        while i < filled:
+            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, int(i), roundoff, tolerance)
+            at.search = advance(at.motion, at.distance, timed, at.search)
+            if at.search.ended and at.search.status != FREE:
+                k = _enqueue_contact(stages.survivors[int(i)], stages)
+                if not at.search.given_up:
+                    _decide_contact(k, kind, at, timed, stages)
+                elif k >= 0:
+                    stages.for_exact[wp.int32(take_slot(stages.counts, _SUBDIVIDED))] = k
+            if at.search.ended:
                 i += threads
-                v = points_of_pair(kind, stages.elements, pair)
-                a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-                a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-                points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-                distance = distance_of_corners(kind, v, radius)
-                motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, roundoff)
-                search = begin_search(motion, scaled, tolerance)
-                search.ended = not all_finite(a0, b0, c0, d0, a1, b1, c1, d1)
-            if not search.ended:
-                search = visit_part(kind, motion, scaled, timed, search)
-            if search.ended and search.status != FREE:
-                _add_contact(kind, pair, motion, search, timed, stages)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def subdivide_distances(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        radius: wp.array[wp.float64],
+        kind: int,
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        threads: wp.uint32,
+        # in and out
+        stages: PairStages,
+    ):
+        filled = wp.uint32(stages.counts[_SUBDIVIDED])
+        i = wp.uint32(first + wp.tid())
+        at = _PairSearch()
+        at.search.ended = True
+        while i < filled:
+            k = stages.for_exact[int(i)]
+            at = search_next(at, kind, x0, x1, stages.elements, radius, stages.contacts.pairs, k, roundoff, tolerance)
+            at.search = visit_part(kind, at.motion, at.distance, timed, at.search)
+            if at.search.ended:
+                _decide_contact(k, kind, at, timed, stages)
+                i += threads
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_closest(
@@ -199,7 +286,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
         coordinates[i] = at
         normal[i] = direction
 
-    return cull_distances, decide_distances, find_closest
+    return _Kernels(cull_distances, advance_distances, subdivide_distances, find_closest)
 
 
 def run_distance_phases(
@@ -227,23 +314,27 @@ def run_distance_phases(
         tolerance: Of the times of impact, as a share of the step.
         timer: Measures the stages.
     """
-    cull, decide, _ = _kernels(x0.dtype)
+    kernels = _kernels(x0.dtype)
     roundoff = 0.0 if method == "float" else ROUNDOFF
     with timer.stage("cull"):
         for phase, elements in phases:
             inputs = [x0, x1, radius, rings, int(phase.kind), roundoff]
             stages = phase.stages(elements)
-            launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
-    with timer.stage("classify"):
-        device = x0.device
-        for phase, elements in phases:
-            stages = phase.stages(elements)
-            entries = threads = _THREADS_OF_MULTIPROCESSOR * device.sm_count
-            if device.is_cpu:
-                entries = min(len(stages.survivors), int(phase.counts.numpy()[Count.SURVIVORS]))
-                threads = 2**31
-            inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance, threads]
-            launch_over(decide, entries, inputs=inputs, outputs=[stages], device=device, block_dim=_BLOCK)
+            launch_over_queue(kernels.cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+    device = x0.device
+    for name, kernel, count, threads_of_multiprocessor in (
+        ("classify", kernels.advance, Count.SURVIVORS, _ADVANCING),
+        ("time of impact", kernels.subdivide, Count.SUBDIVIDED, _SUBDIVIDING),
+    ):
+        with timer.stage(name):
+            for phase, elements in phases:
+                stages = phase.stages(elements)
+                entries = threads = threads_of_multiprocessor * device.sm_count
+                if device.is_cpu:
+                    entries = min(len(stages.survivors), int(phase.counts.numpy()[count]))
+                    threads = 2**31
+                inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance, threads]
+                launch_over(kernel, entries, inputs=inputs, outputs=[stages], device=device, block_dim=_BLOCK)
 
 
 def pair_distances(
@@ -302,6 +393,6 @@ def decide_distances_on_host(
     outputs = [wp.empty(len(again), dtype=wp.vec3d, device=x0.device) for _ in range(2)]
     timed_pairs = wp.array(contacts.pairs[again], dtype=wp.vec2i, device=x0.device)
     inputs = [x0, x1, elements, int(kind), timed_pairs, wp.array(toi[again], dtype=wp.float64, device=x0.device)]
-    kernel = _kernels(x0.dtype)[2]
+    kernel = _kernels(x0.dtype).find_closest
     wp.launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
     contacts.coordinates[again], contacts.normal[again] = (output.numpy() for output in outputs)

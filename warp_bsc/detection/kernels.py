@@ -50,7 +50,7 @@ class PairStages:
         contacts: Survivors that classification does not certify free.
         keys: Sorting keys of the contacts.
         order: Indices of the contacts, to be sorted by their keys.
-        for_exact: Indices of contacts for the exact stage.
+        for_exact: Indices of contacts for the exact stage, or for subdivision with a minimum distance.
         second_bits: Bits of the second element in a key.
         last_key: Key of what is no contact, greater than those of contacts.
     """

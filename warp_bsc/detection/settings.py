@@ -122,7 +122,7 @@ class Count(enum.IntEnum):
         QUEUED: Pairs enqueued for the narrow phase: candidates that no coordinate axis separates at the start and at
             the end, on the same side.
         SURVIVORS: Queued pairs that no cull decides.
-        CONTACTS: Survivors that classification does not certify free.
+        CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
         FOUND: Contacts that are not certified free when their time of impact is sought either.
         UNSURE: Found pairs that are not certified hits either.
         FOR_EXACT: Found pairs that the exact stage decides or, where times are wanted, times.
@@ -130,6 +130,7 @@ class Count(enum.IntEnum):
         TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
         TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs: left to the host.
         REFUTED: Found pairs that the exact stage decides to be free.
+        SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
     """
 
     CANDIDATES = 0
@@ -143,6 +144,7 @@ class Count(enum.IntEnum):
     TOO_WIDE_2 = 8
     TOO_WIDE_8 = 9
     REFUTED = 10
+    SUBDIVIDED = 11
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ class PairCounts:
     too_wide_2: int = 0
     too_wide_8: int = 0
     refuted: int = 0
+    subdivided: int = 0
 
     @classmethod
     def of(cls, values: np.ndarray) -> "PairCounts":

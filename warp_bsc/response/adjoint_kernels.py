@@ -1,6 +1,6 @@
-"""The small steps of a response as kernels that Warp differentiates; :mod:`.adjoint` launches their adjoints.
+"""The small steps of a response as kernels that Warp differentiates, and those that go back, see :mod:`.adjoint`.
 
-Each computes what a kernel of the forward pass changes, by the same functions.
+Each of the first computes what a kernel of the forward pass changes, by the same functions.
 """
 
 import warp as wp
@@ -12,11 +12,12 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import Impact
 from .angular_momentum import HELD, MASS, MOMENTS, Moments, acts, change_by_turn, is_held, moments, torque_of, turns
-from .bodies import body_change, sagitta
-from .buffers import Constraints, Motion, Progress, Vertices
+from .bodies import add_body_delta, body_change, sagitta
+from .buffers import PROJECTED, Constraints, Motion, Progress, SolveStatus, Vertices
 from .constraints import (
     EDGE_EDGE_CONTACT,
     EDGE_EDGE_PROXIMITY,
+    MAX_TRUNCATIONS,
     MOST_SAGITTA,
     PLANE_CONTACT,
     VERTEX_FACE_CONTACT,
@@ -35,11 +36,14 @@ from .constraints import (
 )
 from .planes import MovingPlanes, level, offset_from, signed_distance, time_of_entry
 from .projection import (
+    add_delta,
+    count_active,
     has_pushed,
     initial_velocity_multiplier,
     is_reversible,
     position_multiplier_after,
     velocity_multiplier_after,
+    with_delta,
     with_momentum,
 )
 from .proximities import closest_vector
@@ -47,17 +51,28 @@ from .step_record import NO_CONTACT, StepRecord, truncation_at
 
 __all__ = [
     "Cursor",
+    "Gradients",
     "add_moments",
     "add_torques",
-    "change_position_multipliers",
-    "change_velocity_multipliers",
+    "begin_adjoint",
+    "begin_gradients",
+    "change_multipliers",
+    "check_complete",
     "count_grazing",
-    "entry_of",
+    "enter_iteration",
+    "find_truncation_times",
+    "finish_gradients",
     "initialize_multipliers",
+    "leave_iteration",
     "make_constraints",
+    "restore_multipliers",
+    "restore_paths",
+    "restore_positions",
+    "restore_unturned",
+    "restore_velocities",
+    "set_detection_iteration",
     "torque_and_moments",
     "truncate_paths",
-    "truncation_time",
     "turn_velocities",
 ]
 
@@ -76,6 +91,8 @@ _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
+
+_KERNEL = {"enable_backward": False}
 
 
 @wp.func
@@ -114,7 +131,7 @@ def _first_entry(record: StepRecord, sweep: int) -> int:
 
 
 @wp.func
-def entry_of(record: StepRecord, sweep: int, place: int) -> int:
+def _entry_of(record: StepRecord, sweep: int, place: int) -> int:
     """Returns the entry of the constraint at a place of a sweep's active set; -1 if the set is smaller."""
     if sweep < 0:
         return -1
@@ -123,7 +140,7 @@ def entry_of(record: StepRecord, sweep: int, place: int) -> int:
 
 
 @wp.kernel
-def change_position_multipliers(
+def change_multipliers(
     # in
     motion: Motion,
     vertices: Vertices,
@@ -131,55 +148,36 @@ def change_position_multipliers(
     progress: Progress,
     record: StepRecord,
     cursor: Cursor,
-    # out
-    multiplier_changes: wp.array[wp.vec3d],
-    previous_changes: wp.array[wp.vec3d],
-    vertex_changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vectord],
-):
-    """Computes what a sweep on positions changes, see :func:`.projection.project_positions`."""
-    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
-    if entry < 0:
-        return
-    i = record.constraint[entry]
-    multiplier = position_multiplier_after(
-        motion, vertices, constraints, i, not is_reversible(constraints, progress, i)
-    )
-    previous = constraints.previous_multiplier[i]
-    new = with_momentum(multiplier, previous, record.momentum[entry])
-    change = new - constraints.position_multiplier[i]
-    multiplier_changes[i] = change
-    previous_changes[i] = multiplier - previous
-    _add_change(motion, vertices, constraints, i, change, motion.x1, vertex_changes, body_changes)
-
-
-@wp.kernel
-def change_velocity_multipliers(
-    # in
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    record: StepRecord,
-    cursor: Cursor,
     restitution: wp.array[float],
+    of_velocities: bool,
+    x: wp.array[wp.vec3],
     # out
     multiplier_changes: wp.array[wp.vec3d],
     previous_changes: wp.array[wp.vec3d],
     vertex_changes: wp.array[wp.vec3],
     body_changes: wp.array[wp.spatial_vectord],
 ):
-    """Computes what a sweep on velocities changes, see :func:`.projection.project_velocities`."""
-    entry = entry_of(record, cursor.current_sweep[0], wp.tid())
+    """Computes what a sweep on positions or ``of_velocities`` changes, whose impulses act at positions ``x``.
+
+    See :func:`.projection.project_positions` and :func:`.projection.project_velocities`.
+    """
+    entry = _entry_of(record, cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
     i = record.constraint[entry]
-    multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
+    old = constraints.position_multiplier[i]
+    multiplier = old
+    if of_velocities:
+        old = constraints.velocity_multiplier[i]
+        multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
+    else:
+        pushes_only = not is_reversible(constraints, progress, i)
+        multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
     previous = constraints.previous_multiplier[i]
-    new = with_momentum(multiplier, previous, record.momentum[entry])
-    change = new - constraints.velocity_multiplier[i]
+    change = with_momentum(multiplier, previous, record.momentum[entry]) - old
     multiplier_changes[i] = change
     previous_changes[i] = multiplier - previous
-    _add_change(motion, vertices, constraints, i, change, vertices.x1, vertex_changes, body_changes)
+    _add_change(motion, vertices, constraints, i, change, x, vertex_changes, body_changes)
 
 
 @wp.kernel
@@ -268,7 +266,7 @@ def turn_velocities(
 
 
 @wp.func
-def impact_of(
+def _impact_of(
     motion: Motion,
     vertices: Vertices,
     corners: wp.vec4i,
@@ -347,7 +345,7 @@ def make_constraints(
         if edges == 1:
             coordinates = wp.vec3d(weight[1], -weight[3], _ZERO)
         within_tolerance = constraints.within_tolerance[i]
-        impact = impact_of(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
+        impact = _impact_of(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
         weight = contact_weights(edges, impact.coordinates)
         normal = impact.normal
         separation = widened(least, progress)
@@ -366,34 +364,41 @@ def make_constraints(
     approaches[i] = approach_of(motion, vertices, corners, weight, normal, separation)
 
 
-@wp.func
-def truncation_time(
-    motion: Motion, vertices: Vertices, planes: MovingPlanes, record: StepRecord, entry: int
-) -> wp.float64:
-    """Returns the time of the contact that a path was truncated before; 0 if it was frozen."""
-    kind = record.kind[entry]
+@wp.kernel
+def find_truncation_times(
+    # in
+    motion: Motion,
+    vertices: Vertices,
+    planes: MovingPlanes,
+    record: StepRecord,
+    cursor: Cursor,
+    # out
+    times: wp.array[wp.float64],
+):
+    """Computes the times of the contacts that an iteration truncated paths before."""
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0 or record.kind[entry] == NO_CONTACT:
+        return
     corners = record.contact[entry]
-    toi = _ZERO
-    if kind == PLANE_CONTACT:
+    if record.kind[entry] == PLANE_CONTACT:
         vertex = corners[0]
         plane = corners[1]
         before, _error = signed_distance(planes.start[plane], motion.x0[vertex])
         after, _error_after = signed_distance(planes.end[plane], vertices.x1[vertex])
         lowest = level(motion, planes, plane, vertex)
-        toi = time_of_entry(before - lowest, after - lowest)
-    elif kind != NO_CONTACT:
-        impact = impact_of(
+        times[entry] = time_of_entry(before - lowest, after - lowest)
+    else:
+        impact = _impact_of(
             motion,
             vertices,
             corners,
-            kind,
+            record.kind[entry],
             record.within_tolerance[entry],
             record.toi[entry],
             record.coordinates[entry],
             record.normal[entry],
         )
-        toi = impact.toi
-    return toi
+        times[entry] = impact.toi
 
 
 @wp.kernel
@@ -401,7 +406,7 @@ def truncate_paths(
     # in
     motion: Motion,
     vertices: Vertices,
-    planes: MovingPlanes,
+    times: wp.array[wp.float64],
     record: StepRecord,
     cursor: Cursor,
     dt: wp.float64,
@@ -409,16 +414,18 @@ def truncate_paths(
     end: wp.array[wp.vec3],
     velocity: wp.array[wp.vec3],
 ):
-    """Computes the ends and velocities of truncated paths, see :func:`.kernels.truncate_vertices`."""
+    """Computes the ends and velocities of truncated paths, see :func:`.kernels.truncate_vertices`.
+
+    Paths that were frozen have time 0.
+    """
     entry = truncation_at(record, cursor.iteration[0], wp.tid())
     if entry < 0:
         return
     vertex = record.vertex[entry]
     if vertex < 0:
         return
-    toi = truncation_time(motion, vertices, planes, record, entry)
     x0 = to_double(motion.x0[vertex])
-    path = truncated_path(x0, to_double(vertices.x1[vertex]), toi)
+    path = truncated_path(x0, to_double(vertices.x1[vertex]), times[entry])
     end[entry] = to_single(x0 + path)
     velocity[entry] = to_single(path / dt)
 
@@ -432,15 +439,254 @@ def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: in
         return
     kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
     at = contacts.coordinates[i]
-    impact = impact_of(
+    impact = _impact_of(
         motion, vertices, corners, kind, contacts.within_tolerance[i], contacts.toi[i], at, contacts.normal[i]
     )
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(**_KERNEL)
 def count_grazing(motion: Motion, vertices: Vertices, vertex_face: Contacts, edge_edge: Contacts, record: StepRecord):
     """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
     i = wp.tid()
     _count_grazing(motion, vertices, vertex_face, i, record)
     _count_grazing(motion, vertices, edge_edge, i, record)
+
+
+@wp.struct
+class Gradients:
+    """Gradients with respect to positions and velocities at the cursor."""
+
+    x1: wp.array[wp.vec3]
+    velocity: wp.array[wp.vec3]
+    more_x1: wp.array[wp.vec3]  # added to x1 once everything has read it
+    more_velocity: wp.array[wp.vec3]
+    velocity_change: wp.array[wp.vec3]  # with respect to what constraints add to velocities
+
+
+@wp.kernel(**_KERNEL)
+def begin_gradients(
+    # in
+    motion: Motion,
+    status: SolveStatus,
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    # out
+    gradients: Gradients,
+    x0: wp.array[wp.vec3],
+):
+    """Initializes gradients by those of the results; where an undetected step froze everything, only that of x0."""
+    vertex = wp.tid()
+    x1 = wp.vec3()
+    velocity = wp.vec3()
+    if vertex < particle_q.shape[0]:
+        x1 = particle_q[vertex]
+        velocity = particle_qd[vertex]
+    x0[vertex] = wp.vec3()
+    if status.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
+        x0[vertex] = x1
+        x1 = wp.vec3()
+        velocity = wp.vec3()
+    gradients.x1[vertex] = x1
+    gradients.velocity[vertex] = velocity
+
+
+@wp.kernel(**_KERNEL)
+def begin_adjoint(
+    # in
+    record: StepRecord,
+    status: SolveStatus,
+    max_iterations: int,
+    complete: wp.array[int],
+    # out
+    cursor: Cursor,
+    more_sweeps: wp.array[int],
+    more_iterations: wp.array[int],
+    iteration: wp.array[int],
+):
+    """Puts the cursor behind the last sweep on velocities; of an incomplete record, nothing is read."""
+    cursor.current_sweep[0] = -1
+    if complete[0] == 0:
+        cursor.first_sweep[0] = 0
+        cursor.next_sweep[0] = -1
+        return
+    last = wp.min(status.iteration[0], max_iterations + MAX_TRUNCATIONS + 1)
+    cursor.iteration[0] = last
+    cursor.first_sweep[0] = record.sweep_offsets[last + 1]
+    cursor.next_sweep[0] = record.counts.sweeps[0] - 1
+    more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
+    more_iterations[0] = 1
+    iteration[0] = last
+
+
+@wp.kernel(**_KERNEL)
+def enter_iteration(record: StepRecord, cursor: Cursor, more_sweeps: wp.array[int]):
+    """Puts the cursor behind the last sweep on positions of its iteration."""
+    iteration = cursor.iteration[0]
+    cursor.first_sweep[0] = record.sweep_offsets[iteration]
+    cursor.next_sweep[0] = record.sweep_offsets[iteration + 1] - 1
+    more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def set_detection_iteration(cursor: Cursor, iteration: wp.array[int]):
+    """Sets the iteration to that of the detection before the cursor's iteration."""
+    iteration[0] = wp.max(cursor.iteration[0] - 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def leave_iteration(cursor: Cursor, more_iterations: wp.array[int]):
+    """Moves the cursor to the iteration before."""
+    cursor.iteration[0] = cursor.iteration[0] - 1
+    more_iterations[0] = wp.where(cursor.iteration[0] >= 0, 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def restore_multipliers(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    record: StepRecord,
+    cursor: Cursor,
+    multiplier: wp.array[wp.vec3d],
+    sums: wp.array2d[wp.int64],
+    x: wp.array[wp.vec3],
+    body_sums: wp.array2d[wp.int64],
+):
+    """Restores multipliers as they were before a sweep, and the sums of what they changed, at positions ``x``."""
+    entry = _entry_of(record, cursor.next_sweep[0], wp.tid())
+    if cursor.next_sweep[0] < cursor.first_sweep[0] or entry < 0:
+        return
+    i = record.constraint[entry]
+    old = record.multiplier[entry]
+    add_delta(motion, constraints, i, old - multiplier[i], sums)
+    if motion.bodies.of_vertex:
+        add_body_delta(motion, vertices, constraints, i, old - multiplier[i], x, body_sums)
+    multiplier[i] = old
+    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
+    count_active(motion, vertices, constraints, i)
+
+
+@wp.func
+def _step_back(vertex: int, cursor: Cursor, more_sweeps: wp.array[int]):
+    """Makes the next sweep the current one, and the one before it the next."""
+    if vertex == 0:
+        sweep = cursor.next_sweep[0]
+        exists = sweep >= cursor.first_sweep[0]
+        cursor.current_sweep[0] = wp.where(exists, sweep, -1)
+        cursor.next_sweep[0] = wp.where(exists, sweep - 1, sweep)
+        more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
+
+
+@wp.kernel(**_KERNEL)
+def restore_positions(
+    motion: Motion, vertices: Vertices, gradients: Gradients, cursor: Cursor, more_sweeps: wp.array[int]
+):
+    """Restores positions as they were before a sweep, and adds up their gradients."""
+    vertex = wp.tid()
+    _step_back(vertex, cursor, more_sweeps)
+    gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
+    gradients.more_x1[vertex] = wp.vec3()
+    if vertices.active[vertex] != 0 and motion.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def restore_unturned(motion: Motion, vertices: Vertices):
+    """Restores velocities as they were before vertices were turned."""
+    vertex = wp.tid()
+    if turns(motion, vertices, vertex):
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def restore_velocities(
+    motion: Motion, vertices: Vertices, gradients: Gradients, cursor: Cursor, more_sweeps: wp.array[int]
+):
+    """Restores velocities as they were before a sweep, and adds up their gradients."""
+    vertex = wp.tid()
+    _step_back(vertex, cursor, more_sweeps)
+    gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
+    gradients.more_velocity[vertex] = wp.vec3()
+    gradients.velocity_change[vertex] = wp.vec3()
+    if motion.inverse_mass[vertex] > 0.0 and vertices.outcome[vertex] <= PROJECTED:
+        gradients.velocity_change[vertex] = gradients.velocity[vertex]
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
+
+
+@wp.kernel(**_KERNEL)
+def restore_paths(
+    # in
+    vertices: Vertices,
+    gradients: Gradients,
+    record: StepRecord,
+    cursor: Cursor,
+    # out
+    end: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+):
+    """Restores the ends of truncated paths; the gradients of their vertices move to ``end`` and ``velocity``."""
+    entry = truncation_at(record, cursor.iteration[0], wp.tid())
+    if entry < 0:
+        return
+    vertex = record.vertex[entry]
+    if vertex < 0:
+        return
+    end[entry] = gradients.x1[vertex]
+    velocity[entry] = gradients.velocity[vertex]
+    gradients.x1[vertex] = wp.vec3()
+    gradients.velocity[vertex] = wp.vec3()
+    vertices.x1[vertex] = record.end[entry]
+
+
+@wp.kernel(**_KERNEL)
+def finish_gradients(
+    # in
+    motion: Motion,
+    gradients: Gradients,
+    x0: wp.array[wp.vec3],
+    wanted_x1: wp.array[wp.vec3],
+    wanted_velocity: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    friction: wp.array[float],
+    complete: wp.array[int],
+    # out
+    start_q: wp.array[wp.vec3],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    particle_inv_mass: wp.array[float],
+    restitution: wp.array[float],
+):
+    """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
+
+    Those of vertices of shapes remain gradients with respect to what was wanted of them.
+    """
+    particle = wp.tid()
+    missing = float(0.0)
+    if complete[0] == 0:
+        missing = wp.nan
+    x1 = gradients.x1[particle] + gradients.more_x1[particle] + wanted_x1[particle]
+    velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + wanted_velocity[particle]
+    friction[particle] = friction[particle] + missing
+    if particle == 0 and restitution:
+        restitution[0] = restitution[0] + missing
+    if particle >= particle_q.shape[0]:
+        wanted_x1[particle] = x1
+        wanted_velocity[particle] = velocity
+        return
+    if particle_inv_mass and motion.inverse_mass[particle] > 0.0:
+        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle] + missing
+    particle_q[particle] = x1 + wp.vec3(missing)
+    particle_qd[particle] = velocity + wp.vec3(missing)
+    start_q[particle] = start_q[particle] + x0[particle] + wp.vec3(missing)
+
+
+@wp.kernel(**_KERNEL)
+def check_complete(constraints: wp.array[int], record: StepRecord, capacity: int, complete: wp.array[int]):
+    """Sets ``complete`` to 1 if everything that a step did fits in its record, else to 0."""
+    counts = record.counts
+    fits = constraints[0] <= capacity and counts.dropped[0] == 0
+    fits = fits and counts.sweeps[0] <= record.sweep_ends.shape[0]
+    fits = fits and counts.entries[0] <= record.constraint.shape[0]
+    fits = fits and counts.truncations[0] <= record.vertex.shape[0]
+    complete[0] = wp.where(fits, 1, 0)

@@ -1,5 +1,6 @@
 """The part of the adjoint of a step that goes back through rigid bodies, see :mod:`.adjoint`."""
 
+import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -7,8 +8,9 @@ import warp as wp
 from .body_adjoint_kernels import (
     BodyGradients,
     add_body_moments,
-    begin_bodies,
-    finish_bodies,
+    begin_body_gradients,
+    collect_vertex_gradients,
+    finish_body_gradients,
     place_planes,
     place_shape_vertices,
     place_vertices,
@@ -19,20 +21,19 @@ from .body_adjoint_kernels import (
     restore_poses,
     restore_unturned_bodies,
     set_centres,
-    take_vertices,
     truncate_body_paths,
     turn_body_velocities,
     vertex_velocities,
 )
 from .buffers import Bodies, Motion, MovedBodies, Vertices
 
-__all__ = ["BodyAdjoint", "copied", "give_gradients", "launch_adjoint"]
+__all__ = ["BODY_MOTION_ARRAYS", "BodyAdjoint", "attach_gradients", "copy_arrays", "launch_adjoint"]
 
-_MOTION_ARRAYS = "start", "end", "velocity", "inverse_mass"
+BODY_MOTION_ARRAYS = "start", "end", "velocity", "inverse_mass"
 _OF_MODEL = {"com": "body_com", "mass": "body_mass", "inertia": "body_inertia", "inverse_inertia": "body_inv_inertia"}
 
 
-def copied(struct, into, lengths):
+def copy_arrays(struct, into, lengths):
     """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
     for name, length in lengths.items():
         array = getattr(struct, name)
@@ -43,7 +44,7 @@ def copied(struct, into, lengths):
     return into
 
 
-def give_gradients(struct, names, gradients=None):
+def attach_gradients(struct, names, gradients=None):
     """Replaces arrays of a struct by aliases with gradients, given or new ones; returns the gradients by name."""
     into = SimpleNamespace(**(gradients or {}))
     for name in names:
@@ -57,6 +58,12 @@ def give_gradients(struct, names, gradients=None):
     return into
 
 
+@functools.cache
+def _empty(struct_type):
+    """Returns a struct without arrays, in place of the gradient of one, whose arrays have gradients of their own."""
+    return struct_type()
+
+
 def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
     """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
@@ -68,7 +75,7 @@ def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
         dim,
         inputs=inputs,
         outputs=outputs,
-        adj_inputs=[value._cls() if hasattr(value, "_cls") else None for value in inputs],
+        adj_inputs=[_empty(value._cls) if hasattr(value, "_cls") else None for value in inputs],
         adj_outputs=of_outputs,
         adjoint=True,
         device=device,
@@ -81,7 +88,7 @@ class BodyAdjoint:
     Attributes:
         shift: Gradient with respect to what constraints add to the poses of bodies, Warp array of spatial_vectord.
         velocity_change: Gradient with respect to what they add to velocities, of the same kind.
-        changes: What the adjoint of a sweep takes for these changes, of the same kind.
+        changes: Stands for these changes in adjoints of sweeps, which do not read it, of the same kind.
     """
 
     def __init__(self, step, gradients, motion: Motion, of_motion, vertices: Vertices):
@@ -89,7 +96,7 @@ class BodyAdjoint:
 
         Args:
             step: The :class:`.adjoint.RecordedStep`.
-            gradients: Those with respect to vertices at the place of the cursor.
+            gradients: Those with respect to vertices at the cursor.
             motion: The motion.
             of_motion: The gradients with respect to its arrays, by name.
             vertices: The vertices.
@@ -99,13 +106,13 @@ class BodyAdjoint:
         self._device = device = step.mesh.device
         self.moves = step.moves_bodies
         count = step.mesh.model.body_count
-        bodies, names = Bodies(), _MOTION_ARRAYS[: 4 if self.moves else 2]
+        bodies, names = Bodies(), BODY_MOTION_ARRAYS[: 4 if self.moves else 2]
         self.shift = self.velocity_change = self.changes = None
         if not count:
             return
         for name in Bodies.vars if self.moves else names:
             setattr(bodies, name, getattr(step.motion.bodies, name))
-        self._of_bodies = give_gradients(bodies, names)
+        self._of_bodies = attach_gradients(bodies, names)
         of_bodies = BodyGradients()
         if self.moves:
             for name in ("shift", "velocity_change"):
@@ -119,13 +126,13 @@ class BodyAdjoint:
             sums.grad = self.shift
             self._sums = sums
             moved = step.vertices.bodies
-            mine = copied(moved, MovedBodies(), dict.fromkeys(("pose", "velocity", "delta_x", "delta_v")))
+            mine = copy_arrays(moved, MovedBodies(), dict.fromkeys(("pose", "velocity", "delta_x", "delta_v")))
             mine.outcome = moved.outcome
             mine.active = wp.zeros(count, dtype=int, device=device)
             mine.centre = wp.zeros(count, dtype=wp.vec3d, device=device)
             mine.inverse_inertia = wp.zeros(count, dtype=wp.mat33d, device=device)
             given = {"pose": of_bodies.pose, "velocity": of_bodies.velocity}
-            self._of_moved = give_gradients(mine, ("pose", "velocity", "centre", "inverse_inertia"), given)
+            self._of_moved = attach_gradients(mine, ("pose", "velocity", "centre", "inverse_inertia"), given)
             vertices.bodies = mine
             truncations = len(step.record.vertex)
             self._of_paths = [
@@ -141,7 +148,7 @@ class BodyAdjoint:
         if not self.moves:
             return
         inputs = [self._motion, self._step.status, of_poses, of_velocities]
-        self._launch(begin_bodies, [*inputs, self._of, self._of_bodies.start])
+        self._launch(begin_body_gradients, [*inputs, self._of, self._of_bodies.start])
         self._set_centres(self._vertices.bodies.pose)
         self._restore_poses()
 
@@ -158,12 +165,12 @@ class BodyAdjoint:
     def through_turn(self, totals):
         """Goes back through the turn of bodies, to the totals of worlds."""
         if self.moves:
-            self._adjoin(turn_body_velocities, [self._motion, self._vertices, totals], [self._of.velocity])
+            self._launch_adjoint(turn_body_velocities, [self._motion, self._vertices, totals], [self._of.velocity])
 
     def through_moments(self, totals):
         """Goes back through the moments of bodies."""
         if self.moves:
-            self._adjoin(add_body_moments, [self._motion, self._vertices], [totals.grad])
+            self._launch_adjoint(add_body_moments, [self._motion, self._vertices], [totals.grad])
 
     def restore_velocities(self):
         """Restores velocities of bodies and their vertices as they were before a sweep."""
@@ -171,29 +178,28 @@ class BodyAdjoint:
             self._launch(restore_body_velocities, [self._motion, self._vertices, self._of])
             self._launch_over_vertices(vertex_velocities, [self._motion, self._vertices, self._vertices.velocity])
 
-    def take_velocities(self):
+    def through_vertex_velocities(self):
         """Turns gradients with respect to velocities of vertices into those with respect to their bodies."""
         if self.moves:
-            self._take(self._gradients.velocity, self._gradients.more_velocity)
-            self._adjoin_over_vertices(vertex_velocities, [self._motion, self._vertices])
-            self._vertices.bodies.active.zero_()
+            self._collect(self._gradients.velocity, self._gradients.more_velocity)
+            self._launch_adjoint_over_vertices(vertex_velocities, [self._motion, self._vertices])
 
-    def leave_velocities(self):
+    def through_move_to_end(self):
         """Goes from changes of velocities on to those of positions, whose impulses act elsewhere."""
         if self.moves:
             self._through_centres(self._vertices.bodies.pose)
             self._set_centres(self._motion.bodies.end)
 
-    def take_positions(self):
+    def through_placement(self):
         """Turns gradients with respect to positions of vertices into those with respect to poses."""
         if self.moves:
-            self._take(self._gradients.x1, self._gradients.more_x1)
-            self._adjoin_over_vertices(place_vertices, [self._motion, self._vertices])
+            self._collect(self._gradients.x1, self._gradients.more_x1)
+            self._launch_adjoint_over_vertices(place_vertices, [self._motion, self._vertices])
 
-    def project(self):
+    def through_projection(self):
         """Turns gradients with respect to poses into those with respect to what constraints did to them."""
         if self.moves:
-            self._adjoin(project_poses, [self._motion, self._vertices, self._sums], [self._of.pose])
+            self._launch_adjoint(project_poses, [self._motion, self._vertices, self._sums], [self._of.pose])
             self._of.pose.zero_()
 
     def restore_positions(self):
@@ -202,12 +208,11 @@ class BodyAdjoint:
             self._restore_poses()
             self._place()
 
-    def take_projected_positions(self):
+    def through_projected_placement(self):
         """Turns gradients with respect to positions of vertices into those with respect to what constraints did."""
         if self.moves:
-            self._take(self._gradients.x1, self._gradients.more_x1)
-            self._adjoin_over_vertices(project_vertices, [self._motion, self._vertices, self._sums])
-            self._vertices.bodies.active.zero_()
+            self._collect(self._gradients.x1, self._gradients.more_x1)
+            self._launch_adjoint_over_vertices(project_vertices, [self._motion, self._vertices, self._sums])
 
     def restore_paths(self, cursor):
         """Restores poses as they were before paths were truncated."""
@@ -216,15 +221,13 @@ class BodyAdjoint:
             wp.launch(restore_body_paths, len(self._step.record.vertex), inputs=inputs, device=self._device)
             self._place()
 
-    def through_truncation(self, cursor, planes):
-        """Goes back through the truncation of paths."""
+    def through_truncation(self, cursor, times):
+        """Goes back through the truncation of paths, to their poses and to the times of their contacts."""
         if self.moves:
             step = self._step
-            inputs = [self._motion, self._vertices, planes, step.record, cursor, step.dt]
+            inputs = [self._motion, self._vertices, times, step.record, cursor, step.dt]
             truncations = len(step.record.vertex)
-            launch_adjoint(
-                truncate_body_paths, truncations, inputs, self._of_paths, self._of_paths, device=self._device
-            )
+            launch_adjoint(truncate_body_paths, truncations, inputs, self._of_paths, self._of_paths, self._device)
 
     def finish(self, of_planes, of_starts, of_ends, of_velocities):
         """Writes the gradients of poses and velocities at the start and as wanted at the end of the step.
@@ -237,7 +240,7 @@ class BodyAdjoint:
         of_bodies, of_motion = self._of_bodies, self._of_motion
         if self.moves:
             self._through_centres(self._motion.bodies.end)
-            self.project()
+            self.through_projection()
         shapes, model = mesh.device_shape_vertices, mesh.model
         inputs = [self._motion, shapes.body, shapes.position, model.particle_count, self._step.dt]
         outputs = [of_motion.x0, of_motion.x1, of_motion.velocity]
@@ -247,10 +250,10 @@ class BodyAdjoint:
         outputs = [of_planes.start, of_planes.end]
         launch_adjoint(place_planes, len(planes.body), inputs, outputs, outputs, self._device)
         inputs = [self._motion, self._of]
-        inputs += [getattr(of_bodies, name, None) for name in _MOTION_ARRAYS]
+        inputs += [getattr(of_bodies, name, None) for name in BODY_MOTION_ARRAYS]
         of_model = [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia]
         inputs += [self._step.complete, of_starts, of_ends, of_velocities]
-        self._launch(finish_bodies, [*inputs, *(array.grad for array in of_model)])
+        self._launch(finish_body_gradients, [*inputs, *(array.grad for array in of_model)])
 
     def _set_centres(self, poses):
         """Makes given poses those where impulses act."""
@@ -260,7 +263,7 @@ class BodyAdjoint:
     def _through_centres(self, poses):
         """Turns gradients with respect to where impulses act into those with respect to the poses given."""
         of_centres = [self._of_moved.centre, self._of_moved.inverse_inertia]
-        self._adjoin(set_centres, [self._motion, poses], of_centres)
+        self._launch_adjoint(set_centres, [self._motion, poses], of_centres)
         for of in of_centres:
             of.zero_()
 
@@ -270,8 +273,8 @@ class BodyAdjoint:
     def _place(self):
         self._launch_over_vertices(place_vertices, [self._motion, self._vertices, self._vertices.x1])
 
-    def _take(self, of_vertices, more):
-        self._launch_over_vertices(take_vertices, [self._motion, of_vertices, more, self._of])
+    def _collect(self, of_vertices, more):
+        self._launch_over_vertices(collect_vertex_gradients, [self._motion, of_vertices, more, self._of])
 
     def _launch(self, kernel, inputs):
         wp.launch(kernel, self._mesh.model.body_count, inputs=inputs, device=self._device)
@@ -279,9 +282,9 @@ class BodyAdjoint:
     def _launch_over_vertices(self, kernel, inputs):
         wp.launch(kernel, len(self._mesh.shape_vertices.body), inputs=inputs, device=self._device)
 
-    def _adjoin(self, kernel, inputs, of_outputs):
+    def _launch_adjoint(self, kernel, inputs, of_outputs):
         launch_adjoint(kernel, self._mesh.model.body_count, inputs, of_outputs, of_outputs, self._device)
 
-    def _adjoin_over_vertices(self, kernel, inputs):
+    def _launch_adjoint_over_vertices(self, kernel, inputs):
         of_outputs = [self._of.vertices]
         launch_adjoint(kernel, len(self._mesh.shape_vertices.body), inputs, of_outputs, of_outputs, device=self._device)

@@ -6,7 +6,7 @@ from the pose that was wanted, and from the sums of the changes by constraints.
 
 import warp as wp
 
-from .adjoint_kernels import Cursor, torque_and_moments, truncation_time
+from .adjoint_kernels import Cursor, torque_and_moments
 from .angular_momentum import HELD, MASS, MOMENTS, body_change_by_turn, body_moments, body_turns
 from .bodies import (
     centre_of,
@@ -22,14 +22,15 @@ from .bodies import (
 from .buffers import Motion, SolveStatus, Vertices, has_final_velocity
 from .constraints import to_double, to_single
 from .model_motion import moves_with_body, wanted_velocity
-from .planes import MovingPlanes, transformed_plane
+from .planes import transformed_plane
 from .step_record import NO_CONTACT, StepRecord, truncation_at
 
 __all__ = [
     "BodyGradients",
     "add_body_moments",
-    "begin_bodies",
-    "finish_bodies",
+    "begin_body_gradients",
+    "collect_vertex_gradients",
+    "finish_body_gradients",
     "place_planes",
     "place_shape_vertices",
     "place_vertices",
@@ -40,7 +41,6 @@ __all__ = [
     "restore_poses",
     "restore_unturned_bodies",
     "set_centres",
-    "take_vertices",
     "truncate_body_paths",
     "turn_body_velocities",
     "vertex_velocities",
@@ -53,13 +53,13 @@ _KERNEL = {"enable_backward": False}
 
 @wp.struct
 class BodyGradients:
-    """Gradients with respect to bodies, and to changes of them by constraints, at the place of the cursor."""
+    """Gradients with respect to bodies, and to changes of them by constraints, at the cursor."""
 
     pose: wp.array[wp.transform]
     velocity: wp.array[wp.spatial_vector]
     shift: wp.array[wp.spatial_vectord]  # with respect to changes of centres, and turns
     velocity_change: wp.array[wp.spatial_vectord]  # with respect to what constraints add to velocities
-    vertices: wp.array[wp.vec3]  # with respect to positions or velocities of vertices that are taken to those of bodies
+    vertices: wp.array[wp.vec3]  # with respect to positions or velocities of vertices, which become those of bodies
 
 
 @wp.func
@@ -173,7 +173,7 @@ def truncate_body_paths(
     # in
     motion: Motion,
     vertices: Vertices,
-    planes: MovingPlanes,
+    times: wp.array[wp.float64],
     record: StepRecord,
     cursor: Cursor,
     dt: wp.float64,
@@ -193,7 +193,7 @@ def truncate_body_paths(
         poses[entry] = start
         velocities[entry] = wp.spatial_vector()
     else:
-        share = share_before(truncation_time(motion, vertices, planes, record, entry))
+        share = share_before(times[entry])
         end = pose_between(motion.bodies, body, start, vertices.bodies.pose[body], share)
         poses[entry] = end
         velocities[entry] = velocity_between(motion.bodies, body, start, end, dt)
@@ -246,7 +246,7 @@ def place_planes(
 
 
 @wp.kernel(**_KERNEL)
-def begin_bodies(
+def begin_body_gradients(
     # in
     motion: Motion,
     status: SolveStatus,
@@ -306,16 +306,18 @@ def restore_poses(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_
 
 
 @wp.kernel(**_KERNEL)
-def take_vertices(motion: Motion, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3], gradients: BodyGradients):
-    """Takes the gradients with respect to vertices of bodies, which are to become those with respect to bodies."""
+def collect_vertex_gradients(
+    motion: Motion, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3], gradients: BodyGradients
+):
+    """Moves the gradients with respect to vertices of bodies to ``gradients.vertices``."""
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
-    taken = wp.vec3()
+    collected = wp.vec3()
     if body >= 0 and _is_movable(motion, body):
-        taken = of_vertices[vertex] + more[vertex]
+        collected = of_vertices[vertex] + more[vertex]
         of_vertices[vertex] = wp.vec3()
         more[vertex] = wp.vec3()
-    gradients.vertices[vertex] = taken
+    gradients.vertices[vertex] = collected
 
 
 @wp.kernel(**_KERNEL)
@@ -344,7 +346,7 @@ def restore_body_paths(
 
 
 @wp.kernel(**_KERNEL)
-def finish_bodies(
+def finish_body_gradients(
     # in
     motion: Motion,
     gradients: BodyGradients,

@@ -27,9 +27,9 @@ __all__ = [
 ]
 
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
-"""Bits of the outcome of a vertex: constraints moved it or may change its velocity, dividing planes moved it, its path
-was cut, it was left where it was, it was left there because its wanted position was not finite, it was divided from
-contacts without constraints."""
+"""Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity, dividing planes moved it,
+its path was cut, it was left where it was, it was left there because its wanted position was not finite, it was divided
+from contacts without constraints."""
 
 NEVER = wp.constant(wp.int64(2**62))
 """The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
@@ -105,7 +105,7 @@ class Vertices:
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
     first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
-    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, LOST, UNCONSTRAINED
     bodies: MovedBodies
 
 

@@ -34,25 +34,24 @@ def _find_starts(
 
 
 @wp.kernel(**_KERNEL)
-def _add_body_impulses(motion: Motion, vertices: Vertices, impulses: wp.array[wp.spatial_vector]):
-    """Adds the changes of momentum by the response, angular momentum about centres of mass [N s, N m s]."""
-    body = wp.tid()
-    if vertices.bodies.outcome[body] == 0:
-        return
-    change = vertices.bodies.velocity[body] - motion.bodies.velocity[body]
-    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
-    angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
-    impulses[body] += wp.spatial_vector(motion.bodies.mass[body] * wp.spatial_top(change), angular)
-
-
-@wp.kernel(**_KERNEL)
-def _add_particle_impulses(
-    motion: Motion, vertices: Vertices, particle_mass: wp.array[float], impulses: wp.array[wp.vec3]
+def _add_impulses(
+    # in
+    motion: Motion,
+    vertices: Vertices,
+    particle_mass: wp.array[float],
+    # in and out
+    of_particles: wp.array[wp.vec3],
+    of_bodies: wp.array[wp.spatial_vector],
 ):
-    """Adds the changes of momentum by the response [N s]."""
-    particle = wp.tid()
-    if vertices.outcome[particle] != 0:
-        impulses[particle] += particle_mass[particle] * (vertices.velocity[particle] - motion.velocity[particle])
+    """Adds the changes of momentum by the response, angular momentum about centres of mass [N s, N m s]."""
+    i = wp.tid()
+    if i < of_particles.shape[0] and vertices.outcome[i] != 0:
+        of_particles[i] += particle_mass[i] * (vertices.velocity[i] - motion.velocity[i])
+    if i < vertices.bodies.outcome.shape[0] and vertices.bodies.outcome[i] != 0:
+        change = vertices.bodies.velocity[i] - motion.bodies.velocity[i]
+        inertia = inertia_at(motion.bodies, i, vertices.bodies.pose[i])
+        angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
+        of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 
 
 @wp.kernel(**_KERNEL)
@@ -190,16 +189,12 @@ class _Coupled:
                 wp.launch(_find_starts, count, inputs=inputs, device=model.device)
         return start
 
-    def finish(self, state, motion, vertices, moves_bodies):
+    def finish(self, state, motion, vertices):
         """Notes where a step has ended, and what the response did."""
         _copy_positions(self._last, state)
-        model = self._model
-        if model.particle_count:
-            inputs = [motion, vertices, model.particle_mass, self.particle_impulses]
-            wp.launch(_add_particle_impulses, model.particle_count, inputs=inputs, device=model.device)
-        if moves_bodies:
-            inputs = [motion, vertices, self.body_impulses]
-            wp.launch(_add_body_impulses, model.body_count, inputs=inputs, device=model.device)
+        outputs = [self.particle_impulses, self.body_impulses]
+        inputs, size = [motion, vertices, self._model.particle_mass], max(map(len, outputs))
+        wp.launch(_add_impulses, size, inputs=inputs, outputs=outputs, device=self._model.device)
 
 
 def _copy_positions(to, state):

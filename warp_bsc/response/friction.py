@@ -56,7 +56,7 @@ class Friction:
         """Reads the coefficients again. Can be captured in a CUDA graph."""
         self._launch([self.vertices, self.planes])
 
-    def adjoin(self, of_vertices: wp.array[float], of_planes: wp.array[float]) -> None:
+    def backward(self, of_vertices: wp.array[float], of_planes: wp.array[float]) -> None:
         """Adds to the gradients of what coefficients are read from, given those of vertices and planes."""
         outputs = [of_vertices, of_planes]  # which stand in for the outputs: the adjoint neither reads nor writes these
         inputs = 5 * [None]

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .buffers import Motion
-from .constraints import to_double
+from .constraints import are_on_body, to_double
 from .exclusion import Connectivity
 
 __all__ = ["are_hidden"]
@@ -36,14 +36,7 @@ def are_hidden(
         normal: Unit vector from the second to the first.
         time: When, in [0, 1].
     """
-    if not motion.bodies.of_vertex:
-        return False
-    moves = bool(False)
-    for side in range(2):
-        body = motion.bodies.of_vertex[corners[3 * side]]
-        if body >= 0:
-            moves = moves or motion.bodies.inverse_mass[body] > 0.0
-    if not moves:
+    if not are_on_body(motion, corners):
         return False
     for side in range(2):
         edge = edges[side]

@@ -501,7 +501,7 @@ def record_body_truncations(
 
 @wp.kernel(**_KERNEL)
 def freeze_undetected(motion: Motion, vertices: Vertices, progress: Progress):
-    """Freezes all vertices if a detection was incomplete: positions were not finite, or a buffer overflowed."""
+    """Freezes all vertices if a detection was incomplete, because a buffer overflowed."""
     vertex = wp.tid()
     if progress.status.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = motion.x0[vertex]

@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags
 
-from .bodies import centre_of
+from .bodies import centre_of, velocity_on_body
 from .buffers import Bodies, Motion
-from .constraints import to_double, to_single
+from .constraints import to_double
 from .friction import Friction
 from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
@@ -60,9 +60,8 @@ def moves_with_body(motion: Motion, vertex: int) -> bool:
 def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
     """Returns the wanted velocity of a vertex of a body, whose wanted position is ``x1`` [m/s]."""
     body = motion.bodies.of_vertex[vertex]
-    twist = motion.bodies.velocity[body]
     arm = to_double(x1) - centre_of(motion.bodies, body, motion.bodies.end[body])
-    return to_single(to_double(wp.spatial_top(twist)) + wp.cross(to_double(wp.spatial_bottom(twist)), arm))
+    return velocity_on_body(motion.bodies.velocity[body], arm)
 
 
 @wp.kernel(enable_backward=False)

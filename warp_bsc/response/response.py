@@ -109,10 +109,10 @@ class Response:
 
     Iterations of detection and projection come first: each contact is moved apart at the end of the step, and the new
     motion is detected again, as far as it changed. Vertices that still collide after ``max_iterations`` are divided,
-    see :mod:`.dividing_planes`, and if that is not enough, frozen. So are, after one iteration, vertices in worlds
-    whose contacts are all of slow elements that nothing immovable pushes, and none of a body. This ends, because
-    vertices that stood apart and stand still do not collide. A detection whose queues are too small in a CUDA graph is
-    completed without queues, see :mod:`.queueless`.
+    see :mod:`.dividing_planes`, and if that is not enough, frozen. Worlds divide after one iteration if their contacts
+    are all of slow elements that nothing immovable pushes, and none of a body. This ends, because vertices that stood
+    apart and stand still do not collide. A detection whose queues are too small in a CUDA graph is completed without
+    queues, see :mod:`.queueless`.
 
     Bodies that can be moved are projected with the particles, each by its pose, see :mod:`.bodies`. One whose vertices
     are to be divided or frozen goes back along its path as one, and collides with what is left in the next iteration.

@@ -420,7 +420,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             else:
                 run_on_host(lambda: self._inspect(_arrays(state_out), dt), self.mesh.device)
             if self._coupled is not None:
-                self._coupled.finish(state_out, self._motion.vertices, self._response.vertices, self._moves_bodies)
+                self._coupled.finish(state_out, self._motion.vertices, self._response.vertices)
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
