@@ -91,4 +91,4 @@ class CapturedSteps:
     def _count_lost(self):
         """Returns the steps so far for which the buffers of a graph may have been too small."""
         assert self._report is not None
-        return self._report.undetected_steps + self._report.lost_gradients
+        return self._report.undetected_steps + self._report.lost_gradients + self._report.layerless_steps

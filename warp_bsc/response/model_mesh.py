@@ -160,7 +160,13 @@ class ModelMesh(CollisionMesh):
     def keep_distances(
         self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
     ) -> None:
-        """Sets the minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
+        """Sets the minimum distances of pairs, with arguments as of :meth:`min_distances`."""
+        self.distances = self.min_distances(min_distance, radius, reach=reach)
+
+    def min_distances(
+        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
+    ) -> MinDistances:
+        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 
         Args:
             min_distance: Minimum distance of all pairs [m], at least 0.
@@ -181,7 +187,7 @@ class ModelMesh(CollisionMesh):
         every[:count] += radii
         group = np.full(self.vertex_count, -1)
         group[count:] = self.shape_vertices.body + 1
-        self.distances = make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
+        return make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""

@@ -24,6 +24,7 @@ class StepTotals:
     truncated_steps: wp.array[int]
     frozen_steps: wp.array[int]
     lost_steps: wp.array[int]
+    layerless_steps: wp.array[int]  # whose contact layer pushed nothing
     grazing: wp.array[int]  # contacts whose gradients are clamped
     lost_gradients: wp.array[int]  # steps with an incomplete record
 
@@ -228,6 +229,14 @@ class SolverReport:
     def uncertified_steps(self) -> int:
         """Steps so far that were not certified."""
         return _read(self._totals.uncertified_steps)
+
+    @property
+    def layerless_steps(self) -> int:
+        """Steps so far whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
+
+        Contacts then act where they hit, and results are not continuous.
+        """
+        return _read(self._totals.layerless_steps)
 
     @property
     def undetected_steps(self) -> int:

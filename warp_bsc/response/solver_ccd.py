@@ -13,6 +13,7 @@ from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
+from .contact_layer import ContactLayer
 from .coupling import SUBSTEPS, Coupling
 from .coupling_hooks import CouplingHooks
 from .friction import Friction
@@ -211,6 +212,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         bodies: bool | None = None,
         min_distance: float | None = None,
         radius: float | np.ndarray | wp.array | None = None,
+        contact_layer: float | None = None,
         lift_speed_limit: bool = True,
         respond: bool = True,
     ):
@@ -247,6 +249,12 @@ class SolverCCD(SolverBase, CouplingHooks):
             radius: Radius of each particle [m], shape [particle_count], or one for all, such as
                 ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
                 a face is the largest one of its vertices, that of a shape 0.
+            contact_layer: Thickness of a layer around all surfaces [m], above their minimum distances, in which
+                contacts push gradually, see :mod:`.contact_layer`; what it leaves is resolved where it hits. Results
+                are then continuous in what the inner solver wants, and gradients hold across changes of the contacts.
+                It should be thicker than the longest path of a step, and thinner than half of the shortest edge, as
+                neighbours beyond the next push each other as well. Cloth rests on the layer, and should start outside
+                of it: within a few steps, it is pushed out. None: contacts act where they hit.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, near something or not, see
                 :mod:`.speed_limit`. Where its iterations are too few for the step, VBD does not hold heavy bodies, and
@@ -260,7 +268,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
                 argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
-                solver is to be differentiated.
+                solver is to be differentiated, or to have a contact layer.
         """
         self.solver = solver
         super().__init__(solver.model)
@@ -271,7 +279,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self.respond = respond
         if not respond:
             numbers = {"separation": separation, "friction": friction, "restitution": restitution, "coupling": coupling}
-            numbers |= {"bodies": bodies}
+            numbers |= {"bodies": bodies, "contact_layer": contact_layer}
             for name, value in numbers.items():
                 if value is not None:
                     raise ValueError(f"{name} has no meaning without a response: omit it, or let respond be True")
@@ -285,6 +293,10 @@ class SolverCCD(SolverBase, CouplingHooks):
             raise ValueError(f"coupling takes at least 2 substeps, or 'auto', not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
+        if contact_layer is not None and not 0.0 < contact_layer < np.inf:
+            raise ValueError(f"contact_layer must be more than 0, not {contact_layer!r}")
+        if contact_layer is not None and coupling is not None:
+            raise NotImplementedError("coupled steps have no contact layer: omit coupling, or contact_layer")
         keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
         self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
@@ -319,6 +331,17 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         lifts = self._limited is not None
         self.report = SolverReport(self._motion, self._response, self._substeps, responds=respond, lifts=lifts)
+        self._layer = self._pushed = None
+        if contact_layer is not None:
+            self._layer = ContactLayer(
+                mesh,
+                self._motion.friction,
+                thickness=float(contact_layer),
+                restitution=restitution,
+                distances=mesh.min_distances(min_distance or 0.0, radius, reach=float(contact_layer)),
+                layerless_steps=self.report._totals.layerless_steps,
+            )
+            self._layer.prepare(self._motion)
 
     def _find_moves_bodies(self, bodies):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
@@ -333,6 +356,11 @@ class SolverCCD(SolverBase, CouplingHooks):
         assert model.body_flags is not None and model.body_inv_mass is not None
         kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
         return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
+
+    @property
+    def _has_shapes_on_bodies(self):
+        """Whether a vertex or a plane moves with a body."""
+        return bool((self.mesh.shape_vertices.body >= 0).any() or (self.mesh.planes.body >= 0).any())
 
     def _coefficients(self, name, value, most, lengths):
         """Returns an argument that is a coefficient, or an array of some, as an array; checks it for the response."""
@@ -397,7 +425,8 @@ class SolverCCD(SolverBase, CouplingHooks):
 
         Raises:
             ValueError: If a tape records gradients of the response, and both states are the same.
-            NotImplementedError: If a tape records gradients of a response that keeps a minimum distance.
+            NotImplementedError: If a tape records gradients of a response that keeps a minimum distance, or of one with
+                a contact layer where shapes move with bodies.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
             NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
                 memory, such as ``SolverXPBD``.
@@ -407,6 +436,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 raise ValueError("gradients need the state at the start: step into another state")
             if self.respond and tape is not None and self.model.requires_grad and self.mesh.distances is not None:
                 raise NotImplementedError("steps that keep a distance carry no gradients: omit min_distance and radius")
+            if tape is not None and self.model.requires_grad and self._layer is not None and self._has_shapes_on_bodies:
+                raise NotImplementedError("a contact layer carries no gradients to poses of bodies: omit contact_layer")
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
@@ -446,7 +477,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         if tape is None or end.particle_q is None or not end.particle_q.requires_grad:
             run_on_host(lambda: self._resolve(end, dt), device)
             return
-        recorded = None
+        recorded = pushed = None
         arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
         if self.model.body_count:
             arrays += [state_in.body_q, end.body_q, end.body_qd]
@@ -457,9 +488,9 @@ class SolverCCD(SolverBase, CouplingHooks):
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
 
         def forward():
-            nonlocal recorded
+            nonlocal recorded, pushed
             resolution = self._resolve(end, dt, self._recorder)
-            recorded = None
+            pushed, recorded = self._pushed, None
             if device.is_capturing or self._changed(resolution.vertices):
                 recorded = RecordedStep(self._motion, resolution, self._recorder, dt)
                 inputs, outputs = [self._recorder.record.counts, recorded.complete], [self.report._totals]
@@ -468,6 +499,9 @@ class SolverCCD(SolverBase, CouplingHooks):
         def backward():
             if recorded is not None:
                 StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
+            if pushed is not None:
+                assert self._layer is not None
+                self._layer.backward(pushed, *(array.grad for array in arrays[:3]))
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
@@ -486,6 +520,9 @@ class SolverCCD(SolverBase, CouplingHooks):
             if self._reads_friction:
                 self._motion.friction.read()
             self._set_end(end, dt)
+            if self._layer is not None and end.particle_q is not None:
+                arrays = end.particle_q, end.particle_qd
+                self._pushed = self._layer.push(self._motion, *arrays, dt, record=record is not None)
             resolution = self._response.resolve(self._motion, dt, record)
             self._finish(resolution, end)
         return resolution
