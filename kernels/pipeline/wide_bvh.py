@@ -13,6 +13,8 @@ side, so that one box is compared with eight at once.
 Where there are fewer than eight, the boxes of the others are empty, which overlap nothing.
 """
 
+import functools
+
 import warp as wp
 
 
@@ -35,7 +37,7 @@ import warp as wp
 
     // the packet's own box, over all of the time, and its worlds, sorted as they are
     Floats lows[3], highs[3];
-    float low[3], high[3];
+    float low[3], high[3], lane_lows[3][8], lane_highs[3][8];
     for (int axis = 0; axis < 3; ++axis) {
         const float* at = box + 32 * axis;
         lows[axis] = at_end ? floats(at + 16) : __builtin_elementwise_min(floats(at), floats(at + 16));
@@ -46,6 +48,9 @@ import warp as wp
             low[axis] = lowest(low[axis], lows[axis][lane]);
             high[axis] = highest(high[axis], highs[axis][lane]);
         }
+        // a copy in memory: to take a lane whose number is not constant from a register stores all of it each time
+        __builtin_memcpy(lane_lows[axis], &lows[axis], sizeof(lane_lows[axis]));
+        __builtin_memcpy(lane_highs[axis], &highs[axis], sizeof(lane_highs[axis]));
     }
     int first_world = element[32], last_world = element[32];
     for (int lane = 1; lane < 8; ++lane)
@@ -91,7 +96,7 @@ import warp as wp
             const int lane = __builtin_ctz(lanes);
             Ints overlap = ints(other_element + 32) == element[32 + lane];
             for (int axis = 0; axis < 3; ++axis)
-                overlap &= (other_low[axis] <= highs[axis][lane]) & (other_high[axis] >= lows[axis][lane]);
+                overlap &= (other_low[axis] <= lane_highs[axis][lane]) & (other_high[axis] >= lane_lows[axis][lane]);
             unsigned mask = bits(overlap);
             if (!(changed >> lane & 1))
                 mask &= other_changed;
@@ -104,6 +109,8 @@ import warp as wp
                 for (int j = 0; j < other_corners; ++j)
                     shared |= ints(other_element + 8 + 8 * j) == element[8 + 8 * i + lane];
             mask &= ~bits(shared);
+            if (!mask)
+                continue;
             overlapping += __builtin_popcount(mask);
             if (!keep_separated && !at_end) {
                 Ints apart = 0;
@@ -187,3 +194,110 @@ def pair_packet(
     smaller number comes first, else that of the packet.
     """
     ...
+
+
+_FIT_SNIPPET = """
+    typedef {scalar} Four __attribute__((ext_vector_type(4)));
+    typedef {scalar} Loaded __attribute__((ext_vector_type(4), aligned(sizeof({scalar}))));
+    typedef double Doubles __attribute__((ext_vector_type(4)));
+
+    const {scalar} infinity = __builtin_inf();
+    const int* element = elements.data + 41 * (size_t)packet;
+    float* box = boxes.data + 96 * (size_t)packet;
+    float* node = nodes.data + 48 * (size_t)(packet / 8) + packet % 8;
+
+    // positions may be a view, with any stride; a fourth number is read with them where there is one
+    auto load = [&](const auto& x, int corner) -> Four {{
+        const {scalar}* from = (const {scalar}*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
+        if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof({scalar}))
+            return *(const Loaded*)from;
+        return Four{{from[0], from[1], from[2], 0}};
+    }};
+    // to single precision, to nearest: rounding and clamping keep order
+    auto rounded = [](Four x, double pad) {{
+        const Doubles largest = 3.4028234663852886e38;
+        const Doubles moved = __builtin_convertvector(x, Doubles) + pad;
+        const Doubles clamped = __builtin_elementwise_max(__builtin_elementwise_min(moved, largest), -largest);
+        return __builtin_convertvector(clamped, float __attribute__((ext_vector_type(4))));
+    }};
+
+    float rows[12][8];
+    for (int row = 0; row < 12; ++row)
+        for (int lane = 0; lane < 8; ++lane)
+            rows[row][lane] = row % 2 ? -__builtin_inff() : __builtin_inff();
+    unsigned changed_lanes = 0;
+    for (int lane = 0; lane < count; ++lane) {{
+        Four low0 = infinity, high0 = -infinity, low1 = infinity, high1 = -infinity;
+        auto finite = low0 == low0;
+        double pad = 0.0;
+        bool is_changed = !changed.data;
+        for (int i = 0; i < corners; ++i) {{
+            const int corner = element[8 + 8 * i + lane];
+            const Four start = load(x0, corner), end = load(x1, corner);
+            finite &= (__builtin_elementwise_abs(start) < infinity) & (__builtin_elementwise_abs(end) < infinity);
+            low0 = __builtin_elementwise_min(low0, start);
+            high0 = __builtin_elementwise_max(high0, start);
+            low1 = __builtin_elementwise_min(low1, end);
+            high1 = __builtin_elementwise_max(high1, end);
+            if (padding.data)
+                pad = padding.data[corner] > pad ? padding.data[corner] : pad;
+            if (changed.data)
+                is_changed |= changed.data[corner] != 0;
+        }}
+        changed_lanes |= (unsigned)is_changed << lane;
+        if (!(finite[0] && finite[1] && finite[2]))
+            continue;  // an empty box overlaps none
+        const auto a = rounded(low0, -pad), b = rounded(high0, pad), c = rounded(low1, -pad), d = rounded(high1, pad);
+        for (int axis = 0; axis < 3; ++axis) {{
+            rows[4 * axis][lane] = a[axis];
+            rows[4 * axis + 1][lane] = b[axis];
+            rows[4 * axis + 2][lane] = c[axis];
+            rows[4 * axis + 3][lane] = d[axis];
+        }}
+    }}
+    for (int axis = 0; axis < 3; ++axis) {{
+        float low = __builtin_inff(), high = -__builtin_inff();
+        for (int lane = 0; lane < 8; ++lane)
+            for (int row = 4 * axis; row < 4 * axis + 4; row += 2) {{
+                low = rows[row][lane] < low ? rows[row][lane] : low;
+                high = rows[row + 1][lane] > high ? rows[row + 1][lane] : high;
+            }}
+        node[16 * axis] = low;
+        node[16 * axis + 8] = high;
+    }}
+    __builtin_memcpy(box, rows, sizeof(rows));
+    elements.data[41 * (size_t)packet + 40] = changed_lanes;
+"""
+
+
+@functools.cache
+def fit_packet_of(dtype: type) -> wp.Function:
+    """Returns the function that fits the boxes of a packet to a motion, for one type of position.
+
+    Args:
+        dtype: Type of a position, vec3 or vec3d.
+
+    Returns:
+        Device function for the CPU. It takes the packet, the number of its elements, the positions at both ends, the
+        number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach beyond
+        each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which elements
+        have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an element with
+        a position that is not finite is empty. No index is checked.
+    """
+    snippet = _FIT_SNIPPET.format(scalar="float" if dtype is wp.vec3 else "double")
+
+    @wp.func_native(snippet)
+    def fit_packet(
+        packet: int,
+        count: int,
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        corners: int,
+        changed: wp.array[int],
+        padding: wp.array[wp.float64],
+        elements: wp.array[int],
+        boxes: wp.array[wp.float32],
+        nodes: wp.array[wp.float32],
+    ): ...
+
+    return fit_packet

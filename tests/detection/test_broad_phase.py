@@ -9,7 +9,7 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy, traversal_kernel
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd, hilbert_transpose
 from warp_bsc.detection.settings import Count
 from warp_bsc.kernels.pipeline.hierarchy import count_places
 
@@ -235,3 +235,21 @@ def test_elements_without_finite_positions_have_no_pairs(broad_phase, dtype, at_
         left = [(a, b) for a, b in expected if not (moves and (first[a] or second[b]))]
         assert pairs == left
         assert left and (len(left) < len(expected) or not moves)
+
+
+@wp.kernel
+def transpose_cells(cells: wp.array[wp.vec3i], places: wp.array[wp.vec3i]):
+    places[wp.tid()] = hilbert_transpose(cells[wp.tid()])
+
+
+@pytest.mark.parametrize("corner", [0, 1008])
+def test_a_hilbert_curve_goes_from_each_cell_to_one_beside_it(corner, device):
+    """The curve passes all 4,096 cells of a cube of its grid before it leaves the cube."""
+    cells = np.stack(np.indices((16, 16, 16)), axis=-1).reshape(-1, 3) + corner
+    places = wp.empty(len(cells), dtype=wp.vec3i, device=device)
+    wp.launch(transpose_cells, len(cells), [wp.array(cells, dtype=wp.vec3i, device=device), places], device=device)
+    bits = (places.numpy()[:, None] >> np.arange(9, -1, -1)[:, None]) & 1  # of each number in turn, the highest first
+    codes = bits.reshape(-1, 30) @ (1 << np.arange(29, -1, -1))
+    order = np.argsort(codes)
+    np.testing.assert_array_equal(codes[order], codes.min() + np.arange(len(cells)))
+    assert (np.abs(np.diff(cells[order], axis=0)).sum(axis=1) == 1).all()

@@ -1,5 +1,6 @@
 """Reading ahead and writing behind: order, one item each, errors at their turn."""
 
+import contextvars
 import threading
 
 import pytest
@@ -31,6 +32,18 @@ def test_an_error_comes_when_it_is_that_items_turn():
     with pytest.raises(ValueError, match="broken"):
         next(ahead)
     assert list(read_ahead([])) == []
+
+
+def test_items_are_made_in_the_context_of_their_reader():
+    """Launches of a detection in another thread keep to the cores that are given to this one."""
+    variable = contextvars.ContextVar("variable", default=0)
+    variable.set(7)
+
+    def items():
+        for _ in range(2):
+            yield variable.get()
+
+    assert list(read_ahead(read_ahead(items()))) == [7, 7]
 
 
 def test_items_are_written_in_order_in_another_thread():

@@ -77,3 +77,13 @@ def test_a_mesh_inside_another_is_a_warning(tmp_path):
     (error,) = validator.Validate(stage)
     assert (error.GetName(), error.GetType()) == ("Inside", UsdValidation.ValidationErrorType.Warn)
     assert error.GetMessage() == "/World/Inside is inside /World/Case from time 0 to 0"
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["import warp_bsc.replay.usd_validation as rules", "from warp_bsc.replay import usd_validation as rules"],
+)
+def test_the_module_is_imported_although_a_function_hides_its_package(statement):
+    program = f"{statement}; import warp_bsc; assert callable(warp_bsc.replay); print(rules.NAME)"
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert printed.stdout.strip() == rules.NAME

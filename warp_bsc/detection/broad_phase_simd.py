@@ -1,17 +1,17 @@
 """The broad phase on the CPU: a wide BVH of packets of eight boxes, compared by SIMD instructions.
 
-The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are sorted along a Morton curve of a grid
-with 2^10 cells an axis, world by world.
+The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are sorted along a Hilbert curve of a grid
+with 2^10 cells an axis, world by world. Along a Morton curve, packets are larger, and a third more of them overlap.
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import lowered, raised, rounded
-from ..kernels.pipeline.wide_bvh import pair_packet
+from ..kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 from .launch import launch_over
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count
@@ -19,7 +19,7 @@ from .settings import NO_GRADIENTS, UNLIMITED, Count
 __all__ = ["BroadPhaseSimd"]
 
 _CODE_BITS = 10
-"""Bits of a Morton code an axis."""
+"""Bits of a Hilbert code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LOOSE = 1.5
@@ -27,12 +27,35 @@ _LOOSE = 1.5
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
-@functools.cache
-def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that encode elements and fill packets, for one type of position, with or without a padding.
+@wp.func
+def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
+    """Returns the place of a cell along a Hilbert curve: its bits are those of the three numbers, taken in turns.
 
-    Without one, code for it is not compiled, as ``padded`` is a constant of the kernel.
+    J. Skilling, Programming the Hilbert Curve, AIP Conference Proceedings 707, 2004, doi:10.1063/1.1751381.
     """
+    for level in range(_CODE_BITS - 1):
+        bit = _CODE_BITS - 1 - level
+        below = (1 << bit) - 1
+        for axis in range(3):
+            if (cells[axis] >> bit) & 1 == 1:
+                cells[0] = cells[0] ^ below
+            else:
+                exchanged = (cells[0] ^ cells[axis]) & below
+                cells[0] = cells[0] ^ exchanged
+                cells[axis] = cells[axis] ^ exchanged
+    cells[1] = cells[1] ^ cells[0]
+    cells[2] = cells[2] ^ cells[1]
+    turned = int(0)
+    for bit in range(1, _CODE_BITS):
+        if (cells[2] >> bit) & 1 == 1:
+            turned = turned ^ ((1 << bit) - 1)
+    return wp.vec3i(cells[0] ^ turned, cells[1] ^ turned, cells[2] ^ turned)
+
+
+@functools.cache
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that encode elements and fit packets, for one type of position."""
+    fit_packet = fit_packet_of(dtype)
 
     @wp.kernel(**NO_GRADIENTS)
     def encode(
@@ -48,7 +71,7 @@ def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
         codes: wp.array[wp.int64],
         order: wp.array[int],
     ):
-        """Writes for each element its world and the Morton code of its first corner halfway, as one number to sort."""
+        """Writes for each element its world and the Hilbert code of its first corner halfway, as one number to sort."""
         i = first + wp.tid()
         vertex = corners[i, 0]
         code = wp.int64(worlds[i])
@@ -56,6 +79,7 @@ def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
         for axis in range(3):
             x = wp.float64(0.5) * (wp.float64(x0[vertex][axis]) + wp.float64(x1[vertex][axis]))
             cells[axis] = wp.int32(wp.clamp((x - low[axis]) * scale[axis], wp.float64(0.0), _LARGEST_CELL))
+        cells = hilbert_transpose(cells)
         for bit in range(_CODE_BITS):
             for axis in range(3):
                 code = (code << wp.int64(1)) | wp.int64((cells[axis] >> (_CODE_BITS - 1 - bit)) & 1)
@@ -63,80 +87,52 @@ def _kernels(dtype: type, padded: bool) -> tuple[wp.Kernel, wp.Kernel]:
         order[i] = i
 
     @wp.kernel(**NO_GRADIENTS)
-    def fill_packets(
+    def fit_packets(
         first: int,
         # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        corners: wp.array2d[int],
-        numbers: wp.array[int],
-        worlds: wp.array[int],
-        order: wp.array[int],
+        corners: int,
+        count: int,
         changed: wp.array[int],
         padding: wp.array[wp.float64],
+        # in and out
+        elements: wp.array[int],
         # out
-        boxes: wp.array3d[wp.float32],
-        elements: wp.array2d[int],
-        nodes: wp.array3d[wp.float32],
-        node_worlds: wp.array3d[int],
+        boxes: wp.array[wp.float32],
+        nodes: wp.array[wp.float32],
     ):
-        """Writes the boxes and the elements of each packet, and its entry in its node."""
+        """Writes the boxes of each packet, and its entry in its node."""
         packet = first + wp.tid()
-        count = wp.min(8, corners.shape[0] - 8 * packet)
-        low = wp.vec3(wp.inf)
-        high = wp.vec3(-wp.inf)
-        changed_lanes = int(0)
-        for lane in range(count):
-            i = order[8 * packet + lane]
-            low0 = wp.vec3(wp.inf)
-            high0 = wp.vec3(-wp.inf)
-            low1 = wp.vec3(wp.inf)
-            high1 = wp.vec3(-wp.inf)
-            finite = bool(True)
-            pad = wp.float64(0.0)
-            if wp.static(padded):
-                for corner in range(corners.shape[1]):
-                    pad = wp.max(pad, padding[corners[i, corner]])
-            elements[packet, lane] = numbers[i]
-            elements[packet, 32 + lane] = worlds[i]
-            for corner in range(corners.shape[1]):
-                vertex = corners[i, corner]
-                elements[packet, 8 + 8 * corner + lane] = vertex
-                if not changed or changed[vertex] != 0:
-                    changed_lanes = changed_lanes | (1 << lane)
-                finite = finite and wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
-                if wp.static(padded):
-                    low0 = wp.min(low0, lowered(x0[vertex], pad))
-                    high0 = wp.max(high0, raised(x0[vertex], pad))
-                    low1 = wp.min(low1, lowered(x1[vertex], pad))
-                    high1 = wp.max(high1, raised(x1[vertex], pad))
-                else:
-                    start = rounded(x0[vertex])
-                    end = rounded(x1[vertex])
-                    low0 = wp.min(low0, start)
-                    high0 = wp.max(high0, start)
-                    low1 = wp.min(low1, end)
-                    high1 = wp.max(high1, end)
-            if not finite:  # an empty box overlaps none
-                low0 = wp.vec3(wp.inf)
-                high0 = wp.vec3(-wp.inf)
-                low1 = wp.vec3(wp.inf)
-                high1 = wp.vec3(-wp.inf)
-            for axis in range(3):
-                boxes[packet, 4 * axis, lane] = low0[axis]
-                boxes[packet, 4 * axis + 1, lane] = high0[axis]
-                boxes[packet, 4 * axis + 2, lane] = low1[axis]
-                boxes[packet, 4 * axis + 3, lane] = high1[axis]
-            low = wp.min(low, wp.min(low0, low1))
-            high = wp.max(high, wp.max(high0, high1))
-        elements[packet, 40] = changed_lanes
-        for axis in range(3):
-            nodes[packet / 8, 2 * axis, packet % 8] = low[axis]
-            nodes[packet / 8, 2 * axis + 1, packet % 8] = high[axis]
-        node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
-        node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
+        lanes = wp.min(8, count - 8 * packet)
+        fit_packet(packet, lanes, x0, x1, corners, changed, padding, elements, boxes, nodes)
 
-    return encode, fill_packets
+    return encode, fit_packets
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _fill_packets(
+    first: int,
+    # in
+    corners: wp.array2d[int],
+    numbers: wp.array[int],
+    worlds: wp.array[int],
+    order: wp.array[int],
+    # out
+    elements: wp.array2d[int],
+    node_worlds: wp.array3d[int],
+):
+    """Writes the elements of each packet in their order, and its worlds in its node."""
+    packet = first + wp.tid()
+    count = wp.min(8, corners.shape[0] - 8 * packet)
+    for lane in range(count):
+        i = order[8 * packet + lane]
+        elements[packet, lane] = numbers[i]
+        elements[packet, 32 + lane] = worlds[i]
+        for corner in range(corners.shape[1]):
+            elements[packet, 8 + 8 * corner + lane] = corners[i, corner]
+    node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
+    node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -183,6 +179,36 @@ def _pair_packets(
         _QUEUED,
         pairs,
     )
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _join_nodes(
+    first: int,
+    # in
+    start: int,
+    above: int,
+    # in and out
+    nodes: wp.array3d[wp.float32],
+    node_worlds: wp.array3d[int],
+):
+    """Writes the box and the worlds of each node of a level to the level above, given where both levels start."""
+    i = first + wp.tid()
+    node = start + i
+    parent = above + i / 8
+    lane = i % 8
+    for axis in range(3):
+        low = wp.float32(wp.inf)
+        high = wp.float32(-wp.inf)
+        for child in range(8):
+            low = wp.min(low, nodes[node, 2 * axis, child])
+            high = wp.max(high, nodes[node, 2 * axis + 1, child])
+        nodes[parent, 2 * axis, lane] = low
+        nodes[parent, 2 * axis + 1, lane] = high
+    last = int(-1)
+    for child in range(8):
+        last = wp.max(last, node_worlds[node, 1, child])
+    node_worlds[parent, 0, lane] = node_worlds[node, 0, 0]
+    node_worlds[parent, 1, lane] = last
 
 
 class _Tree:
@@ -232,7 +258,7 @@ class _Tree:
         return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:
-        """Sorts the elements along a Morton curve of a motion's grid.
+        """Sorts the elements along a Hilbert curve of a motion's grid.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
@@ -240,11 +266,13 @@ class _Tree:
             low: Lowest corner of the grid, float64, shape [3].
             scale: Cells of the grid per unit of length along each axis, float64, shape [3].
         """
-        encode, _ = _kernels(x0.dtype, self._padding is not None)
+        encode, _ = _kernels(x0.dtype)
         n, device = len(self._corners), self._corners.device
         inputs = [x0, x1, self._corners, self._worlds, wp.vec3d(low), wp.vec3d(scale)]
         launch_over(encode, n, inputs=inputs, outputs=[self._codes, self._order], device=device, chunk=16384)
         wp.utils.radix_sort_pairs(self._codes, self._order, n)
+        inputs, outputs = [self._corners, self._numbers, self._worlds, self._order], [self._elements, self._node_worlds]
+        launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         self._sorted_size = 0.0
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
@@ -255,21 +283,19 @@ class _Tree:
             x1: Positions at the end, of the same type.
             changed: Nonzero for each changed vertex, array of int; None for all.
         """
-        _, fill_packets = _kernels(x0.dtype, self._padding is not None)
-        inputs = [x0, x1, self._corners, self._numbers, self._worlds, self._order, changed, self._padding]
-        outputs = [self._boxes, self._elements, self._nodes, self._node_worlds]
+        _, fit_packets = _kernels(x0.dtype)
+        inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]
+        outputs = [self._elements.flatten(), self._boxes.flatten(), self._nodes.flatten()]
         device = self._corners.device
-        launch_over(fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
-        nodes, worlds, starts = self._nodes.numpy(), self._node_worlds.numpy(), self._level_starts.numpy()
+        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
+        nodes, starts = self._nodes.numpy(), self._level_starts.numpy().tolist()
         with np.errstate(over="ignore"):
             sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
         self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
-        for start, end, above in zip(starts, starts[1:], starts[2:], strict=False):
-            _join(nodes[start:end, 0::2].min(axis=2), nodes[end:above, 0::2])
-            _join(nodes[start:end, 1::2].max(axis=2), nodes[end:above, 1::2])
-            _join(worlds[start:end, :1, 0], worlds[end:above, :1])
-            _join(worlds[start:end, 1:].max(axis=2), worlds[end:above, 1:])
+        for start, above in itertools.pairwise(starts[:-1]):
+            inputs, outputs = [start, above], [self._nodes, self._node_worlds]
+            launch_over(_join_nodes, above - start, inputs=inputs, outputs=outputs, device=device, chunk=2048)
 
     def pair(
         self,
@@ -312,14 +338,6 @@ class _Tree:
             counts,
         ]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
-
-
-def _join(children: np.ndarray, parents: np.ndarray) -> None:
-    """Writes values of children, shape [n, m], to the lanes of their parents, shape [ceil(n / 8), m, 8]."""
-    whole = len(children) // 8
-    parents[:whole] = children[: 8 * whole].reshape(whole, 8, children.shape[1]).transpose(0, 2, 1)
-    if 8 * whole < len(children):
-        parents[whole, :, : len(children) - 8 * whole] = children[8 * whole :].T
 
 
 class BroadPhaseSimd:

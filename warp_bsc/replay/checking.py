@@ -1,8 +1,12 @@
-"""Checks the intervals of a scene one after another, in one process, holding one at a time."""
+"""Checks the intervals of a scene one after another, in one process, a few at a time.
+
+One interval is read while the one before is detected, and on a CPU the one before that is named.
+"""
 
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -11,7 +15,8 @@ from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
-from ..detection.proximities import ProximityFinder
+from ..detection.proximities import Proximities, ProximityFinder
+from ..detection.start import is_cpu
 from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment
@@ -24,6 +29,8 @@ from .threads import read_ahead
 from .validation import validate
 
 __all__ = ["Checks", "IntervalChecker"]
+
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True)
@@ -55,10 +62,10 @@ class IntervalChecker:
         self.scene = scene
         self._checks = checks
         self._worker = worker
-        self._of_segment: _SegmentChecker | None = None
+        self._of_segment: tuple[_SegmentDetector, _SegmentNamer] | None = None
 
     def check(self, first: int, stop: int) -> Iterator[IntervalResult]:
-        """Finds the collisions in some intervals, in order. A thread reads the next one meanwhile.
+        """Finds the collisions in some intervals, in order. Threads read, and detect on a CPU, the next ones meanwhile.
 
         Args:
             first: Number of the first interval.
@@ -67,16 +74,20 @@ class IntervalChecker:
         Raises:
             ValueError: If the positions at some time are broken, or there is no such method.
         """
-        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
+        detections = self._detect(first, stop)
+        if is_cpu(self._checks.device):
+            detections = read_ahead(detections)
+        for work, namer, detection in detections:
             started = time.perf_counter()
-            checker = self._at(interval)
-            result = checker.check(interval)
-            yield replace(result, work=Work(self._worker, checker.device, reading, time.perf_counter() - started))
+            result = namer.name(detection)
+            yield replace(result, work=replace(work, checking=work.checking + time.perf_counter() - started))
 
     def selection_without_initial(self) -> Selection:
         """Returns the selection that also ignores what crosses, and that something is inside, at the first time."""
         interval = self.scene.interval(0)
-        found = summarize_intersections(self._at(interval).find(interval.x0, interval.start))
+        detector, namer = self._at(interval)
+        found = detector.find_intersections(interval.x0, interval.start)
+        found = summarize_intersections(namer.name_intersections(found, interval.x0, interval.start))
         crossing = {(min(names), max(names)) for names, (crossings, _) in found.mesh_pairs.items() if crossings}
         selection = self._checks.selection
         return replace(
@@ -85,77 +96,176 @@ class IntervalChecker:
             ignored_inside=selection.ignored_inside | found.inside.keys(),
         )
 
-    def _at(self, interval: Interval) -> "_SegmentChecker":
-        if self._of_segment is None or interval.segment is not self._of_segment.segment:
+    def _detect(self, first: int, stop: int) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
+        """Yields what is detected in some intervals, and what names it, with the work until then."""
+        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
+            started = time.perf_counter()
+            detector, namer = self._at(interval)
+            detection = detector.detect(interval)
+            yield Work(self._worker, detector.device, reading, time.perf_counter() - started), namer, detection
+
+    def _at(self, interval: Interval) -> tuple["_SegmentDetector", "_SegmentNamer"]:
+        if self._of_segment is None or interval.segment is not self._of_segment[1].segment:
             self._of_segment = None  # before the next is made, to free its memory
-            self._of_segment = _SegmentChecker(interval.segment, self.scene.is_still, self._checks)
+            detector = _SegmentDetector(interval.segment, self.scene.is_still, self._checks)
+            self._of_segment = detector, _SegmentNamer(interval.segment, detector, self._checks)
         return self._of_segment
 
 
-class _SegmentChecker:
-    """Checks the intervals of one segment."""
+@dataclass(frozen=True)
+class _Detection:
+    """What is detected in an interval.
+
+    Attributes:
+        interval: The interval.
+        collisions: Collisions of meshes.
+        of_strands: Collisions of curves and points; None without any.
+        intersections: Intersections at the start and at the end; None if they are not looked for.
+        proximities: Proximities at the start and at the end; None if they are not looked for.
+        detector: The detector of the collisions of meshes, if the exact checker is to decide some again.
+    """
+
+    interval: Interval
+    collisions: Collisions
+    of_strands: Collisions | None
+    intersections: tuple[Intersections, Intersections] | None
+    proximities: tuple[Proximities, Proximities] | None
+    detector: CollisionDetector | None
+
+
+@dataclass(frozen=True)
+class _At(Generic[_Found]):
+    """What has been found at a time, for the interval that starts there."""
+
+    time: float
+    x: np.ndarray
+    found: _Found
+
+    def is_at(self, x: np.ndarray, time: float) -> bool:
+        """Whether these are the time and the positions."""
+        return self.time == time and (self.x is x or np.array_equal(self.x, x))
+
+
+class _SegmentDetector:
+    """Detects collisions, intersections and proximities in the intervals of one segment.
+
+    Attributes:
+        mesh: The segment's meshes.
+        strands: What detects its curves and points; None without any.
+    """
 
     def __init__(self, segment: Segment, is_still: bool, checks: Checks):
-        self.segment = segment
         self._is_still = is_still
-        self._checks = checks
-        self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
-        self._detector = CollisionDetector(self._mesh, method=checks.method)
-        self._strands = _StrandChecker(segment, checks) if segment.has_strands else None
-        self._finder = self._containment = None
-        if checks.intersections:
-            self._finder = self._detector.intersection_finder()
-            if self._strands:
-                self._containment = ContainmentFinder(self._strands.mesh, self._strands.bodies)
-            else:
-                self._containment = ContainmentFinder(self._mesh, segment.face_meshes)
-        self._last: SceneIntersections | None = None  # those found last
+        self._is_validated = checks.validate_most != 0
+        self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
+        self._detector = CollisionDetector(self.mesh, method=checks.method)
+        self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
+        self._finder = self._detector.intersection_finder() if checks.intersections else None
+        self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
         distance = checks.min_distance
-        self._proximity_finder = None if distance is None else ProximityFinder(self._mesh, distance)
-        self._last_near: tuple[np.ndarray, SceneProximities] | None = None  # those found last, and where
+        self._proximity_finder = None if distance is None else ProximityFinder(self.mesh, distance)
+        self._proximities: _At[Proximities] | None = None
 
     @property
     def device(self) -> str:
         """Name of the Warp device."""
-        return self._mesh.device.alias
+        return self.mesh.device.alias
 
-    def check(self, interval: Interval) -> IntervalResult:
-        """Returns the collisions of an interval."""
-        detector, most = self._detector, self._checks.validate_most
-        start = self.find(interval.x0, interval.start) if self._finder else None
+    def detect(self, interval: Interval) -> _Detection:
+        """Returns what is detected in an interval."""
+        detector = self._detector
+        start = self.find_intersections(interval.x0, interval.start) if self._finder else None
         if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
-            nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self._mesh.device)
+            nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)
         assert isinstance(collisions, Collisions)  # nothing is captured here
-        strands = of_strands = None
-        if self._strands and not self._is_still:
-            strands, of_strands = self._strands, self._strands.detect(interval)
+        of_strands = self.strands.detect(interval) if self.strands and not self._is_still else None
         intersections = None
-        if start is not None:
-            intersections = start, self.find(interval.x1, interval.end, is_end=not self._is_still)
+        if start:
+            motion = None if self._is_still else collisions
+            intersections = start, self.find_intersections(interval.x1, interval.end, motion)
         proximities = None
         if self._proximity_finder:
             near = self._find_near(interval.x0, interval.start)
             proximities = near, self._find_near(interval.x1, interval.end)
-        contacts = find_contacts(interval, self._mesh, collisions, self._checks.selection)
+        return _Detection(
+            interval, collisions, of_strands, intersections, proximities, detector if self._is_validated else None
+        )
+
+    def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
+        """Returns the intersections at a time, those found last if these are the ones.
+
+        Args:
+            x: Positions at that time, shape [vertex_count, 3].
+            time: Time code.
+            collisions: Those of the motion that has just been detected, from the positions of the intersections found
+                last to these; None if there is none.
+        """
+        last = self._intersections
+        if last is None or not last.is_at(x, time):
+            assert self._finder
+            if last and collisions:
+                of_meshes = self._finder.find_at_end(x, last.found[0], collisions)
+            else:
+                of_meshes = self._finder.find(x)
+            found = of_meshes
+            if self.strands:
+                found = self.strands.with_intersections(of_meshes, x, is_end=collisions is not None)
+            self._intersections = last = _At(time, x, (of_meshes, found))
+        return last.found[1]
+
+    def _find_near(self, x: np.ndarray, time: float) -> Proximities:
+        """Returns the proximities at a time, those found last if these are the ones."""
+        if self._proximities is None or not self._proximities.is_at(x, time):
+            assert self._proximity_finder
+            self._proximities = _At(time, x, self._proximity_finder.find(x))
+        return self._proximities.found
+
+
+class _SegmentNamer:
+    """Names what is detected in the intervals of one segment, on the host."""
+
+    def __init__(self, segment: Segment, detector: _SegmentDetector, checks: Checks):
+        self.segment = segment
+        self._checks = checks
+        self._mesh = detector.mesh
+        self._strand_mesh = detector.strands.mesh if detector.strands else None
+        bodies = detector.strands.bodies if detector.strands else segment.face_meshes
+        self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies) if checks.intersections else None
+        self._intersections: tuple[Intersections, SceneIntersections] | None = None  # those named last
+        self._proximities: tuple[Proximities, SceneProximities] | None = None
+
+    def name(self, detection: _Detection) -> IntervalResult:
+        """Returns the result of an interval."""
+        interval, collisions, selection = detection.interval, detection.collisions, self._checks.selection
+        intersections = proximities = None
+        if detection.intersections:
+            start, end = detection.intersections
+            named = self.name_intersections(start, interval.x0, interval.start)
+            intersections = named, self.name_intersections(end, interval.x1, interval.end)
+        if detection.proximities:
+            start, end = detection.proximities
+            proximities = self._name_near(start, interval.start), self._name_near(end, interval.end)
+        contacts = find_contacts(interval, self._mesh, collisions, selection)
         certified, stats = collisions.certified, collisions.stats
-        if strands and of_strands:
-            more = find_strand_contacts(interval, strands.mesh, of_strands, self._checks.selection)
-            contacts, stats = join_contacts(contacts, more), add_stats(stats, of_strands.stats)
-            certified &= of_strands.certified
+        if detection.of_strands:
+            assert self._strand_mesh
+            more = find_strand_contacts(interval, self._strand_mesh, detection.of_strands, selection)
+            contacts, stats = join_contacts(contacts, more), add_stats(stats, detection.of_strands.stats)
+            certified &= detection.of_strands.certified
         if intersections:
             contacts = compare_contacts(contacts, *intersections)
         validation = None
-        if most != 0:
+        if detection.detector:
             validation = validate(
-                detector,
+                detection.detector,
                 collisions,
                 interval.x0,
                 interval.x1,
-                most=most,
+                most=self._checks.validate_most,
                 seed=interval.index,
                 counted=contacts.counted,
             )
@@ -169,41 +279,36 @@ class _SegmentChecker:
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
 
-    def find(self, x: np.ndarray, time: float, *, is_end: bool = False) -> SceneIntersections:
-        """Returns the intersections at a time, those found last if these are the ones.
+    def name_intersections(self, found: Intersections, x: np.ndarray, time: float) -> SceneIntersections:
+        """Returns intersections with what is inside meshes at the same time, those named last if these are the ones.
 
         Args:
+            found: The intersections.
             x: Positions at that time, shape [vertex_count, 3].
             time: Time code.
-            is_end: Whether a motion that ends there has just been detected.
         """
-        last = self._last
-        if last is None or last.time != time or not (last.x is x or np.array_equal(last.x, x)):
-            assert self._finder and self._containment
+        if self._intersections is None or self._intersections[0] is not found:
+            assert self._containment
             selection, meshes = self._checks.selection, self.segment.meshes
-            found, mesh = self._finder.find(x, is_end=is_end), self._mesh
-            if self._strands:
-                found, mesh = self._strands.with_intersections(found, x, is_end=is_end), self._strands.mesh
 
             def are_wanted(pairs: np.ndarray) -> np.ndarray:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
                 return selection.counted_pairs(meshes, pairs) & ~ignored
 
             inside = self._containment.find(x, found, are_wanted)
-            self._last = last = name_intersections(self.segment, mesh, found, inside, x, time, selection)
-        return last
+            mesh = self._strand_mesh or self._mesh
+            self._intersections = (
+                found,
+                name_intersections(self.segment, mesh, found, inside, x, time, selection),
+            )
+        return self._intersections[1]
 
-    def _find_near(self, x: np.ndarray, time: float) -> SceneProximities:
-        """Returns the proximities at a time, those found last if these are the ones."""
-        if self._last_near:
-            last_x, last = self._last_near
-            if last.time == time and (last_x is x or np.array_equal(last_x, x)):
-                return last
-        assert self._proximity_finder
-        found = self._proximity_finder.find(x)
-        found = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
-        self._last_near = x, found
-        return found
+    def _name_near(self, found: Proximities, time: float) -> SceneProximities:
+        """Returns proximities, those named last if these are the ones."""
+        if self._proximities is None or self._proximities[0] is not found:
+            named = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
+            self._proximities = found, named
+        return self._proximities[1]
 
 
 class _StrandChecker:

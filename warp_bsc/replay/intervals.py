@@ -72,7 +72,7 @@ def replay(
     Yields:
         IntervalResult: The collisions of one interval, the same whoever finds them, in order. Only what the caller
         keeps stays in memory; from other processes, at most two chunks of at most 16 intervals for each wait. The next
-        interval is read meanwhile.
+        intervals are read, and on a CPU one is detected, meanwhile.
 
     Raises:
         ValueError: If the positions at some time are broken, there is no such method, initial intersections are to be

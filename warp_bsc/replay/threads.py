@@ -1,5 +1,6 @@
-"""Reads ahead and writes behind, one item each, in threads beside the one that detects."""
+"""Reads and detects ahead, and writes behind, one item each, in threads."""
 
+import contextvars
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
@@ -10,12 +11,15 @@ _Item = TypeVar("_Item")
 
 
 def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
-    """Yields items, the next of which is made in another thread meanwhile. Closing waits for that one.
+    """Yields items, the next of which is made in another thread meanwhile, in the context of this one.
+
+    Closing waits for that one.
 
     Raises:
         Exception: What making an item raises, when it is that one's turn.
     """
     iterator = iter(items)
+    context = contextvars.copy_context()
     nothing = []
 
     def take() -> list[_Item]:
@@ -24,9 +28,9 @@ def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
         return nothing
 
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as pool:
-        following = pool.submit(take)
+        following = pool.submit(context.run, take)
         while taken := following.result():
-            following = pool.submit(take)
+            following = pool.submit(context.run, take)
             yield taken.pop()
 
 

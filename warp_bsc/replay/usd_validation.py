@@ -16,6 +16,7 @@ loads if the environment variable ``PXR_PLUGINPATH_NAME`` names it. In Python, i
 
 import math
 import os
+import sys
 
 from pxr import Plug, Usd, UsdValidation
 
@@ -91,3 +92,5 @@ def _error(
 
 Plug.Registry().RegisterPlugins(PLUGIN_FOLDER)
 UsdValidation.ValidationRegistry().RegisterPluginStageValidator(NAME, find_errors)
+# "import warp_bsc.replay.usd_validation as rules" looks this module up in the function that hides the package
+vars(replay)["usd_validation"] = sys.modules[__name__]
