@@ -545,8 +545,10 @@ class ContactLayer:
             inputs = [motion, layer, of_kind]
             launch_adjoint(_add_shares, len(of_kind.pairs), inputs, [sums], [of_shares], device)
         launch_adjoint(_add_shares_of_planes, over_planes, [motion, planes, layer], [sums], [of_shares], device)
+        inverse_mass = self._mesh.model.particle_inv_mass
+        assert inverse_mass is not None
         inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
-        outputs = [start_q, particle_q, self._mesh.model.particle_inv_mass.grad]
+        outputs = [start_q, particle_q, inverse_mass.grad]
         self._launch(_finish_backward, particles, [*inputs, *outputs])
         self._friction.backward(of_motion.friction, of_planes.friction)
 
