@@ -200,7 +200,7 @@ def drop(stage, path, places):
 
 
 def test_large_concave_polygons(stage):
-    teeth = 100
+    teeth = 40
     outline = comb(teeth)
     assert len(outline) == 4 * teeth
     add_mesh(stage, "/World/Comb", outline)

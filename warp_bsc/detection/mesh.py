@@ -77,8 +77,6 @@ class CollisionMesh:
             raise ValueError(f"vertex_count must be an integer in [0, 2^31), not {vertex_count!r}")
         self.vertex_count = int(vertex_count)
         faces = self._checked_indices(faces, 3, "face")
-        if len(faces) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
-            raise ValueError(f"a mesh must have less than 2^28 faces, not {len(faces)}")
         given_edges = self._checked_indices(() if edges is None else edges, 2, "edge")
         same = np.flatnonzero(given_edges[:, 0] == given_edges[:, 1])
         if len(same):
@@ -197,6 +195,8 @@ class CollisionMesh:
             )
         if not np.issubdtype(elements.dtype, np.integer):
             raise ValueError(f"{name}s must be integers, not {elements.dtype}")
+        if len(elements) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
+            raise ValueError(f"a mesh must have less than 2^28 {name}s, not {len(elements)}")
         bad = np.flatnonzero(
             ((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), corners).any(axis=1)
         )
