@@ -415,7 +415,7 @@ def test_buffers_of_results_that_are_garbage_are_used_again(collected):
     x0, x1, faces = crumpled(0)
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
     seen = []
-    for _ in range(10 if collected else 100):  # collecting garbage takes long
+    for _ in range(4 if collected else 100):  # collecting garbage takes long
         c = detector.detect(x0, x1)
         assert len(c.vertex_face) and len(c.edge_edge)
         seen.append(buffer_addresses(c))

@@ -47,7 +47,7 @@ def any_number(device, monkeypatch):
 def test_small_integers_in_all_positions(method, dtype, any_number):
     """Faces that share vertices, touch, lie in one plane, or are a segment, over several motions."""
 
-    @settings(max_examples=25)
+    @settings(max_examples=12)
     @given(seed=st.integers(0), size=st.integers(1, 5), flat=st.booleans())
     def check(seed, size, flat):
         rng = np.random.default_rng(seed)
