@@ -51,8 +51,8 @@ from .time_of_impact import Impact, approximate_root, clamped_tolerance, mix_vec
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
-_SQUARE_SINE = wp.constant(wp.float64(2.0**-20))  # sigma^2
-_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
+SQUARE_SINE = wp.constant(wp.float64(2.0**-20))  # sigma^2
+LEAST_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
 _NEWTON_STEPS = wp.constant(8)
 _NEWTON_END = wp.constant(wp.float64(2.0**-50))
 _CONVERGED = wp.constant(wp.float64(2.0**-40))
@@ -78,7 +78,7 @@ class Touch:
 @wp.func
 def _square_length(x: wp.vec3d) -> wp.float64:
     """Returns the squared length of a vector, at least f^2."""
-    return wp.max(wp.length_sq(x), _SQUARE_LENGTH)
+    return wp.max(wp.length_sq(x), LEAST_SQUARE_LENGTH)
 
 
 @wp.func
@@ -90,7 +90,7 @@ def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, norma
     at.v = mix_vector(motion.v0, motion.v1, t)
     at.n = wp.cross(at.u, at.v)
     square = wp.length_sq(at.n)
-    smallest = _SQUARE_SINE * _square_length(at.u) * _square_length(at.v)
+    smallest = SQUARE_SINE * _square_length(at.u) * _square_length(at.v)
     at.area = wp.max(square, smallest)
     at.x = x
     at.y = y
@@ -106,7 +106,7 @@ def _touch_at(motion: Motion, t: wp.float64, x: wp.float64, y: wp.float64, norma
         at.grazing = 0
     at.velocity = motion.w1 - motion.w0 - at.x * (motion.u1 - motion.u0) - at.y * (motion.v1 - motion.v0)
     speed = wp.dot(at.normal, at.velocity)
-    slowest = _SQUARE_SINE * _square_length(at.velocity)
+    slowest = SQUARE_SINE * _square_length(at.velocity)
     at.approach = speed / wp.max(speed * speed, slowest)
     if speed * speed < slowest:
         at.grazing = 1

@@ -95,16 +95,13 @@ class CollisionDetector:
             All collisions; while a graph is captured :class:`CapturedCollisions`, to be read after a replay.
 
         Raises:
-            ValueError: If the positions have another shape or type, differ in type, are not finite, or require
-                gradients with a minimum distance.
+            ValueError: If the positions have another shape or type, differ in type, or are not finite.
             RuntimeError: If the first detection is captured in a CUDA graph.
         """
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
             raise ValueError("x0 and x1 must have the same type")
-        if self._pipeline.radius is not None and (x0.requires_grad or x1.requires_grad):
-            raise ValueError("collisions with a minimum distance have no gradients")
         if self.mesh.device.is_capturing:
             return (self._capture_on_cpu if self.mesh.device.is_cpu else self._capture_on_cuda)(x0, x1)
 
@@ -129,7 +126,7 @@ class CollisionDetector:
                     contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
         arrays = None
         if differentiable:
-            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *(rows.buffer for rows in contacts.values()))
+            arrays = self._differentiable(x0, x1, {kind: rows.buffer for kind, rows in contacts.items()})
         return Collisions(self.method != "float", (), arrays, self.method, counts, contacts, timer)
 
     def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
@@ -242,9 +239,16 @@ class CollisionDetector:
         arrays = None
         if x0.requires_grad or x1.requires_grad:
             capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
-            whole = [
-                narrow_phase.ordered_contacts(capacity, make_contact_buffer(capacity, self.mesh.device))
+            whole = {
+                DistanceKind(narrow_phase.kind): narrow_phase.ordered_contacts(
+                    capacity, make_contact_buffer(capacity, self.mesh.device)
+                )
                 for narrow_phase, capacity in zip(pipeline.narrow_phases, capacities, strict=True)
-            ]
-            arrays = CollisionArrays(x0, x1, self.mesh, self.tolerance, *whole)
+            }
+            arrays = self._differentiable(x0, x1, whole)
         return CapturedCollisions(arrays, read)
+
+    def _differentiable(self, x0, x1, contacts):
+        radius = self._pipeline.radius
+        assert radius is None or isinstance(radius, wp.array)
+        return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, radius)

@@ -1,17 +1,21 @@
 """Collisions on the device, as differentiable functions of the positions that they were found for."""
 
 import functools
+from collections.abc import Mapping
 
 import warp as wp
 
+from ..kernels.distance_gradients import with_distance_gradients
 from ..kernels.gradients import with_gradients
 from ..kernels.motion import double
-from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.pairs import points_of_pair, vertices_of_pair
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import HIT, UNSURE
 from ..kernels.time_of_impact import Impact
 from .contact_buffer import ContactBuffer
+from .distance_phase import distance_of_corners
 from .mesh import CollisionMesh
-from .settings import PairKind
+from .settings import DistanceKind
 
 __all__ = ["CollisionArrays"]
 
@@ -72,6 +76,56 @@ def _kernel(dtype: type) -> wp.Kernel:
     return differentiate
 
 
+@functools.cache
+def _distance_kernel(dtype: type) -> wp.Kernel:
+    """The kernel for pairs with a minimum distance, for one type of position, in a module of its own."""
+
+    @wp.kernel(module="unique", module_options={"fuse_fp": False})
+    def differentiate_distances(
+        kind: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        radius: wp.array[wp.float64],
+        tolerance: wp.float64,
+        # in
+        contacts: ContactBuffer,
+        # out
+        toi: wp.array[wp.float64],
+        grazing: wp.array[wp.bool],
+    ):
+        i = wp.tid()
+        pair = contacts.pairs[i]
+        if pair[0] < 0:
+            toi[i] = wp.float64(2.0)
+            grazing[i] = False
+            return
+        v = points_of_pair(kind, elements, pair)
+        found = Impact()
+        found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
+        found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
+        found.toi = contacts.toi[i]
+        contact = with_distance_gradients(
+            wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE),
+            double(x0[v[0]]),
+            double(x0[v[1]]),
+            double(x0[v[2]]),
+            double(x0[v[3]]),
+            double(x1[v[0]]),
+            double(x1[v[1]]),
+            double(x1[v[2]]),
+            double(x1[v[3]]),
+            distance_of_corners(kind, v, radius),
+            found,
+            tolerance,
+        )
+        toi[i] = contact.toi
+        grazing[i] = contact.grazing == 1
+
+    return differentiate_distances
+
+
 class CollisionArrays:
     """The collisions of one motion as Warp arrays on the device, in the order of :class:`Collisions`.
 
@@ -79,6 +133,10 @@ class CollisionArrays:
     They have gradients, and what made them is recorded on the tape that was active. For collisions of a detection in a
     CUDA graph the arrays are as long as the detector's queues, and rows without a collision have the pair (-1, -1) and
     the time 2.0. All lengths are the same for a kind of pair.
+
+    With minimum distances only times have gradients, those of the time at which a pair's distance is reached, see
+    :mod:`warp_bsc.kernels.distance_gradients`; coordinates and normals are constants. Of pairs with edges or points
+    that no face has, there are attributes ``vertex_edge``, ``vertex_edge_toi`` and so on, and ``vertex_vertex``.
 
     Attributes:
         vertex_face: (vertex, face), array of vec2i.
@@ -113,8 +171,8 @@ class CollisionArrays:
         x1: wp.array,
         mesh: CollisionMesh,
         tolerance: float,
-        vertex_face: ContactBuffer,
-        edge_edge: ContactBuffer,
+        contacts: Mapping[DistanceKind, ContactBuffer],
+        radius: wp.array | None = None,
     ):
         """Makes the arrays, and records on the tape how.
 
@@ -123,16 +181,26 @@ class CollisionArrays:
             x1: Positions at the end, of the same type.
             mesh: The mesh.
             tolerance: Of the times of impact, as a share of the step.
-            vertex_face: The sorted contacts of vertices with faces, which nothing may change any more.
-            edge_edge: Those of edges with edges.
+            contacts: The sorted contacts of each kind of pair, which nothing may change any more.
+            radius: Of each vertex, the sum of two of which is the distance of a pair; None without minimum distances.
         """
-        for kind, contacts in ((PairKind.VERTEX_FACE, vertex_face), (PairKind.EDGE_EDGE, edge_edge)):
-            constants = contacts.toi, contacts.coordinates, contacts.normal
-            toi, coordinates, normal = (wp.zeros_like(array, requires_grad=True) for array in constants)
-            grazing = wp.zeros(len(contacts.pairs), dtype=wp.bool, device=mesh.device)
-            inputs = [int(kind), x0, x1, mesh.device_elements(kind), tolerance, contacts]
-            outputs = [toi, coordinates, normal, grazing]
-            wp.launch(_kernel(x0.dtype), len(contacts.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
-            setattr(self, kind.label, contacts.pairs)
-            for name, array in zip(("toi", "coordinates", "normal", "grazing"), outputs, strict=True):
+        for kind, found in contacts.items():
+            elements = mesh.device_elements(kind)
+            toi = wp.zeros_like(found.toi, requires_grad=True)
+            grazing = wp.zeros(len(found.pairs), dtype=wp.bool, device=mesh.device)
+            inputs = [int(kind), x0, x1, elements]
+            if radius is None:
+                coordinates, normal = (wp.zeros_like(a, requires_grad=True) for a in (found.coordinates, found.normal))
+                kernel, inputs = _kernel(x0.dtype), [*inputs, tolerance, found]
+                outputs = [toi, coordinates, normal, grazing]
+            else:
+                coordinates, normal = found.coordinates, found.normal
+                kernel, inputs = _distance_kernel(x0.dtype), [*inputs, radius, tolerance, found]
+                outputs = [toi, grazing]
+            wp.launch(kernel, len(found.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
+            setattr(self, kind.label, found.pairs)
+            results = {"toi": toi, "normal": normal, "grazing": grazing}
+            if kind != DistanceKind.VERTEX_VERTEX:
+                results["coordinates"] = coordinates
+            for name, array in results.items():
                 setattr(self, f"{kind.label}_{name}", array)

@@ -1,0 +1,169 @@
+"""Gradients of the time at which two features come within a distance, by the implicit function theorem.
+
+At the time t two points of the features, closest to each other, are the distance d apart: |x| = d, with the vector x
+between them and the unit normal N = x / |x|. As the points are closest, moving them within their features changes |x|
+in the second order only. So with their weights w_i in x = sum w_i p_i held fixed (in a vertex and a face 1 and minus
+the barycentric coordinates), and with the velocity e of the one point relative to the other,
+
+    dt = -N . sum w_i dp_i / (N . e),
+
+of which a point's start has the share 1 - t and its end t. The returned time is a lower bound; gradients are those at
+the root of |x| = d within the tolerance after it, which Newton's method finds. Where several pairs of points are
+closest, as of parallel edges, gradients are those of one pair.
+
+**Grazing.** Gradients grow without bound where N . e goes to zero. As in :mod:`.gradients`, 1 / (N . e) becomes
+N . e / max((N . e)^2, (sigma max(|e|, f))^2), with sigma = 2^-10 and f = 2^-22 of the largest coordinate of the
+relative motion. Where this has an effect ``grazing`` is 1, and also where the root is not certain to be within the
+tolerance, or is not found there. Of features that are nearer than the distance from the start, whose time is 0 whatever
+the points, gradients are zero.
+"""
+
+import warp as wp
+
+from .closest import between
+from .distance import nearest_pair
+from .gradients import LEAST_SQUARE_LENGTH, SQUARE_SINE
+from .motion import all_finite, relative_motion
+from .polynomials import VERTEX_FACE, Motion
+from .signs import FREE
+from .time_of_impact import Impact, clamped_tolerance, mix_vector
+
+_ZERO = wp.constant(wp.float64(0.0))
+_ONE = wp.constant(wp.float64(1.0))
+_NEWTON_STEPS = wp.constant(8)
+_CONVERGED = wp.constant(wp.float64(2.0**-40))
+
+
+@wp.struct
+class _Reach:
+    """The time at which a distance is reached and the terms of its gradient, in the scale of the motion."""
+
+    time: wp.float64
+    weights: wp.vec4d
+    slope: wp.vec3d  # minus the normal over its product with the velocity: the derivative of the time by x
+    grazing: int
+
+
+@wp.func
+def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.float64) -> _Reach:
+    """Returns when a distance is reached, at the root within the tolerance after the time that was found."""
+    reach = _Reach()
+    reach.time = found.toi
+    reach.grazing = 1
+    last = wp.min(found.toi + clamped_tolerance(tolerance), _ONE)
+    steps = int(_NEWTON_STEPS)  # not a constant, as the body would be repeated
+    for i in range(steps):
+        t = reach.time
+        u = mix_vector(motion.u0, motion.u1, t)
+        v = mix_vector(motion.v0, motion.v1, t)
+        w = mix_vector(motion.w0, motion.w1, t)
+        nearest = nearest_pair(motion.kind, u, v, w)
+        at = wp.vec2d(nearest[0], nearest[1])
+        gap = between(motion.kind, at, u, v, w)
+        size = wp.length(gap)
+        if size == _ZERO:
+            reach.slope = wp.vec3d()
+            return reach
+        normal = gap / size
+        velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
+        speed = wp.dot(normal, velocity)
+        slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), LEAST_SQUARE_LENGTH)
+        approach = speed / wp.max(speed * speed, slowest)
+        reach.weights = wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+        if motion.kind != VERTEX_FACE:
+            reach.weights = wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
+        reach.slope = -approach * normal
+        step = (distance - size) * approach
+        if i == 0 and t == _ZERO and size < distance:  # from the start
+            reach.slope = wp.vec3d()
+            return reach
+        if wp.abs(step) <= _CONVERGED:
+            certain = found.within_tolerance == 1 and speed < _ZERO and speed * speed >= slowest
+            reach.grazing = wp.where(certain, 0, 1)
+            return reach
+        reach.time = wp.clamp(t + step, found.toi, last)
+    return reach
+
+
+@wp.func
+def with_distance_gradients(
+    kind: int,
+    # points at the start
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    # points at the end
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    distance: wp.float64,
+    # what was found
+    found: Impact,
+    tolerance: wp.float64,
+) -> Impact:
+    """Returns the answer to a query with a minimum distance, its time as a differentiable function of the points.
+
+    Args:
+        kind: VERTEX_FACE or EDGE_EDGE; points of a vertex and an edge are p a b a, of two vertices p q q q.
+        a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
+        b0: Second point at the start.
+        c0: Third point at the start.
+        d0: Fourth point at the start.
+        a1: First point at the end.
+        b1: Second point at the end.
+        c1: Third point at the end.
+        d1: Fourth point at the end.
+        distance: The minimum distance.
+        found: The answer.
+        tolerance: Tolerance of its time of impact.
+
+    Returns:
+        The answer ``found``, with ``grazing``. Its time has gradients, coordinates and normal have none.
+    """
+    result = found
+    result.grazing = 0
+    if found.status != FREE:
+        result.grazing = 1
+        if all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+            if motion.scale > _ZERO:
+                result.grazing = _reach(motion, distance * motion.scale, found, tolerance).grazing
+    return result
+
+
+@wp.func_grad(with_distance_gradients)
+def _adjoint_of_with_distance_gradients(
+    kind: int,
+    # points at the start
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    # points at the end
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    distance: wp.float64,
+    # what was found
+    found: Impact,
+    tolerance: wp.float64,
+    adj_ret: Impact,
+):
+    if found.status != FREE and all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+        if motion.scale > _ZERO:
+            reach = _reach(motion, distance * motion.scale, found, tolerance)
+            slope = adj_ret.toi * motion.scale * reach.slope
+            before = _ONE - reach.time
+            after = reach.time
+            wp.adjoint[a0] += before * reach.weights[0] * slope
+            wp.adjoint[b0] += before * reach.weights[1] * slope
+            wp.adjoint[c0] += before * reach.weights[2] * slope
+            wp.adjoint[d0] += before * reach.weights[3] * slope
+            wp.adjoint[a1] += after * reach.weights[0] * slope
+            wp.adjoint[b1] += after * reach.weights[1] * slope
+            wp.adjoint[c1] += after * reach.weights[2] * slope
+            wp.adjoint[d1] += after * reach.weights[3] * slope
