@@ -249,6 +249,4 @@ class CollisionDetector:
         return CapturedCollisions(arrays, read)
 
     def _differentiable(self, x0, x1, contacts):
-        radius = self._pipeline.radius
-        assert radius is None or isinstance(radius, wp.array)
-        return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, radius)
+        return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)

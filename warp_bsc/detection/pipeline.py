@@ -91,6 +91,7 @@ class DetectionPipeline:
             or without points.
         radius: Radius of each vertex, half of the minimum distance included, float64, shape [vertex_count]; None if
             pairs collide that touch.
+        device_radius: The same on the device, Warp array of float64, or None.
         generation: How often buffers have been replaced. Graphs captured before still write to the old buffers.
     """
 
@@ -143,9 +144,9 @@ class DetectionPipeline:
         else:
             self.radius = keeping.radius.numpy() + 0.5 * keeping.reach
         self._rings = Rings() if self.radius is None or keeping is not None else make_rings(mesh, rings)
-        self._radius = padding = None
+        self.device_radius = padding = None
         if self.radius is not None:
-            self._radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
+            self.device_radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
             # the minimum distance of a pair, a rounded sum, is at most the sum of these
             padding = wp.array(np.nextafter(self.radius, np.inf), dtype=wp.float64, device=mesh.device)
         elements = faces + len(mesh.free_edges) + len(mesh.points)
@@ -220,10 +221,10 @@ class DetectionPipeline:
         if self._keeping is not None:
             options = {"tolerance": self.tolerance, "timer": timer}
             run_approach_phases(narrow_phases, x0, x1, self._keeping, near_pairs=not refit, **options)
-        elif self._radius is None:
+        elif self.device_radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:
-            run_distance_phases(narrow_phases, x0, x1, self._radius, self._rings, **options)
+            run_distance_phases(narrow_phases, x0, x1, self.device_radius, self._rings, **options)
         if not sort:
             return
         for narrow_phase in self.narrow_phases:
