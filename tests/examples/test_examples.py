@@ -105,11 +105,21 @@ def test_docstring_prints_its_command(path):
     assert re.findall(r"python (examples/\S+\.py)", path.read_text())[0] == name
 
 
-@pytest.mark.parametrize("path", [*FIGURES, FOLDER / "paper" / "record_scenes.py"], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [FOLDER / "figures" / "throw.py", FOLDER / "paper" / "record_scenes.py"], ids=lambda path: path.stem
+)
 def test_scripts_without_a_viewer_start(path, tmp_path):
     """From any folder, by their path alone."""
     done = subprocess.run([sys.executable, path, "--help"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("path", FIGURES, ids=lambda path: path.stem)
+def test_figures_have_options(path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(path), "--help"])
+    with pytest.raises(SystemExit):
+        load_module(path).main()
+    assert "usage" in capsys.readouterr().out
 
 
 class Browser:

@@ -275,11 +275,11 @@ def test_hundreds_of_tape_iterations_take_no_more_memory(device):
             return wp.get_mempool_used_mem_current(device)
         return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    for i in range(300):
+    for i in range(200):
         scene.gradient(down)
-        if i == 100:
+        if i == 70:
             before = used()
-    assert scene.hits > 300
+    assert scene.hits > 200
     assert used() - before < 2**20
 
 
