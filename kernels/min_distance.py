@@ -453,9 +453,7 @@ class Search:
     limit: wp.float64  # end of what is to be searched
     found: bool  # whether the distance is certainly reached at the limit
     aimed: bool  # whether the part ends within the tolerance before the limit
-    time: (
-        wp.float64
-    )  # at which advancement evaluates the closest points next; less than the start if that is to be found
+    time: wp.float64  # that advancement evaluates next; less than the start if it is to be found
     visits: int
     status: int  # FREE if the whole step is free, else UNSURE
     ended: bool
