@@ -92,6 +92,7 @@ class Motion:
     world: wp.array[int]
     bodies: Bodies
     distances: MinDistances  # that pairs are to keep; empty if they only must not touch
+    interrupted: wp.array[int]  # by world, then of any: 1 where the program moved a movable particle between steps
 
 
 @wp.struct

@@ -117,6 +117,9 @@ def begin_step(
     if i < worlds:
         progress.contact_iteration[i] = -1
         progress.fast[i] = 0
+        motion.interrupted[i] = 0
+    if i == worlds:
+        motion.interrupted[i] = 0
     if i >= vertices.x1.shape[0]:
         return
     for axis in range(3):

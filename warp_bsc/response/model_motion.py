@@ -48,12 +48,19 @@ def _place_plane(placement: _Placement, i: int, planes: wp.array[wp.vec4d]):
 
 
 @wp.func
+def _is_movable(motion: Motion, body: int) -> bool:
+    """Returns whether the response can move a body, -1 for none."""
+    if body < 0 or not motion.bodies.inverse_mass:
+        return False
+    return motion.bodies.inverse_mass[body] > 0.0
+
+
+@wp.func
 def moves_with_body(motion: Motion, vertex: int) -> bool:
     """Returns whether a vertex is of a body that the response can move."""
     if not motion.bodies.of_vertex:
         return False
-    body = motion.bodies.of_vertex[vertex]
-    return body >= 0 and motion.bodies.inverse_mass[body] > 0.0
+    return _is_movable(motion, motion.bodies.of_vertex[vertex])
 
 
 @wp.func
@@ -64,19 +71,54 @@ def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
     return velocity_on_body(motion.bodies.velocity[body], arm)
 
 
+@wp.func
+def _is_finite(plane: wp.vec4d) -> bool:
+    return wp.isfinite(plane[0]) and wp.isfinite(plane[1]) and wp.isfinite(plane[2]) and wp.isfinite(plane[3])
+
+
+@wp.func
+def _continues(motion: Motion, world: int) -> bool:
+    """Returns whether a step begins where the last one ended, as far as movable particles of a world go."""
+    last = motion.interrupted.shape[0] - 1
+    return motion.interrupted[wp.where(world < 0, last, world)] == 0
+
+
+@wp.kernel(enable_backward=False)
+def _interrupt(
+    # in
+    world_mask: wp.array[wp.bool],
+    # out
+    interrupted: wp.array[int],
+):
+    """Marks worlds as interrupted, and what is in all of them if any world is."""
+    i = wp.tid()
+    last = world_mask.shape[0] - 1
+    if world_mask[wp.min(i, last)] or world_mask[last]:
+        interrupted[i] = 1
+        interrupted[interrupted.shape[0] - 1] = 1
+
+
 @wp.kernel(enable_backward=False)
 def _write_start(
     # in
     placement: _Placement,
+    last: wp.array[wp.vec3],
     # out
-    x0: wp.array[wp.vec3],
+    motion: Motion,
     planes: wp.array[wp.vec4d],
 ):
-    """Writes the positions of vertices and the planes at the start of a step."""
+    """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
     _place_plane(placement, i, planes)
-    if i < x0.shape[0]:
-        x0[i] = _position(placement, i)
+    if i >= motion.x0.shape[0]:
+        return
+    x0 = _position(placement, i)
+    motion.x0[i] = x0
+    if last and motion.inverse_mass[i] > 0.0:
+        for axis in range(3):
+            if x0[axis] != last[i][axis]:
+                motion.interrupted[motion.world[i]] = 1
+                motion.interrupted[motion.interrupted.shape[0] - 1] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -112,20 +154,30 @@ def _write_end(
     placement: _Placement,
     particle_qd: wp.array[wp.vec3],
     dt: float,
+    last: wp.array[wp.vec3],
+    plane_world: wp.array[int],
     # in and out
     motion: Motion,
     # out
-    planes: wp.array[wp.vec4d],
+    plane_starts: wp.array[wp.vec4d],
+    plane_ends: wp.array[wp.vec4d],
 ):
     """Writes positions, velocities and planes at the end of a step.
 
     Velocities are those of particles and movable bodies as they are, and those of other shapes from their positions. A
-    vertex without a finite position at the end stands where it was.
+    vertex without a finite position at the end stands where it was. What nothing moves starts where the last step left
+    it: a program that animates it between steps would otherwise take it past what is in its way unseen.
     """
     i = wp.tid()
-    _place_plane(placement, i, planes)
+    if last and i < plane_ends.shape[0] and not _is_movable(motion, placement.plane_body[i]):
+        if _continues(motion, plane_world[i]) and _is_finite(plane_ends[i]):
+            plane_starts[i] = plane_ends[i]
+    _place_plane(placement, i, plane_ends)
     if i >= motion.x1.shape[0]:
         return
+    if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
+        if _continues(motion, motion.world[i]) and wp.isfinite(last[i]):
+            motion.x0[i] = last[i]
     x0 = motion.x0[i]
     x1 = _position(placement, i)
     velocity = (x1 - x0) / dt
@@ -172,6 +224,8 @@ class ModelMotion:
         for name in ("x0", "x1", "velocity"):
             setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
         vertices.is_lost = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
+        vertices.interrupted = wp.zeros(max(1, mesh.model.world_count) + 1, dtype=int, device=mesh.device)
+        self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
         if mesh.distances is not None:
@@ -211,12 +265,35 @@ class ModelMotion:
         bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         return bodies
 
+    def remember(self, last: wp.array[wp.vec3]) -> None:
+        """Makes what the response cannot move start a step where it was at the end of the last one.
+
+        Not in worlds in which a movable particle is elsewhere than then: those were set to another state.
+
+        Args:
+            last: Positions of the vertices at the end of the last step, which the response keeps.
+        """
+        self._last = last
+        self.interrupt()
+
+    def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
+        """Makes the next step begin where its state is.
+
+        Args:
+            world_mask: The worlds, then whether what is in all of them, shape [world_count + 1]; None for everything.
+        """
+        interrupted = self.vertices.interrupted
+        if world_mask is None:
+            interrupted.fill_(1)
+        else:
+            inputs, outputs = [world_mask], [interrupted]
+            wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
+
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""
-        x0, planes = self.vertices.x0, self.planes.start
-        self.mesh.check_lengths(particle_q, body_q, x0)
-        inputs = [self._placement(particle_q, body_q)]
-        wp.launch(_write_start, self._size, inputs=inputs, outputs=[x0, planes], device=self.mesh.device)
+        self.mesh.check_lengths(particle_q, body_q, self.vertices.x0)
+        inputs, outputs = [self._placement(particle_q, body_q), self._last], [self.vertices, self.planes.start]
+        wp.launch(_write_start, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
         if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, body_q)
 
@@ -237,8 +314,8 @@ class ModelMotion:
             self.set_body_ends(body_q, body_qd)
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, body_q)
-        inputs = [self._placement(particle_q, body_q), particle_qd, dt]
-        outputs = [self.vertices, self.planes.end]
+        inputs = [self._placement(particle_q, body_q), particle_qd, dt, self._last, self.planes.world]
+        outputs = [self.vertices, self.planes.start, self.planes.end]
         wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:

@@ -312,7 +312,7 @@ class Response:
             self._record = recorder.begin()
         inputs = [motion.vertices, self.worlds]
         outputs = [self.vertices, self.constraints, self._dividing_planes, self.progress]
-        size = max(len(self.vertices.x1), self.worlds)
+        size = max(len(self.vertices.x1), self.worlds + 1)
         wp.launch(begin_step, size, inputs=inputs, outputs=outputs, device=self.device)
         self.begin_bodies(motion)
         wp.capture_if(self.status.recount, self._count_crossings)

@@ -173,6 +173,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     whose wanted position or velocity is not finite stays where it was. A position at the start that is not finite
     leaves the step uncertified, without its elements.
 
+    Kinematic particles and bodies that a program moves between steps, as animations do, take that way in the next step:
+    it begins where the last one ended. Where a movable particle has been moved as well, its world was set to another
+    state, and begins there. So does everything after :meth:`reset`, and with ``requires_grad``.
+
     The certificate is of straight motion: of all vertices between the stored state at the start and the stored state at
     the end, those of shapes between the poses of their bodies. The vertices of a body that turns go in arcs, whose
     distance from their chords (the sagitta) the response adds to the separation of contacts with that body, up to 4
@@ -320,6 +324,8 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
         self._response.prepare(self._motion)
         self._recount_crossings()
+        if not model.requires_grad:
+            self._motion.remember(self._response.vertices.x1)
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
@@ -610,9 +616,10 @@ class SolverCCD(SolverBase, CouplingHooks):
         """Delegates to the inner solver."""
         return self.solver.validate_observables(*arguments, **options)
 
-    def reset(self, state, *arguments, **options):
-        """Resets the inner solver; the stage keeps no state between steps."""
-        self.solver.reset(state, *arguments, **options)
+    def reset(self, state, world_mask=None, flags=None):
+        """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
+        self.solver.reset(state, world_mask, flags)
+        self._motion.interrupt(world_mask)
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver."""

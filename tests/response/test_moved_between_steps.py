@@ -1,0 +1,163 @@
+"""What a program moves between steps, as animations do, takes that way in the next step."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import DT, Changed, Rollout, add_patch, status
+
+import warp_bsc as bsc
+
+SPEED = 6.0  # 25 mm a step, through a sheet without thickness
+POSES = [(0.013, 0.007, 0.1 - SPEED * DT * i) for i in range(12)]
+
+
+def pose(x):
+    return np.float32([[*x, 0.0, 0.0, 0.0, 1.0]])
+
+
+def ball_over_sheet(device, *, worlds=1, **options):
+    """A sheet that floats, and a kinematic ball above it."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(world, 8, 0.04, (0.0, 0.0, 0.0))
+    body = world.add_body(xform=wp.transform(wp.vec3(*POSES[0]), wp.quat_identity()), is_kinematic=True)
+    world.add_shape_sphere(body, radius=0.05)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device, **options)
+
+
+def animate(rollout, x):
+    """Sets the ball between steps."""
+    rollout.states[0].body_q.assign(pose(x))
+
+
+def ball_in_sheet(rollout):
+    """The number of edges that cross faces now, of which one is of the sheet."""
+    return len(rollout.find_crossings(rollout.vertices(rollout.states[0])))
+
+
+@pytest.mark.parametrize("coupling", [None, 4, "auto"])
+def test_a_ball_set_between_steps_is_one_that_moves_in_them(coupling, device):
+    """Bit by bit: the inner solver knows nothing of the ball."""
+    model = ball_over_sheet(device)
+    between, within = (Rollout(model, bsc.SolverCCD(Changed(model), coupling=coupling)) for _ in range(2))
+    within.solver.solver.change = lambda state: state.body_q.assign(pose(x))
+    hits = 0
+    for x in POSES:
+        animate(between, x)
+        between.step()
+        within.step()
+        assert between.solver.report.certified and between.solver.report.truncated == 0
+        assert between.positions.tobytes() == within.positions.tobytes()
+        assert between.velocities.tobytes() == within.velocities.tobytes()
+        assert ball_in_sheet(between) == status(between.solver, "crossings") == 0
+        hits += between.solver.report.hits
+    assert hits > 20 and between.positions[:, 2].min() < POSES[-1][2]
+
+
+def test_the_monitor_counts_what_a_ball_passes_between_steps(device):
+    model = ball_over_sheet(device)
+    rollout = Rollout(model, bsc.CollisionMonitor(Changed(model)))
+    hits = 0
+    for x in POSES:
+        animate(rollout, x)
+        rollout.step()
+        hits += rollout.solver.report.hits
+    assert hits > 20 and (rollout.positions[:, 2] == 0.0).all()
+
+
+def test_particles_that_are_held_take_their_way_too(device):
+    """A held patch that a program pulls through a sheet pushes that ahead."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.04, (0.0, 0.0, 0.0))
+    sheet = builder.particle_count
+    add_patch(builder, 2, 0.04, (0.013, 0.007, 0.1), fixed=True)
+    builder.particle_mass[sheet:] = [0.0] * (builder.particle_count - sheet)
+    builder.color()
+    rollout = Rollout(model := builder.finalize(device=device), bsc.SolverCCD(Changed(model)))
+    for i in range(12):
+        positions = rollout.positions
+        positions[sheet:, 2] = 0.1 - SPEED * DT * i
+        rollout.states[0].particle_q.assign(positions)
+        rollout.step()
+        assert rollout.solver.report.certified
+        assert not rollout.find_crossings(rollout.positions) and status(rollout.solver, "crossings") == 0
+    assert rollout.positions[:sheet, 2].min() < rollout.positions[sheet:, 2].max() < 0.0
+
+
+def test_a_plane_that_a_program_moves_pushes(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 4, 0.04, (0.0, 0.0, 0.01))
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_plane(body=body, width=0.0, length=0.0)
+    builder.color()
+    rollout = Rollout(model := builder.finalize(device=device), bsc.SolverCCD(Changed(model)))
+    for i in range(6):
+        rollout.states[0].body_q.assign(pose((0.0, 0.0, 0.025 * i)))
+        rollout.step()
+        assert rollout.solver.report.certified
+        assert rollout.positions[:, 2].min() > 0.025 * i
+
+
+@pytest.mark.parametrize("how", ["state", "reset", "first step"])
+def test_what_is_set_to_another_state_begins_there(how, device):
+    """The ball was above the sheet, and is below it after a reset: it did not pass."""
+    model = ball_over_sheet(device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    for _ in range(0 if how == "first step" else 2):
+        rollout.step()
+    expected = rollout.positions
+    if how == "state":
+        expected[0, 0] += 0.01
+        rollout.states[0].particle_q.assign(expected)
+    elif how == "reset":
+        rollout.solver.reset(rollout.states[0])
+    animate(rollout, POSES[-1])
+    rollout.step()
+    assert rollout.solver.report.certified and rollout.solver.report.hits == 0
+    assert rollout.positions.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("mask", [[True, False, False], [False, False, True], None])
+def test_a_world_is_set_to_another_state_alone(mask, device):
+    model = ball_over_sheet(device, worlds=2)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    rollout.step()
+    before = rollout.positions
+    if mask is not None:
+        rollout.solver.reset(rollout.states[0], world_mask=wp.array(mask, dtype=bool, device=device))
+    rollout.states[0].body_q.assign(np.concatenate([pose(POSES[-1])] * 2))
+    rollout.step()
+    moved = (rollout.positions != before).reshape(2, -1).any(axis=1)
+    expected = {None: [True, True], (True, False, False): [False, True], (False, False, True): [False, False]}
+    assert moved.tolist() == expected[None if mask is None else tuple(mask)]
+    assert rollout.solver.report.certified
+
+
+@wp.kernel(enable_backward=False)
+def _lower(path: float, body_q: wp.array[wp.transform]):
+    body_q[0] = wp.transform(wp.transform_get_translation(body_q[0]) - wp.vec3(0.0, 0.0, path), wp.quat_identity())
+
+
+def test_a_graph_that_moves_a_ball(device):
+    if device.is_cuda and not wp.is_conditional_graph_supported():
+        pytest.skip("needs conditional nodes")
+    model = ball_over_sheet(device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    states = rollout.states
+
+    def frame():
+        for start, end in (states, states[::-1]):
+            wp.launch(_lower, 1, inputs=[SPEED * DT, start.body_q], device=device)
+            start.clear_forces()
+            rollout.solver.step(start, end, rollout.control, None, DT)
+
+    with wp.ScopedCapture(device) as capture:
+        frame()
+    for _ in range(6):
+        wp.capture_launch(capture.graph)
+        assert rollout.solver.report.certified
+        assert ball_in_sheet(rollout) == 0
+    assert rollout.positions[:, 2].min() < -0.05
