@@ -67,7 +67,6 @@ class ContainmentFinder:
         if not len(self._bodies) or self._bodies.min() == self._bodies.max() or not self._parts.closed.any():
             return none
         parts = self._parts
-        x = x.astype(np.float64)
         low, high = parts.boxes(x)
         (outer,) = np.nonzero(parts.closed)
         pairs = _enclosing(low, high, low[outer], high[outer], 3)
@@ -84,7 +83,7 @@ class ContainmentFinder:
         of_bodies = np.concatenate([of_bodies, of_bodies[:, ::-1]])
         passing = of_bodies[:, 0] * len(low) + parts.body[of_bodies[:, 1]]
         kept = ~np.isin(pairs[:, 0] * len(low) + parts.body[pairs[:, 1]], passing)
-        return self._decide(x, found, pairs[kept], is_touching[kept])
+        return self._decide(x.astype(np.float64), found, pairs[kept], is_touching[kept])
 
     @functools.cached_property
     def _parts(self) -> "_Parts":
@@ -248,10 +247,10 @@ class _Parts:
         self.oriented = np.bincount(of_side, sums[edges[proper]] != 0, part_count) == 0
 
     def boxes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the lowest and the highest corners of the parts' bounding boxes, each of shape [part_count, 3]."""
+        """Returns lowest and highest corners of the parts' bounding boxes, float64, each of shape [part_count, 3]."""
         columns = [np.ascontiguousarray(column) for column in x[self._ordered_vertices].T]
         low, high = (
-            np.stack([bound.reduceat(column, self._starts) for column in columns], axis=1)
+            np.stack([bound.reduceat(column, self._starts) for column in columns], axis=1).astype(np.float64)
             for bound in (np.minimum, np.maximum)
         )
         return low, high

@@ -4,10 +4,11 @@ import csv
 import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any, TypeVar
 
+import numpy as np
 import orjson
 
 from .. import __version__
@@ -17,7 +18,7 @@ from .outputs import RecordFile
 from .results import IntersectionSummary, IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import KINDS, ScenePairs
+from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 
@@ -175,16 +176,18 @@ class HitsCsv(RecordFile):
 
     def head(self) -> str:
         """Returns the names of the columns."""
-        return _to_csv([list(self._COLUMNS)])
+        return ",".join(self._COLUMNS) + "\n"
 
     def record(self, result: IntervalResult) -> Iterator[str]:
         """Yields the rows of an interval."""
         interval, contacts = result.summary, result.contacts
-        where = [interval.index, interval.start, interval.end]
+        where = f"{interval.index},{interval.start},{interval.end}"
         times = 2 if interval.index == self._last_index and interval.end > interval.start else 1
-        yield from _csv_rows(where, [contacts], _contact_rows)
-        yield from _csv_rows(where, (result.intersections or ())[:times], _intersection_rows)
-        yield from _csv_rows(where, (result.proximities or ())[:times], _proximity_rows)
+        yield from _csv_rows(where, contacts, _contact_columns)
+        for intersections in (result.intersections or ())[:times]:
+            yield from _csv_rows(where, intersections, _intersection_columns)
+        for proximities in (result.proximities or ())[:times]:
+            yield from _csv_rows(where, proximities, _proximity_columns)
 
     def tail(self, summary: Summary) -> str:
         """Returns a line on the missing intervals, empty if there are none."""
@@ -202,15 +205,8 @@ def _list(
     """Yields a member of a JSON object: the list of all pairs, or of some rows of them."""
     yield f', "{name}": ['
     for number, rows in enumerate(pairs.chunks(which)):
-        yield (b", " if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
+        yield (b"," if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
     yield "]"
-
-
-def _csv_rows(where: list, found: Iterable[_Pairs], to_rows: Callable[[_Pairs, slice], list[dict]]) -> Iterator[str]:
-    """Yields rows of a CSV file: an interval's columns, then those of each pair."""
-    for pairs in found:
-        for rows in pairs.chunks():
-            yield _to_csv([*where, *_csv_values(row)] for row in to_rows(pairs, rows))
 
 
 def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
@@ -232,20 +228,28 @@ def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
 
 def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[dict]:
     """Returns the fields of some intersections."""
-    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
-    insides = [row >= edges for row in range(*rows.indices(len(intersections)))]
+    kinds, phases = _intersection_texts(intersections, rows)
     return _to_rows(
         {
-            "kind": ["vertex-face" if inside else "edge-face" for inside in insides],
+            "kind": kinds,
             **_names(intersections, rows),
-            "time": [intersections.time] * len(crosses),
+            "time": [intersections.time] * len(kinds),
             "position": intersections.position[rows].tolist(),
-            "phase": [
-                "inside" if inside else "crosses" if passes else "touches"
-                for inside, passes in zip(insides, crosses, strict=True)
-            ],
+            "phase": phases,
         }
     )
+
+
+def _intersection_texts(intersections: SceneIntersections, rows: slice) -> tuple[list[str], list[str]]:
+    """Returns the kinds and phases of some intersections."""
+    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
+    insides = [row >= edges for row in range(*rows.indices(len(intersections)))]
+    kinds = ["vertex-face" if inside else "edge-face" for inside in insides]
+    phases = [
+        "inside" if inside else "crosses" if passes else "touches"
+        for inside, passes in zip(insides, crosses, strict=True)
+    ]
+    return kinds, phases
 
 
 def _proximity_rows(proximities: SceneProximities, rows: slice) -> list[dict]:
@@ -282,18 +286,76 @@ def _to_rows(fields: dict[str, list]) -> list[dict]:
     return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
 
 
-def _csv_values(row: dict) -> list:
-    """Returns the values of a contact or an intersection in the order of the columns after the interval's."""
-    sides = zip(row["meshes"], row["prims"], row["elements"], row["indices"], strict=True)
-    pair = [value for mesh, prim, element, of in sides for value in (mesh, prim, element, of[0], [*of, ""][1])]
-    normal = row.get("normal", ("", "", ""))
-    measures = row["time"], row.get("toi", ""), *row["position"], *normal
-    return [row["kind"], *pair, *measures, row.get("phase", ""), row.get("separate", ""), row.get("distance", "")]
+def _csv_rows(
+    where: str, pairs: _Pairs, to_columns: Callable[[_Pairs, slice], tuple[list[str], list[str], list[str]]]
+) -> Iterator[str]:
+    """Yields rows of a CSV file, whose texts are made column by column, as many times faster than value by value.
+
+    Args:
+        where: Text of the columns of the interval.
+        pairs: The pairs.
+        to_columns: Returns texts of some pairs: kind, columns from the time to the normal, columns from the phase on.
+    """
+    names = [_csv_text(mesh.name, mesh.path) for mesh in pairs.segment.meshes]
+    for rows in pairs.chunks():
+        first, second = (_csv_sides(pairs, rows, side, names) for side in range(2))
+        columns = zip(*to_columns(pairs, rows), first, second, strict=True)
+        yield "".join([f"{where},{kind},{a},{b},{measures},{end}\n" for kind, measures, end, a, b in columns])
 
 
-def _to_csv(rows: Iterable[list]) -> str:
+def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: list[str]) -> list[str]:
+    """Returns the columns of one side of some pairs: mesh, prim, element, and one or two indices."""
+    columns = pairs.meshes[rows, side], pairs.elements[rows, side], *pairs.indices[rows, side].T
+    return [
+        f"{names[mesh]},{ELEMENT_WORDS[element]} {a},{a},"
+        if b < 0
+        else f"{names[mesh]},{ELEMENT_WORDS[element]} {a}-{b},{a},{b}"
+        for mesh, element, a, b in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+
+
+def _contact_columns(contacts: SceneContacts, rows: slice) -> tuple[list[str], list[str], list[str]]:
+    """Returns texts of some contacts, as :func:`_csv_rows` takes them."""
+    kinds = [KINDS[kind] for kind in contacts.kind[rows].tolist()]
+    measures = _numbers_to_csv(contacts.time[rows], contacts.toi[rows], contacts.position[rows], contacts.normal[rows])
+    ends = [",,"] * len(kinds)
+    if contacts.phase is not None and contacts.separate is not None:
+        phases = zip(contacts.phase[rows].tolist(), contacts.separate[rows].tolist(), strict=True)
+        ends = [f"{PHASES[phase]},{separate}," if phase >= 0 else ",," for phase, separate in phases]
+    return kinds, measures, ends
+
+
+def _intersection_columns(intersections: SceneIntersections, rows: slice) -> tuple[list[str], list[str], list[str]]:
+    """Returns texts of some intersections, as :func:`_csv_rows` takes them."""
+    kinds, phases = _intersection_texts(intersections, rows)
+    measures = _at_rest_to_csv(intersections.time, intersections.position[rows])
+    return kinds, measures, [f"{phase},," for phase in phases]
+
+
+def _proximity_columns(proximities: SceneProximities, rows: slice) -> tuple[list[str], list[str], list[str]]:
+    """Returns texts of some proximities, as :func:`_csv_rows` takes them."""
+    kinds = [KINDS[kind] for kind in proximities.kind[rows].tolist()]
+    measures = _at_rest_to_csv(proximities.time, proximities.position[rows])
+    return kinds, measures, [f"near,,{distance}" for distance in _numbers_to_csv(proximities.distance[rows])]
+
+
+def _at_rest_to_csv(time: float, position: np.ndarray) -> list[str]:
+    """Returns the columns from the time to the normal of pairs without a time of impact and a normal."""
+    return [f"{time},,{place},,," for place in _numbers_to_csv(position)]
+
+
+def _numbers_to_csv(*columns: np.ndarray) -> list[str]:
+    """Returns the numbers of each row of some columns, with commas between."""
+    if not len(columns[0]):
+        return []
+    numbers = np.column_stack(columns)
+    return orjson.dumps(numbers, option=orjson.OPT_SERIALIZE_NUMPY).decode()[2:-2].split("],[")
+
+
+def _csv_text(*values: str) -> str:
+    """Returns texts as columns."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="").writerow(values)
     return text.getvalue()
 
 

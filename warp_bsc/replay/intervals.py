@@ -39,7 +39,7 @@ def replay(
         scene = bsc.Scene("scene.usd", frames=bsc.FrameRange(101.0, 150.0), selection=selection)
         for interval in bsc.replay(scene, ignore_initial=True):
             contacts = interval.contacts
-            for rows in contacts.chunks():  # 4,096 pairs at a time, as text takes memory
+            for rows in contacts.chunks():  # some pairs at a time, as text takes memory
                 for meshes, elements in zip(contacts.mesh_names(rows), contacts.element_names(rows)):
                     print(interval.summary.start, meshes, elements)
             print(contacts.toi, contacts.position, contacts.separate)

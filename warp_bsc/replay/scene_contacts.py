@@ -1,6 +1,7 @@
 """Names the collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class SceneContacts(ScenePairs):
     separate: np.ndarray | None = None
     phase: np.ndarray | None = None
 
-    @property
+    @cached_property
     def colliding_faces(self) -> np.ndarray:
         """Faces of the segment that collide or have an edge that collides, ascending."""
         ends = self.vertices[self.elements >= EDGE]
@@ -226,15 +227,18 @@ def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: Sc
         phase[rows] = 0
         firsts, others = contacts.vertices[rows, 0], contacts.vertices[rows, 1][:, [0, 1, 1]]
         seconds = np.where((contacts.kind[rows] == 0)[:, None], segment.faces[contacts.faces[rows, 1]], others)
-        pairs = [
-            np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
-            for first in firsts.T
-            for second in seconds.T
-        ]
+        pairs = np.concatenate(
+            [
+                np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
+                for first in firsts.T
+                for second in seconds.T
+            ]
+        )
         for weight, intersections in ((2, start), (1, end)):
-            if len(tangled := intersections.tangled_vertices()):
-                crosses = [np.isin(intersections.pair_keys(pair), tangled) for pair in pairs]
-                phase[rows] += weight * np.any(crosses, axis=0)
+            if len(tangled := intersections.tangled_vertices):
+                keys = intersections.pair_keys(pairs).reshape(6, -1)
+                places = np.searchsorted(tangled, keys)
+                phase[rows] += weight * (tangled[np.minimum(places, len(tangled) - 1)] == keys).any(axis=0)
     return replace(contacts, separate=separate, phase=phase)
 
 

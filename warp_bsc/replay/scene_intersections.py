@@ -103,10 +103,11 @@ class SceneIntersections(ScenePairs):
         faces = np.stack(np.divmod(crossed, len(segment.faces)), axis=1)[lasting]
         return Cuts(ends[lasting], segment.locate_faces(faces)[0], faces)
 
+    @cached_property
     def tangled_vertices(self) -> np.ndarray:
-        """Returns the pairs of vertices of which a face, or edge of a curve, of one crosses a face of the other.
+        """The pairs of vertices of which a face, or edge of a curve, of one crosses a face of the other.
 
-        They are numbers as of :meth:`pair_keys`.
+        They are numbers as of :meth:`pair_keys`, ascending.
         """
         rows, sides = self.segment.faces_of_edges(self.vertices[self.crosses, 0])
         others = np.concatenate([self.faces[self.crosses, 1][rows], self.faces[self.of_curves, 1]])
@@ -117,8 +118,8 @@ class SceneIntersections(ScenePairs):
 
     def pair_keys(self, vertices: np.ndarray) -> np.ndarray:
         """Returns a number for each pair of vertices, whatever their order, for shape [n, 2]."""
-        first, second = np.sort(vertices, axis=1).astype(np.int64).T
-        return first * self.segment.vertex_count + second
+        first, second = vertices.astype(np.int64).T
+        return np.minimum(first, second) * self.segment.vertex_count + np.maximum(first, second)
 
 
 def name_intersections(

@@ -40,7 +40,7 @@ NO_PAIRS = {
 """The arrays of :class:`ScenePairs` without pairs. Most intervals have none, and naming these would take half of the
 fixed time of an interval."""
 
-_CHUNK = 4096
+_CHUNK = 256  # so that Python's garbage collector seldom meets the objects that a text is made of
 
 
 @dataclass(frozen=True)

@@ -401,9 +401,8 @@ class UsdMesh:
             if not self.is_placed:
                 transform = self._transform(time, before=before)
                 positions = positions @ transform[:3, :3] + transform[3, :3]
-            finite = np.isfinite(positions).all(axis=1)
-            if not finite.all():
-                first = int(np.argmin(finite))
+            if not np.isfinite(positions).all():
+                first = int(np.argmin(np.isfinite(positions).all(axis=1)))
                 raise UnreadableError(
                     f"{self._where}: vertex {used[first]} is not finite at time {time:g}: {positions[first].tolist()}"
                 )

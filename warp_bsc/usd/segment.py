@@ -301,7 +301,8 @@ class Segment:
         """Returns the faces that have any of the vertices as a corner, ascending."""
         marked = np.zeros(self.vertex_count, dtype=bool)
         marked[vertices] = True
-        return np.flatnonzero(marked[self.faces].any(axis=1))
+        a, b, c = self.faces.T
+        return np.flatnonzero(marked[a] | marked[b] | marked[c])
 
     def faces_of_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all faces that have each edge, shape [n, 2], smaller vertex first, as a side: rows, and the faces."""
