@@ -102,8 +102,7 @@ class Segment:
                 radius.append(own_radius)
                 compact[id(triangles)] = used, corners, triangles
             elif id(triangles) not in compact:
-                used, corners = np.unique(triangles, return_inverse=True)
-                compact[id(triangles)] = used, corners.reshape(-1, 3), triangles
+                compact[id(triangles)] = *_renumber(triangles, len(points)), triangles
             used, corners, _ = compact[id(triangles)]
             if not strands:
                 curves.append(np.full(len(used), -1))
@@ -144,7 +143,7 @@ class Segment:
             self._welded_to = everything
             self._welded_to[welds[0]] = welds[1]
         used = [self._welded_to[part].reshape(-1) for part in (self._corners, self._unwelded_edges, alone)]
-        self._kept, places = np.unique(np.concatenate(used), return_inverse=True)
+        self._kept, places = _renumber(np.concatenate(used), vertex_count)
         corners, ends, points = np.split(places.astype(np.int32), np.cumsum([len(used[0]), len(used[1])]))
         self.faces, self.free_edges, self.points = corners.reshape(-1, 3), ends.reshape(-1, 2), points
         self.vertex_count = len(self._kept)
@@ -524,6 +523,13 @@ def _split(groups, positions) -> np.ndarray:
         groups = groups.copy()
         groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
     return groups
+
+
+def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the indices below a count that are used, ascending, and the place among these of each index."""
+    is_used = np.zeros(count, dtype=bool)
+    is_used[indices] = True
+    return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[indices]
 
 
 def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
