@@ -9,6 +9,7 @@ import newton.examples
 import newton.utils
 import pytest
 import warp as wp
+from newton.solvers.experimental.coupled import SolverCoupled
 
 from warp_bsc.bench import newton_examples
 from warp_bsc.bench.newton_examples import WARM_UP, NewtonExample, describe_needs, find_examples, measure_example
@@ -96,7 +97,9 @@ def in_this_process(monkeypatch, tmp_path):
         (newton.examples, "run"),
         (newton.examples, "download_external_git_folder"),
         (newton.utils, "download_asset"),
+        (SolverCoupled, "__init__"),
         (sys, "argv"),
+        *((newton.solvers, name) for name in newton_examples._SOLVERS),
     ):
         monkeypatch.setattr(module, name, getattr(module, name))
 
@@ -195,13 +198,13 @@ def test_a_process_that_ends_is_a_row(write_example, device, source, problem):
 
 
 @pytest.mark.slow
-def test_a_part_of_a_coupled_solver_is_not_applicable(device):
+def test_a_part_of_a_coupled_solver_is_not_applicable(in_this_process, device):
     (example,) = find_examples(["xpbd_vbd_coupled_solver"])
     problem = fail(example, "stage", device=device)
     assert problem == "not applicable: SolverCCD cannot be a part of SolverCoupledProxy"
 
 
-def test_without_a_solver_the_stage_is_not_applicable(write_example, device):
+def test_without_a_solver_the_stage_is_not_applicable(write_example, in_this_process, device):
     example = write_example(FALLING_TRIANGLE.replace("from newton.solvers import", "from newton._src.solvers import"))
     problem = fail(example, "stage", device=device)
     assert problem is not None
@@ -228,12 +231,15 @@ def test_measures_a_triangle_that_falls_through_a_sheet(write_example, in_this_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [[], ["--derived"]], ids=["by name", "derived"])
-def test_measures_the_stage_that_stops_it(write_example, device, options):
+@pytest.mark.parametrize("derived", [False, True])
+def test_measures_the_stage_that_stops_it(write_example, device, derived, request):
+    if derived:
+        request.getfixturevalue("in_this_process")
+    options = ["--derived"] if derived else []
     found = measure(write_example(FALLING_TRIANGLE, *options), "stage", device=device, check_every=1)
     assert (found.crossings_at_start, found.most_crossings, found.first_frame_with_crossings) == (0, 0, None)
     assert (found.stage.steps, found.stage.uncertified_steps) == (8, 0)
-    assert type(newton.solvers.SolverXPBD) is type  # replaced only in that process
+    assert (type(newton.solvers.SolverXPBD) is type) != derived  # replaced only in that process
 
 
 @pytest.mark.slow
@@ -262,7 +268,7 @@ def test_an_interrupt_ends_the_process(write_example, device, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_example_of_newton(device):
+def test_an_example_of_newton(in_this_process, device):
     (example,) = find_examples(["cloth_hanging --width 8 --height 4"])
     for mode in ("plain", "stage"):
         found = measure(example, mode, device=device, frames=4)

@@ -137,7 +137,7 @@ def central_differences(device, target, velocity):
 def test_central_differences_agree_with_each_other_and_with_the_tape(target, velocity, device):
     """Within 3% in each component of at least a hundredth of the largest.
 
-    Without the layer, they are off the tape by 0.5 to 25 times its largest component. With it, the four and the tape
+    Without the layer, they are off the tape by up to 25 times its largest component. With it, the four and the tape
     are within 3% of the largest in 94 of 96 random throws; in components below a tenth of that, 1e-2 m/s is often too
     long a step.
     """
