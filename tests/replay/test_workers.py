@@ -113,8 +113,13 @@ LEFT_OUT = 4
 """The exit status of a scene of which a part is left out."""
 
 
-def test_two_workers_write_the_same_files(troubled, tmp_path, capsys):
-    alone = run(troubled, tmp_path / "1", *OPTIONS, status=LEFT_OUT)
+@pytest.fixture(scope="module")
+def alone(troubled, tmp_path_factory):
+    """The files that one process writes, in a folder as far from the scene as those of the tests: overlays name it."""
+    return run(troubled, tmp_path_factory.mktemp("alone") / "1", *OPTIONS, status=LEFT_OUT)
+
+
+def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     found = json.loads(alone["hits.json"])
     assert found["complete"] and found["hits"] + len(found["ignored"]) > 0
     assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
@@ -250,19 +255,18 @@ def stop(monkeypatch, scene, folder, at, *options):
     assert len(json.loads((folder / "hits.json").read_bytes())["intervals"]) == at
 
 
-def test_resumed(troubled, tmp_path, monkeypatch, capsys):
-    whole = run(troubled, tmp_path / "whole", *OPTIONS, status=LEFT_OUT)
+def test_resumed(troubled, alone, tmp_path, monkeypatch, capsys):
     at, in_workers = 18, ("--workers", "2")
     folder = tmp_path / "stopped"
     stop(monkeypatch, troubled, folder, at, *in_workers, *OPTIONS)
-    assert say_where(contents(folder), whole) == list(FILES.values())
+    assert say_where(contents(folder), alone) == list(FILES.values())
     capsys.readouterr()
     resumed = run(troubled, folder, "--resume", *in_workers, *OPTIONS, status=LEFT_OUT)
-    assert not say_where(resumed, whole)
+    assert not say_where(resumed, alone)
     taken = re.search(r"Taken from an earlier run: (\d+) intervals?\.", capsys.readouterr().out)
     assert (int(taken.group(1)) if taken else 0) >= at - 1
     resumed = run(troubled, folder, "--resume", *OPTIONS, status=LEFT_OUT)  # nothing is left to do
-    assert not say_where(resumed, whole)
+    assert not say_where(resumed, alone)
 
 
 def test_resumed_twice_without_a_file_at_first(tmp_path, monkeypatch, waves):
@@ -371,18 +375,17 @@ def cluster(tmp_path):
 
 @needs_dask
 @pytest.mark.slow
-def test_a_cluster_writes_the_same_files(tmp_path, cluster, troubled, waves, capsys):
+def test_a_cluster_writes_the_same_files(tmp_path, cluster, troubled, alone, waves, capsys):
     address, processes = cluster
-    alone = run(troubled, tmp_path / "1", *OPTIONS, status=LEFT_OUT)
     assert not say_where(run(troubled, tmp_path / "2", "--scheduler", address, *OPTIONS, status=LEFT_OUT), alone)
 
-    alone = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
+    expected = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
     found = []
     for result in bsc.replay(bsc.Scene(waves), device="cpu", scheduler=address):
         found.append((result.summary.index, result.summary.mesh_pairs))
         if len(found) == 4:
             processes[1].kill()
-    assert found == list(enumerate(alone))
+    assert found == list(enumerate(expected))
 
     capsys.readouterr()
     os.kill(processes[0].pid, signal.SIGKILL)
