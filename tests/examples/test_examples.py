@@ -105,12 +105,10 @@ def test_docstring_prints_its_command(path):
     assert re.findall(r"python (examples/\S+\.py)", path.read_text())[0] == name
 
 
-@pytest.mark.parametrize(
-    "path", [FOLDER / "figures" / "throw.py", FOLDER / "paper" / "record_scenes.py"], ids=lambda path: path.stem
-)
-def test_scripts_without_a_viewer_start(path, tmp_path):
+def test_scripts_without_a_viewer_start(tmp_path):
     """From any folder, by their path alone."""
-    done = subprocess.run([sys.executable, path, "--help"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    command = [sys.executable, FOLDER / "paper" / "record_scenes.py", "--help"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
