@@ -296,15 +296,16 @@ def _csv_rows(
         pairs: The pairs.
         to_columns: Returns texts of some pairs: kind, columns from the time to the normal, columns from the phase on.
     """
-    names = [_csv_text(mesh.name, mesh.path) for mesh in pairs.segment.meshes]
+    meshes = pairs.segment.meshes
+    names = {mesh: _csv_text(meshes[mesh].name, meshes[mesh].path) for mesh in np.unique(pairs.meshes).tolist()}
     for rows in pairs.chunks():
         first, second = (_csv_sides(pairs, rows, side, names) for side in range(2))
         columns = zip(*to_columns(pairs, rows), first, second, strict=True)
         yield "".join([f"{where},{kind},{a},{b},{measures},{end}\n" for kind, measures, end, a, b in columns])
 
 
-def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: list[str]) -> list[str]:
-    """Returns the columns of one side of some pairs: mesh, prim, element, and one or two indices."""
+def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: dict[int, str]) -> list[str]:
+    """Returns the columns of one side of some pairs: mesh and prim, by mesh, then element, and one or two indices."""
     columns = pairs.meshes[rows, side], pairs.elements[rows, side], *pairs.indices[rows, side].T
     return [
         f"{names[mesh]},{ELEMENT_WORDS[element]} {a},{a},"

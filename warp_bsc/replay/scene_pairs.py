@@ -78,11 +78,11 @@ class ScenePairs:
 
     def mesh_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the names of the two meshes of some pairs."""
-        return self._of_meshes([mesh.name for mesh in self.segment.meshes], rows)
+        return self._of_meshes("name", rows)
 
     def mesh_paths(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the paths of the prims of the two meshes of some pairs."""
-        return self._of_meshes([mesh.path for mesh in self.segment.meshes], rows)
+        return self._of_meshes("path", rows)
 
     def element_names(self, rows: slice) -> list[tuple[str, str]]:
         """Returns the elements of some pairs: ``"vertex 12"``, ``"face 3"``, ``"edge 4-5"`` or ``"diagonal 0-2"``."""
@@ -119,11 +119,12 @@ class ScenePairs:
             places[row] = place
         return places
 
-    def _of_meshes(self, texts, rows) -> list[tuple[str, str]]:
-        """Returns the texts of the two meshes of some pairs; pairs of the same meshes share them."""
-        keys, places = np.unique(self.meshes[rows] @ np.array([len(texts), 1]), return_inverse=True)
-        pairs = [(texts[key // len(texts)], texts[key % len(texts)]) for key in keys.tolist()]
-        return [pairs[place] for place in places.tolist()]
+    def _of_meshes(self, attribute, rows) -> list[tuple[str, str]]:
+        """Returns an attribute of the two meshes of some pairs; pairs of the same meshes share them."""
+        meshes = self.segment.meshes
+        keys, places = np.unique(self.meshes[rows] @ np.array([len(meshes), 1]), return_inverse=True)
+        both = [tuple(getattr(meshes[mesh], attribute) for mesh in divmod(key, len(meshes))) for key in keys.tolist()]
+        return [both[place] for place in places.tolist()]
 
     def mesh_keys(self) -> np.ndarray:
         """Returns a number for the two meshes of each pair, whatever their order, shape [n]."""
