@@ -78,7 +78,7 @@ def test_first_frames(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [PRINTED[0], PRINTED[-1]])  # all run in this process, below
+@pytest.mark.parametrize("name", [PRINTED[0], PRINTED[-1]])  # all run in this process, above
 def test_printed_commands_run_without_a_window_and_without_a_browser(tmp_path, name):
     for missing in ("pyglet", "viser"):
         (tmp_path / f"{missing}.py").write_text("raise ImportError")

@@ -101,10 +101,10 @@ def test_a_plane_that_a_program_moves_pushes(device):
         assert rollout.positions[:, 2].min() > 0.025 * i
 
 
-@pytest.mark.parametrize("how", ["state", "reset", "first step"])
+@pytest.mark.parametrize("how", ["state", "reset", "first step", "requires_grad"])
 def test_what_is_set_to_another_state_begins_there(how, device):
     """The ball was above the sheet, and is below it after a reset: it did not pass."""
-    model = ball_over_sheet(device)
+    model = ball_over_sheet(device, requires_grad=how == "requires_grad")
     rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
     for _ in range(0 if how == "first step" else 2):
         rollout.step()

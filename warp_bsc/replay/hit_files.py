@@ -289,7 +289,7 @@ def _to_rows(fields: dict[str, list]) -> list[dict]:
 def _csv_rows(
     where: str, pairs: _Pairs, to_columns: Callable[[_Pairs, slice], tuple[list[str], list[str], list[str]]]
 ) -> Iterator[str]:
-    """Yields rows of a CSV file, whose texts are made column by column, as many times faster than value by value.
+    """Yields rows of a CSV file, whose texts are made column by column: many times faster than value by value.
 
     Args:
         where: Text of the columns of the interval.

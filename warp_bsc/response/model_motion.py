@@ -72,11 +72,6 @@ def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _is_finite(plane: wp.vec4d) -> bool:
-    return wp.isfinite(plane[0]) and wp.isfinite(plane[1]) and wp.isfinite(plane[2]) and wp.isfinite(plane[3])
-
-
-@wp.func
 def _continues(motion: Motion, world: int) -> bool:
     """Returns whether a step begins where the last one ended, as far as movable particles of a world go."""
     last = motion.interrupted.shape[0] - 1
@@ -173,7 +168,7 @@ def _write_end(
     """
     i = wp.tid()
     if last and i < plane_ends.shape[0] and not _is_movable(motion, placement.plane_body[i]):
-        if _continues(motion, plane_world[i]) and _is_finite(plane_ends[i]):
+        if _continues(motion, plane_world[i]) and wp.isfinite(plane_ends[i]):
             plane_starts[i] = plane_ends[i]
     _place_plane(placement, i, plane_ends)
     if i >= motion.x1.shape[0]:
