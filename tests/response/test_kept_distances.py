@@ -4,65 +4,10 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import DT, SOLVERS, Changed, Rollout, add_patch, add_plates, place_plates
+from newton_scenes import DT, SOLVERS, Changed, DistanceRollout, Rollout, add_patch, add_plates, place_plates
 from test_queueless import stage
 
 import warp_bsc as bsc
-from warp_bsc.detection.distance_phase import pair_distances
-from warp_bsc.detection.settings import DistanceKind
-
-SHRUNK = 1.0 - 2.0**-28
-"""What is left at least of the distance of a pair that started nearer than it is to keep."""
-
-
-class DistanceRollout(Rollout):
-    """Steps a stage, and counts the pairs that came nearer than they may.
-
-    Attributes:
-        approaches: Number of these so far.
-        near: Pairs so far that came within their minimum distance, all of which started there.
-    """
-
-    def __init__(self, model, solver, distance=0.0, radius=0.0):
-        super().__init__(model, solver)
-        self.mesh = solver.mesh
-        radii = np.zeros(self.mesh.vertex_count)
-        radii[: model.particle_count] = radius
-        self.radius = radii + 0.5 * distance
-        mesh = bsc.CollisionMesh(
-            self.mesh.faces,
-            self.mesh.vertex_count,
-            edges=self.mesh.edges[self.mesh.free_edges],
-            points=self.mesh.points,
-            radius=self.radius,
-            world=self.mesh.world,
-            device=model.device,
-        )
-        self.distances = bsc.CollisionDetector(mesh, method="exact")
-        self.approaches = self.near = 0
-
-    def step(self, dt=DT, contacts=None):
-        super().step(dt, contacts)
-        movable = self.mesh.inverse_masses.numpy() > 0.0
-        before, after = self.start, self.vertices(self.states[0])
-        found = self.distances.detect(before, after)
-        at_rest = self.distances.find_proximities(before, 2.0 * self.radius.max())
-        pairs_at_rest = [getattr(at_rest, kind.label) for kind in DistanceKind]
-        starts = np.split(at_rest.distance, np.cumsum([len(pairs) for pairs in pairs_at_rest])[:-1])
-        for kind, near, starts_of_kind in zip(DistanceKind, pairs_at_rest, starts, strict=True):
-            pairs = getattr(found, kind.label)
-            elements = self.mesh.faces if kind == DistanceKind.VERTEX_FACE else self.mesh.edges
-            corners, distance = pair_distances(kind, elements, pairs, self.radius)
-            known = dict(zip(map(tuple, near.tolist()), starts_of_kind, strict=True))
-            start = np.array([known.get(tuple(pair), np.inf) for pair in pairs.tolist()])
-            own = movable[corners].any(axis=1)
-            self.near += np.count_nonzero(own)
-            self.approaches += np.count_nonzero(start[own] > distance[own])  # farther at the start, but not in the step
-            points = np.concatenate([before[corners[own]], after[corners[own]]], axis=1)
-            query = getattr(bsc, f"query_{kind.label}")
-            allowed = np.minimum(distance, SHRUNK * np.minimum(start, distance))[own]
-            if len(points):
-                self.approaches += np.count_nonzero(query(points, min_distance=allowed).hit)
 
 
 def add_rope(builder, points, *, mass=0.002, velocity=(0.0, 0.0, 0.0), stiffness=1e3):

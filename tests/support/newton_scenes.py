@@ -7,6 +7,8 @@ import numpy as np
 import warp as wp
 
 import warp_bsc as bsc
+from warp_bsc.detection.distance_phase import pair_distances
+from warp_bsc.detection.settings import DistanceKind
 from warp_bsc.response.model_mesh import ModelMesh
 
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     "SOLVERS",
     "STIFF",
     "Changed",
+    "DistanceRollout",
     "Rollout",
     "add_crossing_sheets",
     "add_patch",
@@ -29,6 +32,8 @@ DT = 1.0 / 240.0
 STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}
 SOFT = {"tri_ke": 2e2, "tri_ka": 2e2, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
 _HALF_PLATE = 0.05
+_SHRUNK = 1.0 - 2.0**-28
+"""What is left at least of the distance of a pair that started nearer than it is to keep."""
 
 
 def semi_implicit(model):
@@ -143,8 +148,9 @@ class Rollout:
     """Steps a solver, and asks exact detection about the motion of each step as it is stored.
 
     Attributes:
-        collisions: Collisions so far, except for those of two shapes, and of elements that crossed at the start of
-            their step.
+        collisions: Collisions so far, except for those of two shapes, and of pairs that touched or crossed at the start
+            of their step.
+        new_collisions: The four vertices of each of them in the last step.
         start: Positions of all vertices at the start of the last step.
     """
 
@@ -155,6 +161,7 @@ class Rollout:
         self.mesh = ModelMesh(model)
         self.detector = bsc.CollisionDetector(self.mesh, method="exact")
         self.collisions = 0
+        self.new_collisions = []
         self.start = self.vertices(self.states[0])
 
     def step(self, dt=DT, contacts=None):
@@ -163,24 +170,29 @@ class Rollout:
         start.clear_forces()
         self.solver.step(start, end, self.control, contacts, dt)
         self.states = end, start
-        self.collisions += self.count_collisions(self.start, self.vertices(end))
+        self.new_collisions = self.find_collisions(self.start, self.vertices(end))
+        self.collisions += len(self.new_collisions)
 
-    def count_collisions(self, before, after):
-        """The number of collisions of a motion, except for those of shapes, and of elements that crossed before."""
+    def find_collisions(self, before, after):
+        """The vertices of each collision of a motion, without those of shapes, and of what touched or crossed before.
+
+        Exact detection of the start at rest says which pairs touched.
+        """
         movable = self.mesh.inverse_masses.numpy() > 0.0
         edges, faces = self.mesh.edges, self.mesh.faces
         c = self.detector.detect(before, after)
         own = movable[c.vertex_face[:, 0]] | movable[faces[c.vertex_face[:, 1]]].any(axis=1)
-        vertex_face = list(zip(c.vertex_face[own].tolist(), c.vertex_face_toi[own], strict=True))
+        vertex_face = set(map(tuple, c.vertex_face[own].tolist()))
         own = movable[edges[c.edge_edge]].any(axis=(1, 2))
-        edge_edge = list(zip(c.edge_edge[own].tolist(), c.edge_edge_toi[own], strict=True))
+        edge_edge = set(map(tuple, c.edge_edge[own].tolist()))
         if not vertex_face and not edge_edge:
-            return 0
-        touching = self.find_crossings(before)
+            return []
+        touching = self.detector.detect(before, before)
+        vertex_face -= set(map(tuple, touching.vertex_face.tolist()))
+        edge_edge -= set(map(tuple, touching.edge_edge.tolist()))
         crossing = self.find_crossings(before, inside=True)
-        crossed = [self.vertex_crosses(*pair, crossing if toi > 0.0 else touching) for pair, toi in vertex_face]
-        crossed += [self.edges_cross(*pair, crossing if toi > 0.0 else touching) for pair, toi in edge_edge]
-        return crossed.count(False)
+        found = [[v, *faces[f].tolist()] for v, f in vertex_face if not self.vertex_crosses(v, f, crossing)]
+        return found + [edges[[a, b]].ravel().tolist() for a, b in edge_edge if not self.edges_cross(a, b, crossing)]
 
     def find_crossings(self, x, inside=False):
         """The edges and faces that meet in one configuration and can be moved; if asked, only those that do inside."""
@@ -221,6 +233,56 @@ class Rollout:
         mass = self.model.particle_mass.numpy()[:, None].astype(float)
         p = mass * self.velocities
         return p.sum(axis=0), np.cross(self.positions.astype(float), p).sum(axis=0)
+
+
+class DistanceRollout(Rollout):
+    """Steps a stage, and counts the pairs that came nearer than they may.
+
+    Attributes:
+        approaches: Number of these so far.
+        near: Pairs so far that came within their minimum distance, all of which started there.
+    """
+
+    def __init__(self, model, solver, distance=0.0, radius=0.0):
+        super().__init__(model, solver)
+        self.mesh = solver.mesh
+        radii = np.zeros(self.mesh.vertex_count)
+        radii[: model.particle_count] = radius
+        self.radius = radii + 0.5 * distance
+        mesh = bsc.CollisionMesh(
+            self.mesh.faces,
+            self.mesh.vertex_count,
+            edges=self.mesh.edges[self.mesh.free_edges],
+            points=self.mesh.points,
+            radius=self.radius,
+            world=self.mesh.world,
+            device=model.device,
+        )
+        self.distances = bsc.CollisionDetector(mesh, method="exact")
+        self.approaches = self.near = 0
+
+    def step(self, dt=DT, contacts=None):
+        super().step(dt, contacts)
+        movable = self.mesh.inverse_masses.numpy() > 0.0
+        before, after = self.start, self.vertices(self.states[0])
+        found = self.distances.detect(before, after)
+        at_rest = self.distances.find_proximities(before, 2.0 * self.radius.max())
+        pairs_at_rest = [getattr(at_rest, kind.label) for kind in DistanceKind]
+        starts = np.split(at_rest.distance, np.cumsum([len(pairs) for pairs in pairs_at_rest])[:-1])
+        for kind, near, starts_of_kind in zip(DistanceKind, pairs_at_rest, starts, strict=True):
+            pairs = getattr(found, kind.label)
+            elements = self.mesh.faces if kind == DistanceKind.VERTEX_FACE else self.mesh.edges
+            corners, distance = pair_distances(kind, elements, pairs, self.radius)
+            known = dict(zip(map(tuple, near.tolist()), starts_of_kind, strict=True))
+            start = np.array([known.get(tuple(pair), np.inf) for pair in pairs.tolist()])
+            own = movable[corners].any(axis=1)
+            self.near += np.count_nonzero(own)
+            self.approaches += np.count_nonzero(start[own] > distance[own])  # farther at the start, but not in the step
+            points = np.concatenate([before[corners[own]], after[corners[own]]], axis=1)
+            query = getattr(bsc, f"query_{kind.label}")
+            allowed = np.minimum(distance, _SHRUNK * np.minimum(start, distance))[own]
+            if len(points):
+                self.approaches += np.count_nonzero(query(points, min_distance=allowed).hit)
 
 
 def crosses_inside(x, edge, face):

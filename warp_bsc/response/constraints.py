@@ -7,7 +7,7 @@ from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import take_place
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from .buffers import Constraints, Motion, Progress, Vertices
-from .exclusion import Connectivity, crossed_at_start, is_movable
+from .exclusion import Connectivity, is_movable, met_at_start
 
 __all__ = [
     "EDGE_EDGE_CONTACT",
@@ -222,8 +222,8 @@ def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
 @wp.func
 def is_excluded(motion: Motion, contacts: Contacts, i: int, corners: wp.vec4i) -> bool:
     """Returns whether a contact is none that the response resolves, see :mod:`.exclusion`."""
-    return not is_movable(motion, corners) or crossed_at_start(
-        motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]
+    return not is_movable(motion, corners) or met_at_start(
+        motion, contacts.mesh, contacts.edges, contacts.pairs[i], corners, contacts.toi[i]
     )
 
 

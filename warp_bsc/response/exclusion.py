@@ -5,12 +5,23 @@ from newton import ShapeFlags
 
 from ..detection.settings import Count
 from ..kernels.crossing import edge_crosses_face
+from ..kernels.exact.rest import meet_at_rest
 from ..kernels.pipeline.queues import is_filled
-from ..kernels.signs import FREE, HIT
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import HIT
 from .buffers import Bodies, Motion
 from .model_mesh import Incidence
 
-__all__ = ["Connectivity", "bodies_meet", "collides", "count_crossings", "crossed_at_start", "is_movable"]
+__all__ = [
+    "Connectivity",
+    "bodies_meet",
+    "collides",
+    "count_crossings",
+    "crossed_at_start",
+    "is_movable",
+    "met_at_start",
+    "touched_at_start",
+]
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
@@ -85,8 +96,8 @@ def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
-def _edge_meets_face(motion: Motion, mesh: Connectivity, edge: int, face: int, touches: bool) -> bool:
-    """Returns whether an edge crosses a face at the start; where rounding hides it, whether their pair ``touches``."""
+def _edge_crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bool:
+    """Returns whether an edge certainly crosses a face at the start."""
     for end in range(2):
         for corner in range(3):
             if mesh.edges[edge, end] == mesh.faces[face, corner]:
@@ -97,13 +108,31 @@ def _edge_meets_face(motion: Motion, mesh: Connectivity, edge: int, face: int, t
     a = x[mesh.faces[face, 0]]
     b = x[mesh.faces[face, 1]]
     c = x[mesh.faces[face, 2]]
-    status = edge_crosses_face(x[p], x[q], a, b, c)
-    return status == HIT or (touches and status != FREE)
+    return edge_crosses_face(x[p], x[q], a, b, c) == HIT
 
 
 @wp.func
-def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i, toi: wp.float64) -> bool:
-    """Returns whether the elements of a contact already crossed at the start of the step, or touched there.
+def touched_at_start(motion: Motion, edges: int, corners: wp.vec4i, toi: wp.float64) -> bool:
+    """Returns whether the elements of a pair touched at the start of the step, exactly.
+
+    The time of impact does not say so: it is a lower bound, and 0 for contacts soon after the start as well.
+
+    Args:
+        motion: The motion.
+        edges: 1 where the pair is of edges.
+        corners: The vertices of the pair.
+        toi: Time of impact of the pair; 0 if they touched.
+    """
+    if toi > wp.float64(0.0):
+        return False
+    kind = wp.where(edges == 1, EDGE_EDGE, VERTEX_FACE)
+    x = motion.x0
+    return meet_at_rest(kind, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
+
+
+@wp.func
+def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i) -> bool:
+    """Returns whether a contact is one of elements that certainly crossed at the start of the step.
 
     A vertex that passes through a face changes which of the vertex's edges cross that face; an edge that passes through
     another changes which of the faces at either edge the other crosses. So the contact of a vertex and a face belongs
@@ -115,22 +144,28 @@ def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.ve
         mesh: Its connectivity.
         edges: 1 where the contact is of edges.
         pair: The elements of the contact.
-        toi: Its time of impact; elements that touch at the start have 0.
     """
-    touches = toi <= wp.float64(0.0)
     if edges == 1:
         for side in range(2):
             edge = pair[side]
             other = pair[1 - side]
             for i in range(mesh.edge_faces.first[other], mesh.edge_faces.first[other + 1]):
-                if _edge_meets_face(motion, mesh, edge, mesh.edge_faces.items[i], touches):
+                if _edge_crosses_face(motion, mesh, edge, mesh.edge_faces.items[i]):
                     return True
         return False
     vertex = pair[0]
     for i in range(mesh.vertex_edges.first[vertex], mesh.vertex_edges.first[vertex + 1]):
-        if _edge_meets_face(motion, mesh, mesh.vertex_edges.items[i], pair[1], touches):
+        if _edge_crosses_face(motion, mesh, mesh.vertex_edges.items[i], pair[1]):
             return True
     return False
+
+
+@wp.func
+def met_at_start(
+    motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i, corners: wp.vec4i, toi: wp.float64
+) -> bool:
+    """Returns whether the elements of a contact touched or crossed at the start: it is left to the inner solver."""
+    return touched_at_start(motion, edges, corners, toi) or crossed_at_start(motion, mesh, edges, pair)
 
 
 @wp.kernel(enable_backward=False)
@@ -151,5 +186,5 @@ def count_crossings(
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
     if is_movable(motion, corners) or motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if _edge_meets_face(motion, mesh, edge, face, False):
+        if _edge_crosses_face(motion, mesh, edge, face):
             wp.atomic_add(count, 0, 1)

@@ -55,7 +55,7 @@ from .constraints import (
     widened,
 )
 from .dividing_planes import DividingPlanes, add_dividing_plane, has_all_planes, position_on_sides
-from .exclusion import bodies_meet, crossed_at_start, is_movable
+from .exclusion import bodies_meet, crossed_at_start, is_movable, met_at_start, touched_at_start
 from .hidden_edges import are_hidden
 from .projection import has_pushed, moves_body
 from .step_record import NO_CONTACT, StepRecord, begin_iteration, is_recording
@@ -157,21 +157,22 @@ def _collect_contact(
     corners = contact_vertices(contacts, i)
     if not is_movable(motion, corners):
         if not near and bodies_meet(motion, corners):
-            if not crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i]):
+            if not met_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], corners, contacts.toi[i]):
                 wp.atomic_add(progress.status.body_hits, 0, 1)
                 for j in range(4):
                     vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
     least = wp.float64(0.0)
-    crossed = bool(False)
+    met = bool(False)
     if motion.distances.radius:
         start, kept = distances_at_start(motion, corners, contacts.kind)
         least = kept
-        crossed = start <= wp.float64(0.0)
-    may_cross = progress.status.crossings[0] > 0 or contacts.toi[i] <= wp.float64(0.0)
-    if may_cross and not crossed and contacts.kind <= EDGE_EDGE:
-        crossed = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], contacts.toi[i])
-    if crossed:
+        met = start <= wp.float64(0.0)
+    else:
+        met = touched_at_start(motion, contacts.edges, corners, contacts.toi[i])
+    if progress.status.crossings[0] > 0 and not met and contacts.kind <= EDGE_EDGE:
+        met = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i])
+    if met:
         wp.atomic_add(progress.status.crossed_hits, 0, wp.where(near, 0, 1))
         return
     world = motion.world[corners[0]]

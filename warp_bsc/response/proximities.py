@@ -221,7 +221,7 @@ def _collect_proximity(
     if is_slow(motion, corners, near.edges) == 0:
         return
     if progress.status.crossings[0] > 0:
-        if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i], _ONE):
+        if crossed_at_start(motion, near.mesh, near.edges, near.pairs[i]):
             return
     elif nearest and _is_behind(corners, near.edges, normal, distance, nearest):
         return

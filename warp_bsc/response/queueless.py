@@ -24,7 +24,7 @@ from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
 from .constraints import NO_CONSTRAINT, count_contact, distances_at_start, update_first_contact
 from .dividing_planes import DividingPlanes, add_dividing_plane
-from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable
+from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable, met_at_start
 
 __all__ = ["find_contacts_without_queues"]
 
@@ -57,13 +57,13 @@ def _resolve(
     kind: int,
     corners: wp.vec4i,
     movable: bool,
-    crossed: bool,
+    met: bool,
     toi: wp.float64,
     least: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     motion = arguments.motion
-    if crossed:
+    if met:
         wp.atomic_add(arguments.progress.status.crossed_hits, 0, wp.where(movable, 1, 0))
         return
     if not movable:
@@ -104,10 +104,10 @@ def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: 
     result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, least, ROUNDOFF, True, _TOLERANCE)
     if result.status == FREE:
         return
-    crossed = start <= wp.float64(0.0)
-    if not crossed and kind <= EDGE_EDGE:
-        crossed = crossed_at_start(motion, arguments.mesh, wp.where(kind == EDGE_EDGE, 1, 0), pair, result.toi)
-    _resolve(arguments, kind, corners, movable, crossed, result.toi, least)
+    met = start <= wp.float64(0.0)
+    if not met and kind <= EDGE_EDGE:
+        met = crossed_at_start(motion, arguments.mesh, wp.where(kind == EDGE_EDGE, 1, 0), pair)
+    _resolve(arguments, kind, corners, movable, met, result.toi, least)
 
 
 @wp.func
@@ -141,8 +141,8 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
     if result.status == FREE:
         return
     edges = wp.where(kind == EDGE_EDGE, 1, 0)
-    crossed = crossed_at_start(motion, arguments.mesh, edges, pair, result.toi)
-    _resolve(arguments, kind, corners, movable, crossed, result.toi, wp.float64(0.0))
+    met = met_at_start(motion, arguments.mesh, edges, pair, corners, result.toi)
+    _resolve(arguments, kind, corners, movable, met, result.toi, wp.float64(0.0))
 
 
 @wp.func
