@@ -57,6 +57,51 @@ def test_a_ball_set_between_steps_is_one_that_moves_in_them(coupling, device):
     assert hits > 20 and between.positions[:, 2].min() < POSES[-1][2]
 
 
+@pytest.mark.parametrize("device_loop", [False, True])
+def test_the_first_step_begins_where_the_model_puts_things(device_loop, device):
+    """Loops often set the pose for the end of the step first: the ball then comes from its pose in the model."""
+    model = ball_over_sheet(device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    if device_loop:  # nothing of the state is looked at when a graph is captured
+        with wp.ScopedCapture(device) as capture:
+            rollout.solver.step(*rollout.states, rollout.control, None, DT)
+        animate(rollout, POSES[-1])
+        wp.capture_launch(capture.graph)
+        rollout.states = rollout.states[::-1]
+    else:
+        animate(rollout, POSES[-1])
+        rollout.step()
+    report = rollout.solver.report
+    assert report.certified and report.hits > 20 and report.truncated == 0
+    assert ball_in_sheet(rollout) == status(rollout.solver, "crossings") == 0
+    assert rollout.positions[:, 2].min() < POSES[-1][2] - 0.05  # below the ball
+
+
+def arm_over_sheet(device, angle):
+    """A sheet, and a kinematic arm above it that turns about a joint, which ``joint_q`` turns by an angle."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 6, 0.04, (0.0, 0.0, 0.0))
+    arm = builder.add_link(xform=wp.transform(wp.vec3(0.0, 0.0, 0.1), wp.quat_identity()), is_kinematic=True)
+    builder.add_shape_box(arm, hx=0.1, hy=0.02, hz=0.005)
+    hinge = {"parent_xform": wp.transform(wp.vec3(-0.1, 0.0, 0.1), wp.quat_identity()), "axis": wp.vec3(0.0, 1.0, 0.0)}
+    hinge["child_xform"] = wp.transform(wp.vec3(-0.1, 0.0, 0.0), wp.quat_identity())
+    builder.add_articulation([builder.add_joint_revolute(-1, arm, **hinge)])
+    builder.joint_q[-1] = angle
+    builder.color()
+    return builder.finalize(device=device)
+
+
+@pytest.mark.parametrize(("placed", "turned", "passes"), [(0.0, 1.2, True), (1.2, 1.2, False), (1.2, -1.0, False)])
+def test_joints_may_place_bodies_before_the_first_step(placed, turned, passes, device):
+    """An arm that joint coordinates put elsewhere than ``body_q`` begins there; one at its ``body_q`` comes from it."""
+    model = arm_over_sheet(device, placed)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    model.joint_q.fill_(turned)
+    newton.eval_fk(model, model.joint_q, model.joint_qd, rollout.states[0])
+    rollout.step()
+    assert (rollout.solver.report.hits > 0) == passes and rollout.solver.report.certified
+
+
 def test_the_monitor_counts_what_a_ball_passes_between_steps(device):
     model = ball_over_sheet(device)
     rollout = Rollout(model, bsc.CollisionMonitor(Changed(model)))
@@ -101,15 +146,15 @@ def test_a_plane_that_a_program_moves_pushes(device):
         assert rollout.positions[:, 2].min() > 0.025 * i
 
 
-@pytest.mark.parametrize("how", ["state", "reset", "first step", "requires_grad"])
+@pytest.mark.parametrize("how", ["state", "reset", "state before the first step", "requires_grad"])
 def test_what_is_set_to_another_state_begins_there(how, device):
     """The ball was above the sheet, and is below it after a reset: it did not pass."""
     model = ball_over_sheet(device, requires_grad=how == "requires_grad")
     rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
-    for _ in range(0 if how == "first step" else 2):
+    for _ in range(0 if "first" in how else 2):
         rollout.step()
     expected = rollout.positions
-    if how == "state":
+    if how.startswith("state"):
         expected[0, 0] += 0.01
         rollout.states[0].particle_q.assign(expected)
     elif how == "reset":

@@ -1,5 +1,6 @@
 """The motion of a model in a step: its vertices and planes at the start, and as wanted at the end."""
 
+import newton
 import numpy as np
 import warp as wp
 from newton import BodyFlags
@@ -12,6 +13,9 @@ from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
 
 __all__ = ["ModelMotion", "moves_with_body", "wanted_velocity"]
+
+_SAME_POSE = 1e-5
+"""Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
 
 
 @wp.struct
@@ -189,6 +193,17 @@ def _write_end(
     motion.is_lost[i] = wp.where(finite, 0, 1)
 
 
+def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
+    """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
+    if not model.joint_count or (model.joint_type.numpy() == newton.JointType.FREE).all():
+        return np.empty(0, dtype=int)
+    state = model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    placed, given = state.body_q.numpy(), model.body_q.numpy()
+    given[(placed[:, 3:] * given[:, 3:]).sum(axis=1) < 0.0, 3:] *= -1.0  # the same rotation
+    return np.flatnonzero(np.abs(placed - given).max(axis=1) > _SAME_POSE)
+
+
 class ModelMotion:
     """The input of :meth:`.response.Response.resolve`, whose buffers are reused from step to step.
 
@@ -266,13 +281,22 @@ class ModelMotion:
     def remember(self, last: wp.array[wp.vec3]) -> None:
         """Makes what the response cannot move start a step where it was at the end of the last one.
 
-        Not in worlds in which a movable particle is elsewhere than then: those were set to another state.
+        Not in worlds in which a movable particle is elsewhere than then: those were set to another state. The first
+        step starts where the model puts vertices and planes, as set by :meth:`set_start` and :meth:`set_end`; but those
+        of bodies that the joint coordinates of the model put elsewhere start where the state of the step has them,
+        since a program that evaluates these does not move them.
 
         Args:
             last: Positions of the vertices at the end of the last step, which the response keeps.
         """
         self._last = last
-        self.interrupt()
+        positions, planes = self.vertices.x0.numpy(), self.planes.end.numpy()
+        misplaced = _find_misplaced_bodies(self.mesh.model)
+        first = self.mesh.model.particle_count
+        positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
+        planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
+        last.assign(positions)
+        self.planes.end.assign(planes)
 
     def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
         """Makes the next step begin where its state is.

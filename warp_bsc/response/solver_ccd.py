@@ -174,8 +174,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     leaves the step uncertified, without its elements.
 
     Kinematic particles and bodies that a program moves between steps, as animations do, take that way in the next step:
-    it begins where the last one ended. Where a movable particle has been moved as well, its world was set to another
-    state, and begins there. So does everything after :meth:`reset`, and with ``requires_grad``.
+    it begins where the last one ended, and the first one where the model puts them (``particle_q``, ``body_q``). Where
+    a movable particle has been moved as well, its world was set to another state, and begins there. So does everything
+    after :meth:`reset`, and with ``requires_grad``. A body that ``joint_q`` of the model puts elsewhere than ``body_q``
+    begins the first step where the state has it.
 
     The certificate is of straight motion: of all vertices between the stored state at the start and the stored state at
     the end, those of shapes between the poses of their bodies. The vertices of a body that turns go in arcs, whose
