@@ -38,6 +38,7 @@ def test_crossing_sheets(pull, steps, device):
     before = rollout.find_crossings(rollout.positions)
     counts = [len(before)]
     excluded = 0
+    report = rollout.solver.report
     for _ in range(steps):
         rollout.step()
         assert rollout.solver.report.certified
@@ -52,8 +53,9 @@ def test_crossing_sheets(pull, steps, device):
         assert counts[-1] > 0 and excluded > 0
     else:
         assert set(counts) == {counts[0]}
-    report = rollout.solver.report
     assert (rollout.collisions, report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0, 0)
+    assert (report.total_excluded, report.total_remaining) == (excluded, 0)
+    assert (f"contacts: 0 remained, {excluded} excluded" in str(report)) == (excluded > 0)
 
 
 def add_mesh(builder, points, indices, velocity=(0.0, 0.0, 0.0)):

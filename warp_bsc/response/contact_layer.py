@@ -269,7 +269,7 @@ def _finish_shares(
     capacities: wp.array[wp.int64],
     sums: wp.array[wp.int64],
     shares: wp.array[wp.float64],
-    layerless_steps: wp.array[int],
+    layerless_steps: wp.array[wp.int64],
 ):
     """Adds what contacts with planes count, and writes the sums; zeros if pairs are missing, so that nothing pushes."""
     vertex = wp.tid()
@@ -281,7 +281,7 @@ def _finish_shares(
     if has_overflowed(counts, capacities):
         share = _ZERO
         if vertex == 0:
-            layerless_steps[0] = layerless_steps[0] + 1
+            layerless_steps[0] += wp.int64(1)
     shares[vertex] = share
 
 
@@ -444,7 +444,7 @@ class ContactLayer:
         thickness: float,
         restitution: wp.array[float],
         distances: MinDistances,
-        layerless_steps: wp.array[int],
+        layerless_steps: wp.array[wp.int64],
     ):
         """Allocates buffers.
 

@@ -178,7 +178,7 @@ def _write_end(
     if i >= motion.x1.shape[0]:
         return
     if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
-        if _continues(motion, motion.world[i]) and wp.isfinite(last[i]):
+        if _continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
             motion.x0[i] = last[i]
     x0 = motion.x0[i]
     x1 = _position(placement, i)

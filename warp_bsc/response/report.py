@@ -17,16 +17,18 @@ __all__ = ["SolverReport", "StepTotals"]
 class StepTotals:
     """Totals over all steps so far; each field is an array of one element."""
 
-    steps: wp.array[int]
-    coupled_steps: wp.array[int]
-    uncertified_steps: wp.array[int]
-    undetected_steps: wp.array[int]
-    truncated_steps: wp.array[int]
-    frozen_steps: wp.array[int]
-    lost_steps: wp.array[int]
-    layerless_steps: wp.array[int]  # whose contact layer pushed nothing
-    grazing: wp.array[int]  # contacts whose gradients are clamped
-    lost_gradients: wp.array[int]  # steps with an incomplete record
+    steps: wp.array[wp.int64]
+    coupled_steps: wp.array[wp.int64]
+    uncertified_steps: wp.array[wp.int64]
+    undetected_steps: wp.array[wp.int64]
+    truncated_steps: wp.array[wp.int64]
+    frozen_steps: wp.array[wp.int64]
+    lost_steps: wp.array[wp.int64]
+    remaining: wp.array[wp.int64]
+    excluded: wp.array[wp.int64]
+    layerless_steps: wp.array[wp.int64]  # whose contact layer pushed nothing
+    grazing: wp.array[wp.int64]  # contacts whose gradients are clamped
+    lost_gradients: wp.array[wp.int64]  # steps with an incomplete record
 
 
 class SolverReport:
@@ -53,7 +55,7 @@ class SolverReport:
         self._substeps = substeps
         self._motion, self._response, self._responds = motion, response, responds
         self.speed_limit_lifted = lifts
-        self._totals_values = wp.zeros(len(StepTotals.vars), dtype=int, device=response.device)
+        self._totals_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=response.device)
         self._totals = name_elements(StepTotals, self._totals_values)
         self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
         self._end: float | wp.Event | None = None
@@ -249,6 +251,16 @@ class SolverReport:
         return _read(self._totals.lost_steps)
 
     @property
+    def total_remaining(self) -> int:
+        """Sum of :attr:`remaining` over the steps so far: contacts that were passed, in steps not certified."""
+        return _read(self._totals.remaining)
+
+    @property
+    def total_excluded(self) -> int:
+        """Sum of :attr:`excluded` over the steps so far; a pair counts in each step in which it has a contact."""
+        return _read(self._totals.excluded)
+
+    @property
     def truncated_steps(self) -> int:
         """Steps so far in which a path was truncated."""
         return _read(self._totals.truncated_steps)
@@ -287,6 +299,8 @@ class SolverReport:
             line += ", without VBD's speed limit"
         if self.crossings:
             line += f", {self.crossings} crossings at the start"
+        if self.total_remaining or self.total_excluded:
+            line += f"; contacts: {self.total_remaining} remained, {self.total_excluded} excluded"
         if self.lost_steps:
             line += f", {self.lost_steps} steps with positions that are not finite"
         if self.grazing or self.lost_gradients:

@@ -114,20 +114,22 @@ def _count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals
     # a certified motion of elements that did not cross makes no crossings
     unchanged = status.certified[0] == 1 and status.crossings[0] == 0 and status.excluded[0] == 0
     status.recount[0] = wp.where(unchanged, 0, 1)
-    totals.steps[0] = totals.steps[0] + 1
-    totals.coupled_steps[0] = totals.coupled_steps[0] + wp.min(substeps[0], 1)
-    totals.uncertified_steps[0] = totals.uncertified_steps[0] + 1 - status.certified[0]
-    totals.undetected_steps[0] = totals.undetected_steps[0] + status.undetected[0]
-    totals.truncated_steps[0] = totals.truncated_steps[0] + status.truncated[0]
-    totals.frozen_steps[0] = totals.frozen_steps[0] + status.frozen[0]
-    totals.lost_steps[0] = totals.lost_steps[0] + wp.min(status.lost[0], 1)
+    totals.steps[0] += wp.int64(1)
+    totals.coupled_steps[0] += wp.int64(wp.min(substeps[0], 1))
+    totals.uncertified_steps[0] += wp.int64(1 - status.certified[0])
+    totals.undetected_steps[0] += wp.int64(status.undetected[0])
+    totals.truncated_steps[0] += wp.int64(status.truncated[0])
+    totals.frozen_steps[0] += wp.int64(status.frozen[0])
+    totals.lost_steps[0] += wp.int64(wp.min(status.lost[0], 1))
+    totals.remaining[0] += wp.int64(status.remaining[0])
+    totals.excluded[0] += wp.int64(status.excluded[0])
 
 
 @wp.kernel(enable_backward=False)
 def _count_record(counts: RecordCounts, complete: wp.array[int], totals: StepTotals):
     """Adds the record of a step to the totals."""
-    totals.grazing[0] = totals.grazing[0] + counts.grazing[0]
-    totals.lost_gradients[0] = totals.lost_gradients[0] + 1 - complete[0]
+    totals.grazing[0] += wp.int64(counts.grazing[0])
+    totals.lost_gradients[0] += wp.int64(1 - complete[0])
 
 
 class _Arrays(NamedTuple):
