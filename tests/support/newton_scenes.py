@@ -33,7 +33,9 @@ STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd
 SOFT = {"tri_ke": 2e2, "tri_ka": 2e2, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
 _HALF_PLATE = 0.05
 _SHRUNK = 1.0 - 2.0**-28
-"""What is left at least of the distance of a pair that started nearer than it is to keep."""
+"""What is left at least of the distance of a pair that started nearer than it is to keep, up to rounding."""
+_ROUNDING = 2.0**-38
+"""Bound on the rounding of distances, as a share of the size of a pair."""
 
 
 def semi_implicit(model):
@@ -275,14 +277,16 @@ class DistanceRollout(Rollout):
             corners, distance = pair_distances(kind, elements, pairs, self.radius)
             known = dict(zip(map(tuple, near.tolist()), starts_of_kind, strict=True))
             start = np.array([known.get(tuple(pair), np.inf) for pair in pairs.tolist()])
-            own = movable[corners].any(axis=1)
+            own = movable[corners].any(axis=1) & (start > 0.0)  # the others touch, or are counted among the collisions
             self.near += np.count_nonzero(own)
-            self.approaches += np.count_nonzero(start[own] > distance[own])  # farther at the start, but not in the step
-            points = np.concatenate([before[corners[own]], after[corners[own]]], axis=1)
+            start, distance, corners = start[own], distance[own], corners[own]
+            self.approaches += np.count_nonzero(start > distance)  # farther at the start, but not in the step
+            points = np.concatenate([before[corners], after[corners]], axis=1)
             query = getattr(bsc, f"query_{kind.label}")
-            allowed = np.minimum(distance, _SHRUNK * np.minimum(start, distance))[own]
-            if len(points):
-                self.approaches += np.count_nonzero(query(points, min_distance=allowed).hit)
+            rounding = _ROUNDING * np.ptp(points[:, :4], axis=1).max(axis=1, initial=0.0)
+            kept = np.where(start < distance, _SHRUNK * start - rounding, distance)
+            if (kept > 0.0).any():
+                self.approaches += np.count_nonzero(query(points[kept > 0.0], min_distance=kept[kept > 0.0]).hit)
 
 
 def crosses_inside(x, edge, face):

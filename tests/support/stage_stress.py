@@ -63,6 +63,8 @@ SCENES = {
     "crossing, some held": Scene(1e-3, 0.3, crossing=True, noise=1e-2, held=0.3),
     "minimum distance, one plane, gap 1e-6 m": Scene(1e-6, 0.05, min_distance=1e-3),
     "minimum distance, near planes": Scene(5e-3, 0.2, noise=1e-3, min_distance=2e-3),
+    "minimum distance, gap 1e-12 m": Scene(1e-12, 1e-3, min_distance=1e-3),
+    "minimum distance, touching": Scene(0.0, 0.3, lattice=True, min_distance=1e-3),
 }
 
 

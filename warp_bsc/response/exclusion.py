@@ -112,22 +112,23 @@ def _edge_crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int)
 
 
 @wp.func
-def touched_at_start(motion: Motion, edges: int, corners: wp.vec4i, toi: wp.float64) -> bool:
+def touched_at_start(motion: Motion, kind: int, corners: wp.vec4i, bound: wp.float64) -> bool:
     """Returns whether the elements of a pair touched at the start of the step, exactly.
 
-    The time of impact does not say so: it is a lower bound, and 0 for contacts soon after the start as well.
+    A lower bound alone does not say so: it is 0 for a contact soon after the start as well, and for a small distance.
 
     Args:
         motion: The motion.
-        edges: 1 where the pair is of edges.
+        kind: The kind of pair.
         corners: The vertices of the pair.
-        toi: Time of impact of the pair; 0 if they touched.
+        bound: A lower bound of the time of impact, or of the distance at the start: if it is more than 0, they did
+            not touch.
     """
-    if toi > wp.float64(0.0):
+    if bound > wp.float64(0.0):
         return False
-    kind = wp.where(edges == 1, EDGE_EDGE, VERTEX_FACE)
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     x = motion.x0
-    return meet_at_rest(kind, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
+    return meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
 
 
 @wp.func
@@ -165,7 +166,8 @@ def met_at_start(
     motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i, corners: wp.vec4i, toi: wp.float64
 ) -> bool:
     """Returns whether the elements of a contact touched or crossed at the start: it is left to the inner solver."""
-    return touched_at_start(motion, edges, corners, toi) or crossed_at_start(motion, mesh, edges, pair)
+    kind = wp.where(edges == 1, EDGE_EDGE, VERTEX_FACE)
+    return touched_at_start(motion, kind, corners, toi) or crossed_at_start(motion, mesh, edges, pair)
 
 
 @wp.kernel(enable_backward=False)

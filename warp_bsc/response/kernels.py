@@ -163,13 +163,12 @@ def _collect_contact(
                     vertices.changed[corners[j]] = 1  # so that the next detection finds them again
         return
     least = wp.float64(0.0)
-    met = bool(False)
+    bound = contacts.toi[i]
     if motion.distances.radius:
         start, kept = distances_at_start(motion, corners, contacts.kind)
         least = kept
-        met = start <= wp.float64(0.0)
-    else:
-        met = touched_at_start(motion, contacts.edges, corners, contacts.toi[i])
+        bound = start
+    met = touched_at_start(motion, contacts.kind, corners, bound)
     if progress.status.crossings[0] > 0 and not met and contacts.kind <= EDGE_EDGE:
         met = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i])
     if met:

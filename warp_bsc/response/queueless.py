@@ -24,7 +24,7 @@ from ..kernels.time_of_impact import impact
 from .buffers import Motion, Progress, Vertices
 from .constraints import NO_CONSTRAINT, count_contact, distances_at_start, update_first_contact
 from .dividing_planes import DividingPlanes, add_dividing_plane
-from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable, met_at_start
+from .exclusion import Connectivity, bodies_meet, crossed_at_start, is_movable, met_at_start, touched_at_start
 
 __all__ = ["find_contacts_without_queues"]
 
@@ -104,7 +104,7 @@ def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: 
     result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, least, ROUNDOFF, True, _TOLERANCE)
     if result.status == FREE:
         return
-    met = start <= wp.float64(0.0)
+    met = touched_at_start(motion, kind, corners, start)
     if not met and kind <= EDGE_EDGE:
         met = crossed_at_start(motion, arguments.mesh, wp.where(kind == EDGE_EDGE, 1, 0), pair)
     _resolve(arguments, kind, corners, movable, met, result.toi, least)

@@ -188,7 +188,8 @@ class SolverCCD(SolverBase, CouplingHooks):
     left to the inner solver, and the step is not certified.
 
     With ``min_distance`` or ``radius`` the certificate is of distances: no pair that started farther apart comes within
-    its minimum distance, and none that started nearer comes nearer than it was, beyond the rounding of 2^-30 of that.
+    its minimum distance, and none that started nearer comes nearer than it was, beyond rounding: 2^-30 of that distance
+    and 2^-38 of the largest difference of coordinates of the pair.
     Elements that touch at the start are set aside, and elements that an edge of the mesh joins only do not touch.
 
     With ``respond=False`` the stage detects the collisions of each step, reports them, and changes nothing. A step on a
