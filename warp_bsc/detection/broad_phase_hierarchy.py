@@ -7,6 +7,7 @@ have no such order, and are compared by brute force in the worst case, 1,024 pai
 """
 
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -660,6 +661,7 @@ class BroadPhaseHierarchy:
             checked: Nonzero for each vertex that is counted, array of int; None for all.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+        self.lock = threading.RLock()
         self._padding = padding
         self._device = device = mesh.device
         self._count = count

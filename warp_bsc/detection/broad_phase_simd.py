@@ -6,6 +6,7 @@ with 2^10 cells an axis, world by world. Along a Morton curve, packets are large
 
 import functools
 import itertools
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -359,6 +360,7 @@ class BroadPhaseSimd:
             count: Not used.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+        self.lock = threading.RLock()
 
         def of_vertices(vertices: np.ndarray) -> _Tree:
             return _Tree(vertices.reshape(-1, 1), vertices, mesh.world, padding)

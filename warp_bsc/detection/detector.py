@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from .._arrays import check_finite
+from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
@@ -32,6 +33,9 @@ class CollisionDetector:
 
     Run one detection first to size the buffers. After that a detection can be captured in a CUDA graph, where it
     allocates nothing and does not synchronize, and replayed on new positions in the same arrays.
+
+    Threads may share a detector: each detection waits for the one before, and its results stay as they are. To detect
+    at the same time, make a detector for each thread; they may share the mesh.
 
     Attributes:
         mesh: The mesh.
@@ -78,10 +82,12 @@ class CollisionDetector:
             rings=rings,
             only_used_vertices=True,
         )
+        self._lock = self._pipeline.broad_phase.lock
         self._result_buffers = ContactBufferPool(mesh.device)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
 
+    @one_at_a_time
     def detect(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Collisions | CapturedCollisions:
         """Finds the collisions of a motion.
 
@@ -164,7 +170,7 @@ class CollisionDetector:
         return ProximityFinder(self.mesh, distance, rings=rings).find(x)
 
     def intersection_finder(self) -> IntersectionFinder:
-        """Returns a finder of intersections that shares trees with this detector on a CPU."""
+        """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
     def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
@@ -236,6 +242,10 @@ class CollisionDetector:
             contacts = self._ordered_contacts(counts, recycle=True)
             return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
 
+        def read_alone() -> Collisions:
+            with self._lock:
+                return read()
+
         arrays = None
         if x0.requires_grad or x1.requires_grad:
             capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
@@ -246,7 +256,7 @@ class CollisionDetector:
                 for narrow_phase, capacity in zip(pipeline.narrow_phases, capacities, strict=True)
             }
             arrays = self._differentiable(x0, x1, whole)
-        return CapturedCollisions(arrays, read)
+        return CapturedCollisions(arrays, read_alone)
 
     def _differentiable(self, x0, x1, contacts):
         return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)

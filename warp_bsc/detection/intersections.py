@@ -9,6 +9,7 @@ import warp as wp
 
 from .. import checker
 from .._arrays import check_finite
+from .._one_thread import one_at_a_time
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
@@ -75,6 +76,7 @@ class CrossingCandidates:
         pairs: Queue of the pairs, array of vec2i.
         counts: Counts of the pairs by :class:`Count`, on the device, array of int64.
         count: Number of pairs that the last :meth:`grow` has read.
+        lock: That of the broad phase, held by all that find candidates while they use them.
     """
 
     def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
@@ -87,6 +89,7 @@ class CrossingCandidates:
         self._counters = Counters(mesh.device)
         if broad_phase is None or broad_phase.capacity < UNLIMITED:
             broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self.lock = broad_phase.lock
         self._broad_phase = broad_phase
         # the counts of the edges' pairs with faces take the place of those with edges
         self.counts = self._counters.edge_edge
@@ -136,7 +139,11 @@ class Intersections:
 
 
 class IntersectionFinder:
-    """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses."""
+    """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses.
+
+    Threads may share a finder: each call waits for the one before. Where it shares the trees of a detector, no other
+    thread may detect a motion between the one whose end is given and that call.
+    """
 
     def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
         """Allocates the buffers on the mesh's device.
@@ -147,6 +154,7 @@ class IntersectionFinder:
         """
         self._mesh = mesh
         self._candidates = CrossingCandidates(mesh, broad_phase)
+        self._lock = self._candidates.lock
         self._has_run = False
         self._allocate(len(mesh.faces))
 
@@ -189,6 +197,7 @@ class IntersectionFinder:
         pairs = self._pairs_that_may_meet(start, collisions)
         return self._find(x, lambda _: self._candidates.put(pairs))
 
+    @one_at_a_time
     def _find(self, x: np.ndarray | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
         """Returns which of the pairs that a function enqueues for positions on the device meet."""
         mesh = self._mesh

@@ -9,6 +9,7 @@ import warp as wp
 
 from .. import checker
 from .._arrays import check_finite
+from .._one_thread import one_at_a_time
 from ..kernels.distance import DISTANCE_ERROR, closest_points
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import is_filled, take_slot
@@ -154,7 +155,7 @@ class ProximityFinder:
 
     A pair is a vertex and a face, two edges, a point and an edge that no face has, or two points. Radii of the mesh are
     not counted. Pairs that share a vertex or that a few edges of the mesh join are excluded, since neighbours are
-    always near.
+    always near. Threads may share a finder: each call waits for the one before.
     """
 
     def __init__(self, mesh: CollisionMesh, distance: float, *, rings: int = 1):
@@ -174,6 +175,7 @@ class ProximityFinder:
         self._distance = float(distance)
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._lock = self._broad_phase.lock
         elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
         self._near = [
             _NearPairs(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in DistanceKind
@@ -181,6 +183,7 @@ class ProximityFinder:
         self._rings = make_rings(mesh, rings)
         self._has_run = False
 
+    @one_at_a_time
     def find(self, x: np.ndarray | wp.array) -> Proximities:
         """Returns the proximities of one configuration.
 

@@ -7,6 +7,7 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
+from .._one_thread import Occupied, one_at_a_time
 from .solver_ccd import SolverCCD
 
 __all__ = ["CapturedSteps"]
@@ -48,6 +49,7 @@ class CapturedSteps:
             solver: The solver.
             state: All states and arrays that ``steps`` both reads and changes.
         """
+        self._lock = Occupied("CapturedSteps")
         self._steps, self._solver, self._device = steps, solver, solver.model.device
         self._report = solver.report if isinstance(solver, SolverCCD) else None
         self._state = list(state)
@@ -59,8 +61,13 @@ class CapturedSteps:
         self._graph = None
         self.retaken = 0
 
+    @one_at_a_time
     def __call__(self) -> None:
-        """Runs the steps once. Synchronizes with the device where a run may have to be taken back."""
+        """Runs the steps once. Synchronizes with the device where a run may have to be taken back.
+
+        Raises:
+            RuntimeError: If another thread is running them.
+        """
         if self._graph is None or not self._launch():
             self._steps()
             self._capture()

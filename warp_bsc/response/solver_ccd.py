@@ -10,6 +10,7 @@ import warp as wp
 from newton import BodyFlags
 from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 
+from .._one_thread import Occupied, one_at_a_time
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
@@ -198,6 +199,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     differentiated as it was computed, see :mod:`.adjoint`. With ``requires_grad`` all sweeps are made, so that results
     do not jump.
 
+    A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
+    one stage for each thread. A stage cannot be copied by :func:`copy.deepcopy`, nor can Newton's solvers: put a new
+    one behind a solver of the same model.
+
     Attributes:
         solver: The inner solver.
         respond: Whether the stage responds to collisions, or only reports them.
@@ -274,6 +279,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
                 solver is to be differentiated, or to have a contact layer.
         """
+        self._lock = Occupied(type(self).__name__)
         self.solver = solver
         super().__init__(solver.model)
         self.collision_pipeline = solver.collision_pipeline
@@ -408,6 +414,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
         return float(np.median(lengths)) if lengths.any() else 1.0
 
+    @one_at_a_time
     def step(
         self,
         state_in: newton.State,
@@ -434,6 +441,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             NotImplementedError: If a tape records gradients of a response that keeps a minimum distance, or of one with
                 a contact layer where shapes move with bodies.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
+            RuntimeError: If another thread is using this stage.
             NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
                 memory, such as ``SolverXPBD``.
         """
@@ -464,6 +472,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
             self.solver.step(*arguments, **options)
 
+    @one_at_a_time
     def _inspect(self, end, dt):
         """Detects the collisions of the motion from the start of the step to a state, and counts the step."""
         with self._timed():
@@ -503,6 +512,10 @@ class SolverCCD(SolverBase, CouplingHooks):
                 self._launch(_count_record, 1, inputs, outputs)
 
         def backward():
+            with self._lock:
+                go_back()
+
+        def go_back():
             if recorded is not None:
                 StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
             if pushed is not None:
@@ -520,6 +533,7 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _set_end(self, end, dt):
         self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
 
+    @one_at_a_time
     def _resolve(self, end, dt, record=None):
         """Resolves the motion from the start of the step to a state, and changes it."""
         with self._timed():
@@ -533,6 +547,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             self._finish(resolution, end)
         return resolution
 
+    @one_at_a_time
     def _couple(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
@@ -574,6 +589,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         yield
         self.report._end = now()
 
+    @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         self.solver.notify_model_changed(flags)
@@ -616,6 +632,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         """Delegates to the inner solver."""
         return self.solver.validate_observables(*arguments, **options)
 
+    @one_at_a_time
     def reset(self, state, world_mask=None, flags=None):
         """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
         self.solver.reset(state, world_mask, flags)
@@ -624,6 +641,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver."""
         self.solver.update_contacts(contacts, state)
+
+    def __deepcopy__(self, memo):
+        """Raises a TypeError: buffers on the device, and graphs that write to them, cannot be copied."""
+        raise TypeError(f"a {type(self).__name__} cannot be copied: put a new one behind a solver of the same model")
 
     def __getattr__(self, name):
         """Delegates other attributes to the inner solver."""

@@ -49,12 +49,14 @@ unselected meshes) and the changes that it makes to the motion.
 
 import math
 import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 
+from .._one_thread import one_at_a_time
 from .files import SceneFiles
 from .interval import (
     Interval,
@@ -133,7 +135,8 @@ class FrameRange:
 class Scene:
     """The moving meshes of a USD file, as intervals between consecutive times: ``for interval in scene``.
 
-    A scene holds one segment of the motion in memory and reads others when an interval needs them.
+    A scene holds one segment of the motion in memory and reads others when an interval needs them. Threads may share a
+    scene: each interval that one reads waits for the one before. Jumps are found between intervals read in order.
 
     It can be pickled, for another process that reads other intervals of the same files: the pickle holds its path, its
     options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if it is not
@@ -206,6 +209,7 @@ class Scene:
         from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
         from . import stage as usd_stage  # noqa: PLC0415
 
+        self._lock = threading.RLock()
         self._options = options
         self.path = str(path)
         self.selection = options.selection or Selection()
@@ -317,6 +321,7 @@ class Scene:
         self.take_notes()
         return self._read(index)
 
+    @one_at_a_time
     def segment(self, index: int, progress: Callable[[int, int], None] | None = None) -> Segment:
         """Returns the segment that an interval is in: the one in memory if possible.
 
@@ -343,12 +348,14 @@ class Scene:
                 self._welded = max(self._welded, self._segment.welded)
         return self._segment
 
+    @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
         """Returns what reading has revealed since this was called last, or since the scene was opened; and jumps."""
         parts, messages = self._noted
         self._noted = len(self._parts), len(self._messages)
         return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
 
+    @one_at_a_time
     def note(self, index: int, notes: ReadingNotes) -> None:
         """Records what reading an interval has revealed in another process, as if this scene had read it.
 
@@ -363,6 +370,7 @@ class Scene:
         for name in notes.jumps:
             self._jump_times.setdefault(name, set()).add(self.times[index])
 
+    @one_at_a_time
     def _read(self, index) -> Interval:
         """Reads an interval, with all that reading has revealed since notes were taken last."""
         segment, x0, x1, jumps = self._read_positions(index)
@@ -370,6 +378,7 @@ class Scene:
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
 
+    @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
         """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
         if not 0 <= index < len(self):
