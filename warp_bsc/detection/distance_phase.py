@@ -5,7 +5,6 @@ contacts. The minimum distance of a pair is the sum of two radii, rounded to dou
 its own, that of an edge or a face the largest one of its vertices.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,7 +20,7 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .contact_buffer import HostContacts
 from .kernels import PairStages
-from .launch import launch_over, launch_over_queue
+from .launch import launch, launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings
 from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
@@ -139,7 +138,7 @@ class _Kernels(NamedTuple):
     find_closest: wp.Kernel
 
 
-@functools.cache
+@made_once
 def _kernels(dtype: type) -> _Kernels:
     """Returns the kernels for one type of position, each in a module of its own."""
 
@@ -394,5 +393,5 @@ def decide_distances_on_host(
     timed_pairs = wp.array(contacts.pairs[again], dtype=wp.vec2i, device=x0.device)
     inputs = [x0, x1, elements, int(kind), timed_pairs, wp.array(toi[again], dtype=wp.float64, device=x0.device)]
     kernel = _kernels(x0.dtype).find_closest
-    wp.launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
+    launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
     contacts.coordinates[again], contacts.normal[again] = (output.numpy() for output in outputs)

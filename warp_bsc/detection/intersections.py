@@ -15,7 +15,7 @@ from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
 from .broad_phase import BroadPhase, make_broad_phase
 from .collisions import Collisions
-from .launch import launch_over_queue, retry_until_fits
+from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
@@ -27,7 +27,7 @@ _PAIRS_OF_HIT = 8
 """Pairs of an edge and a face for each collision, roughly. More of them than edges take longer than a search."""
 
 
-@functools.cache
+@made_once
 def _keep_crossings(dtype: type) -> wp.Kernel:
     """The kernel that keeps the pairs that are not certified apart, for one type of position."""
 

@@ -1,13 +1,12 @@
 """Detection on the device alone: broad phase and narrow phases, without results on the host."""
 
-import functools
-
 import numpy as np
 import warp as wp
 
 from .approach_phase import MinDistances, run_approach_phases
 from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import checked_distance, run_distance_phases
+from .launch import launch, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
 from .rings import Rings, make_rings
@@ -25,7 +24,7 @@ _LARGEST_RADIUS = 2.0**1000
 _UNTIMED = StageTimer(None)
 
 
-@functools.cache
+@made_once
 def _count_not_finite(dtype: type) -> wp.Kernel:
     """The kernel that counts positions that are not finite, for one type of position."""
 
@@ -286,4 +285,4 @@ class DetectionPipeline:
         vertices, device = self._checked_vertices, self.mesh.device
         dim = self.mesh.vertex_count if vertices is None else len(vertices)
         inputs, outputs = [x0, x1, vertices], [self.counters.not_finite]
-        wp.launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)
+        launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)

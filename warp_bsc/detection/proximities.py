@@ -1,6 +1,5 @@
 """Proximities of a mesh with itself in one configuration: pairs of elements that are at most some distance apart."""
 
-import functools
 import math
 from dataclasses import dataclass
 
@@ -16,7 +15,7 @@ from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .broad_phase import make_broad_phase
 from .distance_phase import pair_distances
-from .launch import launch_over_queue, retry_until_fits
+from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .rings import Rings, are_within_rings, make_rings
 from .settings import NO_GRADIENTS, Count, Counters, DistanceKind, capacity_for
@@ -29,7 +28,7 @@ _LARGEST = 2.0**1000
 """Largest coordinate: differences and their sums stay finite."""
 
 
-@functools.cache
+@made_once
 def _keep_near(dtype: type) -> wp.Kernel:
     """The kernel that keeps the pairs that are near and not joined, for one type of position."""
 

@@ -200,8 +200,9 @@ class SolverCCD(SolverBase, CouplingHooks):
     do not jump.
 
     A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
-    one stage for each thread. A stage cannot be copied by :func:`copy.deepcopy`, nor can Newton's solvers: put a new
-    one behind a solver of the same model.
+    one stage for each thread. Warp and Newton load their kernels in the first steps that need them, which two threads
+    must not do at the same time: let one thread take first steps. A stage cannot be copied by :func:`copy.deepcopy`:
+    put a new one behind a solver of the same model.
 
     Attributes:
         solver: The inner solver.
