@@ -27,7 +27,6 @@ from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
 from .stage_timer import StageTimer
 
 __all__ = [
-    "checked_distance",
     "decide_distances_on_host",
     "distance_of_corners",
     "firsts_of",
@@ -49,21 +48,6 @@ _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
-
-
-def checked_distance(min_distance: float | np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
-    """Returns a minimum distance, or one each, in double precision.
-
-    Raises:
-        ValueError: If the distances are neither one number nor of the shape, or not finite and at least 0.
-    """
-    distance = np.asarray(min_distance, dtype=np.float64)
-    if distance.shape not in ((), shape):
-        shapes = "must be one number" + (f" or have shape {shape}" if shape else "")
-        raise ValueError(f"min_distance {shapes}, not {distance.shape}")
-    if not (np.isfinite(distance) & (distance >= 0.0)).all():
-        raise ValueError("min_distance must be finite and at least 0")
-    return distance
 
 
 @wp.func

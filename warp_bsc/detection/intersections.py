@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from .._arrays import check_finite
+from .._arguments import check_finite
 from .._one_thread import one_at_a_time
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot

@@ -1,13 +1,12 @@
 """Proximities of a mesh with itself in one configuration: pairs of elements that are at most some distance apart."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from .. import checker
-from .._arrays import check_finite
+from .._arguments import check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.distance import DISTANCE_ERROR, closest_points
 from ..kernels.pipeline.pairs import points_of_pair
@@ -166,12 +165,12 @@ class ProximityFinder:
             rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
 
         Raises:
-            ValueError: If the distance is no finite number more than 0, or the rings are less than 0.
+            TypeError: If an argument has another type.
+            ValueError: If the distance is not finite or less than 2^-1021, or the rings are out of range.
         """
-        if not (math.isfinite(distance) and distance > 0.0):
-            raise ValueError(f"a distance must be a finite number more than 0, not {distance!r}")
+        check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self._mesh = mesh
-        self._distance = float(distance)
+        self._distance = checked_distance(distance, "distance", zero=False)
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
         self._lock = self._broad_phase.lock
@@ -205,7 +204,7 @@ class ProximityFinder:
         check_finite(positions, "x", mesh.vertices)
         largest = float(np.abs(positions[mesh.vertices]).max(initial=0.0))
         if largest > _LARGEST:
-            raise ValueError(f"positions must be at most 2^1000 to have distances, not {largest:g}")
+            raise ValueError(f"x must be at most 2^1000 to have distances, not {largest:g}")
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True

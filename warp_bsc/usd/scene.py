@@ -56,6 +56,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from .._arguments import check_instance, checked_flag, checked_integer, checked_number, given
 from .._one_thread import one_at_a_time
 from .files import SceneFiles
 from .interval import (
@@ -73,6 +74,7 @@ from .selection import Selection
 __all__ = ["FrameRange", "Scene"]
 
 _JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
+_MOST_PARTS = 10_000  # of a step between two times
 _NAMED = 5  # most parts left out, and most messages of OpenUSD, that the warnings list
 _ROUNDING = 1e-12
 _SAME_TIME = 1e-6
@@ -91,12 +93,26 @@ class FrameRange:
     Attributes:
         start: First time code, None for that of the scene.
         end: Last time code, None for that of the scene.
-        step: Time codes from one time to the next, None for the samples that the scene has.
+        step: Time codes from one time to the next, more than 0, None for the samples that the scene has.
+
+    Raises:
+        TypeError: If one of them is no number.
+        ValueError: If one of them is not finite, the end is not after the start, or the step is not more than 0.
     """
 
     start: float | None = None
     end: float | None = None
     step: float | None = None
+
+    def __post_init__(self):
+        """Checks the attributes."""
+        for name in ("start", "end", "step"):
+            value = getattr(self, name)
+            if value is not None:
+                limits = {"least": 0.0, "above": True} if name == "step" else {}
+                object.__setattr__(self, name, checked_number(value, name, **limits))
+        if self.start is not None and self.end is not None and self.end <= self.start:
+            raise ValueError(f"end must be after the start, {self.start:g}, not {self.end:g}")
 
     def bounds(self, samples: list[float]) -> tuple[float, float]:
         """Returns the first and the last time, given all times of the scene, ascending."""
@@ -126,7 +142,7 @@ class FrameRange:
         times = sorted(time for time in times if low <= time <= high)
         if len(times) < 2:
             raise ValueError(
-                f"--frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
+                f"frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
                 f"{samples[-1]:g}"
             )
         return times
@@ -181,7 +197,7 @@ class Scene:
             path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
             selection: Which of its meshes are checked; default: those to be rendered.
             frames: The part of its time; default: all.
-            subdivide: Number of intervals, at least 1, into which each step between two times is divided.
+            subdivide: Number of intervals, 1 to 10,000, into which each step between two times is divided.
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
@@ -189,11 +205,25 @@ class Scene:
                 have been compared, and of all.
 
         Raises:
+            TypeError: If an argument has another type.
             FileNotFoundError: If there is no such file.
             ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
                 ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
-        options = _Options(selection, frames, subdivide, sample_turns, strict)
+        check_instance(path, "path", (str, os.PathLike), "the path of a file")
+        if selection is not None:
+            check_instance(selection, "selection", Selection, "a Selection")
+        if frames is not None:
+            check_instance(frames, "frames", FrameRange, "a FrameRange")
+        if progress is not None and not callable(progress):
+            raise TypeError(f"progress must be a function, not {given(progress)}")
+        options = _Options(
+            selection,
+            frames,
+            checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
+            checked_flag(sample_turns, "sample_turns"),
+            checked_flag(strict, "strict"),
+        )
         self._open(path, options, _Revealed(), progress)
 
     def _open(
