@@ -24,6 +24,7 @@ __all__ = [
     "add_threads",
     "distance",
     "naming_options",
+    "natural",
     "positive",
 ]
 
@@ -160,10 +161,23 @@ def positive(text: str) -> int:
     Raises:
         argparse.ArgumentTypeError: If it is no integer or not in [1, 2^31).
     """
+    return _integer(text, 1)
+
+
+def natural(text: str) -> int:
+    """The integer that an argument holds, which may be 0.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is no integer or not in [0, 2^31).
+    """
+    return _integer(text, 0)
+
+
+def _integer(text: str, least: int) -> int:
     try:
         number = int(text)
     except ValueError:
-        number = 0
-    if not 1 <= number < 2**31:
-        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, less than 2^31, not {text}")
+        number = least - 1
+    if not least <= number < 2**31:
+        raise argparse.ArgumentTypeError(f"must be an integer of at least {least}, less than 2^31, not {text}")
     return number

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from .._arguments import check_finite
+from .._arguments import check_finite, check_instance
 from .._one_thread import one_at_a_time
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
@@ -152,6 +152,7 @@ class IntersectionFinder:
             mesh: The mesh.
             broad_phase: As of :class:`CrossingCandidates`.
         """
+        check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self._mesh = mesh
         self._candidates = CrossingCandidates(mesh, broad_phase)
         self._lock = self._candidates.lock
@@ -167,7 +168,8 @@ class IntersectionFinder:
             is_end: Whether they are those at the end of the last motion that the given broad phase has seen.
 
         Raises:
-            ValueError: If the positions have another shape or type, or are not finite.
+            TypeError: If the positions are no array of numbers.
+            ValueError: If they have another shape or type, or are not finite.
         """
         found = self._find(x, lambda positions: self._candidates.find(positions, refit=self._has_run, is_end=is_end))
         self._has_run = True

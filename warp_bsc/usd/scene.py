@@ -53,6 +53,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from numbers import Integral
 
 import numpy as np
 
@@ -328,11 +329,16 @@ class Scene:
             stop: Number of the interval after the last one; default: all.
 
         Raises:
+            TypeError: If a number is no integer.
             IndexError: If there is no such interval.
             ValueError: As of :meth:`interval`.
         """
+        first = self._checked_index(first, "first", len(self))
+        stop = len(self) if stop is None else self._checked_index(stop, "stop", len(self))
+        return self._intervals(first, stop)
+
+    def _intervals(self, first: int, stop: int) -> Iterator[Interval]:
         self.take_notes()
-        stop = len(self) if stop is None else stop
         if 0 < first < stop and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
             self._read_positions(first - 1)
         for index in range(first, stop):
@@ -345,9 +351,11 @@ class Scene:
             index: Number of the interval, from 0: it starts at that one of :attr:`times`.
 
         Raises:
+            TypeError: If a number is no integer.
             IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
+        index = self._checked_index(index, "index", len(self) - 1)
         self.take_notes()
         return self._read(index)
 
@@ -411,8 +419,6 @@ class Scene:
     @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
         """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
         with self._collecting(self._messages, self.path):
             while True:
@@ -429,6 +435,15 @@ class Scene:
         for name in jumps:
             self._jump_times.setdefault(name, set()).add(start)
         return segment, x0, x1, jumps
+
+    def _checked_index(self, index, name, last) -> int:
+        """Returns the number of an interval; raises a TypeError, or an IndexError if it is not in [0, last]."""
+        if not isinstance(index, Integral) or isinstance(index, bool):
+            raise TypeError(f"{name} must be an integer, not {given(index)}")
+        if not 0 <= int(index) <= last:
+            number = given(int(index))
+            raise IndexError(f"{self.path}: {name}: there is no interval {number}, they go from 0 to {len(self) - 1}")
+        return int(index)
 
     def _contents(self) -> tuple:
         """Returns facts of the scene that another process must find, too."""
