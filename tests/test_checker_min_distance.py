@@ -48,7 +48,7 @@ def lattice(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@given(data=st.data(), exponent=st.integers(-1060, 1000))
+@given(data=st.data(), exponent=st.integers(-1020, 1000))
 @settings(max_examples=25)
 def test_lattice(kind, data, exponent):
     """Integer coordinates, whose distances are often exactly the one asked for, at any scale."""
@@ -137,7 +137,7 @@ def test_bad_input_is_refused(function):
     for distance in (-1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="finite and at least 0"):
             function(points, distance)
-    with pytest.raises(ValueError, match="one number or 3, one a query"):
+    with pytest.raises(ValueError, match=r"one number or have shape \(3,\)"):
         function(points, [1.0, 2.0])
     with pytest.raises(ValueError, match=rf"shape \(n, {rows}, 3\)"):
         function(np.zeros((3, rows + 1, 3)))

@@ -35,15 +35,16 @@ def test_a_checkout_that_is_not_installed_has_its_own_kernels(tmp_path):
 
 PACKAGES = {
     "kernels": set(),
-    "_arrays": set(),
+    "_arguments": set(),
     "_atomic_file": set(),
-    "checker": {"_arrays"},
-    "detection": {"kernels", "checker", "_arrays"},
-    "response": {"detection", "kernels"},
-    "usd": set(),
-    "replay": {"usd", "detection", "checker", "_atomic_file"},
+    "_one_thread": set(),
+    "checker": {"_arguments"},
+    "detection": {"kernels", "checker", "_arguments", "_one_thread"},
+    "response": {"detection", "kernels", "_arguments", "_one_thread"},
+    "usd": {"_arguments", "_one_thread"},
+    "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file"},
     "bench": {"detection", "kernels", "usd", "checker", "response"},
-    "cli": {"replay", "bench", "detection", "usd", "_atomic_file"},
+    "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file"},
     "__main__": {"cli"},
     "__init__": {"checker", "detection", "replay", "response", "usd"},  # for type checkers alone
 }

@@ -72,7 +72,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ._arrays import checked_coordinates
+from ._arguments import checked_coordinates, checked_distances
 
 __all__ = [
     "edge_edge",
@@ -114,15 +114,16 @@ def vertex_face(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
 
     Args:
         points: Positions, float32 or float64 array of shape (n, 8, 3), rows p0 a0 b0 c0 p1 a1 b1 c1.
-        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
-            one for all queries, or one each, shape (n,).
+        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
+            as exact: one for all queries, or one each, shape (n,).
 
     Returns:
         Bool array of shape (n,).
 
     Raises:
-        ValueError: If a shape or a type is wrong, a coordinate is not finite, or a distance is no finite number of at
-            least 0.
+        TypeError: If an argument is no number or array of numbers.
+        ValueError: If a shape or a type is wrong, entries are masked, a coordinate is not finite, or a distance is out
+            of range.
     """
     return _answer(_collides, "vertex_face", points, min_distance)
 
@@ -251,6 +252,7 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
         Bool array of shape (n,).
 
     Raises:
+        TypeError: If an argument is no array of numbers.
         ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
     edges, faces = _checked_pairs(edges, faces)
@@ -275,6 +277,7 @@ def edges_pass_faces(edges: ArrayLike, faces: ArrayLike, across: ArrayLike) -> n
         Bool array of shape (n,).
 
     Raises:
+        TypeError: If an argument is no array of numbers.
         ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
     edges, faces = _checked_pairs(edges, faces)
@@ -311,6 +314,7 @@ def rays_pass_faces(points: ArrayLike, faces: ArrayLike) -> np.ndarray:
         Int8 array of shape (n,): 1 if the ray comes out through the face, -1 if it goes in, 0 if it does not meet it.
 
     Raises:
+        TypeError: If an argument is no array of numbers.
         ValueError: If a shape or a type is wrong, the lengths differ, or a coordinate is not finite.
     """
     points = checked_coordinates(points, (3,), "points")
@@ -370,12 +374,7 @@ def _answer(
 ) -> np.ndarray:
     """Returns what ``ask`` makes of the queries of a kind; raises ValueError as :func:`vertex_face`."""
     points = checked_coordinates(points, (2 * (_POLYGONS[kind].max() + 1), 3), "points")
-    distance = np.asarray(min_distance, dtype=np.float64)
-    if distance.shape not in ((), (len(points),)):
-        raise ValueError(f"min_distance must be one number or {len(points)}, one a query, got {distance.shape}")
-    if not (np.isfinite(distance) & (distance >= 0.0)).all():
-        raise ValueError("min_distance must be finite and at least 0")
-    distance = np.broadcast_to(distance, len(points))
+    distance = np.broadcast_to(checked_distances(min_distance, "min_distance", len(points)), len(points))
     answer = np.zeros(len(points), dtype=bool) if ask is _collides else np.full((len(points), 2), np.nan)
     triangles = {"vertex_face": _VERTEX_FACE, "edge_edge": _EDGE_EDGE}.get(kind)
     touching = (distance == 0.0) & (triangles is not None)

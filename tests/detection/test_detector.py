@@ -199,11 +199,11 @@ def test_huge_double_positions_keep_their_pairs(broad_phase):
 
 def test_bad_meshes_are_refused():
     for faces, message in [
-        ([[0, 1, 9]], r"face 0 is \[0, 1, 9\], but the mesh has 4 vertices"),
-        ([[0, 1, -1]], "face 0"),
+        ([[0, 1, 9]], r"faces\[0\] is \[0, 1, 9\], but the mesh has 4 vertices"),
+        ([[0, 1, -1]], r"faces\[0\]"),
         ([[0, 1]], r"shape \(n, 3\)"),
         ([[0.0, 1.0, 2.0]], "integers"),
-        ([[0, 1, 2**32]], "face 0"),
+        ([[0, 1, 2**32]], r"faces\[0\]"),
         (np.zeros((0, 4), int), r"shape \(n, 3\)"),
         (np.zeros((3, 0), int), r"shape \(n, 3\)"),
         (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 faces"),
@@ -211,7 +211,8 @@ def test_bad_meshes_are_refused():
         with pytest.raises(ValueError, match=message):
             bsc.CollisionMesh(faces, 4)
     for vertex_count in (-1, 2**31, 6.5, 6.0, np.nan, "6", None):
-        with pytest.raises(ValueError, match=f"vertex_count must be an integer .* not {vertex_count!r}"):
+        error = ValueError if isinstance(vertex_count, int) else TypeError
+        with pytest.raises(error, match=f"vertex_count must be an integer.* not {vertex_count!r}"):
             bsc.CollisionMesh([[0, 1, 2]], vertex_count)
 
 
@@ -231,7 +232,7 @@ def test_bad_positions_are_refused():
         detector.detect(np.zeros((4, 2)), x)
     with pytest.raises(ValueError, match="float32 or float64"):
         detector.detect(x.astype(int), x)
-    with pytest.raises(ValueError, match="same type"):
+    with pytest.raises(ValueError, match="x1 must have the type of x0"):
         detector.detect(x, x.astype(np.float32))
     bad = x.copy()
     bad[2, 1] = np.nan
@@ -599,13 +600,13 @@ def test_worlds_do_not_collide_with_one_another(broad_phase):
 
 def test_bad_worlds_are_refused():
     for world, message in [
-        ([0, 0, 1], r"face 0 has vertices in worlds \[0, 0, 1\]"),
+        ([0, 0, 1], r"world must be one for a face, but faces\[0\] has \[0, 0, 1\]"),
         ([0, 0], "3 integers"),
-        ([0, -1, 0], "vertex 1 is in world -1"),
-        ([0, 0, 2**31], f"vertex 2 is in world {2**31}"),
-        (np.full(3, 2**32), f"vertex 0 is in world {2**32}"),
-        (np.full(3, 2**64 - 1, np.uint64), f"vertex 0 is in world {2**64 - 1}"),
-        (wp.full(3, 2**31, dtype=wp.int64), f"vertex 0 is in world {2**31}"),
+        ([0, -1, 0], r"world\[1\] must be in \[0, 2\^31\), not -1"),
+        ([0, 0, 2**31], rf"world\[2\] must be .*, not {2**31}"),
+        (np.full(3, 2**32), rf"world\[0\] must be .*, not {2**32}"),
+        (np.full(3, 2**64 - 1, np.uint64), rf"world\[0\] must be .*, not {2**64 - 1}"),
+        (wp.full(3, 2**31, dtype=wp.int64), rf"world\[0\] must be .*, not {2**31}"),
         ([0.0, 0.0, 0.0], "3 integers"),
     ]:
         with pytest.raises(ValueError, match=message):

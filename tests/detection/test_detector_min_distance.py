@@ -11,6 +11,7 @@ from warp_bsc.detection import intersections, pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.detection.distance_phase import pair_distances
+from warp_bsc.detection.rings import make_rings
 from warp_bsc.detection.settings import DistanceKind
 
 
@@ -277,14 +278,14 @@ def test_elements_of_a_mesh():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"edges": [[0, 9]]}, r"edge 0 is \[0, 9\], but the mesh has 3 vertices"),
-        ({"edges": [[1, 1]]}, "edge 0 has vertex 1 twice"),
+        ({"edges": [[0, 9]]}, r"edges\[0\] is \[0, 9\], but the mesh has 3 vertices"),
+        ({"edges": [[1, 1]]}, r"edges\[0\] has vertex 1 twice"),
         ({"edges": [[0, 1, 2]]}, r"edges must have shape \(n, 2\)"),
-        ({"points": [-1]}, "point 0 is -1, but the mesh has 3 vertices"),
+        ({"points": [-1]}, r"points\[0\] is -1, but the mesh has 3 vertices"),
         ({"points": [0.5]}, "points must be integers"),
-        ({"radius": [1.0, 2.0]}, "one number or 3, one a vertex"),
+        ({"radius": [1.0, 2.0]}, r"radius must be one number or have shape \(3,\)"),
         ({"radius": -1.0}, "finite and at least 0"),
-        ({"edges": [[0, 1]], "world": [0, 1, 1]}, r"edge \[0, 1\] has vertices in worlds \[0, 1\]"),
+        ({"edges": [[0, 1]], "world": [0, 1, 1]}, r"world must be one for an edge, but edge \[0, 1\] has \[0, 1\]"),
     ],
 )
 def test_bad_meshes_are_refused(arguments, message):
@@ -320,3 +321,34 @@ def test_edges_and_points_without_a_distance():
     assert found.edge_edge.tolist() == [sorted([side, strand])]
     assert len(found.vertex_edge) == len(found.vertex_vertex) == 0
     assert detector.find_intersections(x0).tolist() == [[passing, 0]]
+
+
+def test_rings_are_those_of_a_search_by_breadth():
+    x, faces = grid(5)
+    n = len(x)
+    mesh = bsc.CollisionMesh(faces, n, device="cpu")
+    joined = np.eye(n, dtype=bool)
+    joined[mesh.edges[:, 0], mesh.edges[:, 1]] = joined[mesh.edges[:, 1], mesh.edges[:, 0]] = True
+    near = joined
+    for rings in (*range(1, 12), 10**9, np.int64(40)):
+        found = make_rings(mesh, rings)
+        starts = found.starts.numpy()
+        reached = np.eye(n, dtype=bool)
+        reached[np.repeat(np.arange(n), np.diff(starts)), found.neighbours.numpy()] = True
+        assert np.array_equal(reached, near if rings < 12 else np.ones((n, n)))
+        near = near.astype(int) @ joined > 0
+
+
+def test_rings_that_hold_too_much_are_refused_at_once():
+    """One vertex in all faces: all are within two edges of each other."""
+    n = 30_000
+    fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
+    mesh = bsc.CollisionMesh(fan, n, device="cpu")
+    for rings in (2, 10**9):
+        with pytest.raises(ValueError, match=f"rings must be less for this mesh, not {rings}"):
+            bsc.CollisionDetector(mesh, min_distance=1.0, rings=rings)
+    for rings in (-1, 2**31):  # with a distance or without one
+        with pytest.raises(ValueError, match="rings must be an integer of at least 0, less than"):
+            bsc.CollisionDetector(mesh, rings=rings)
+    with pytest.raises(TypeError, match="rings must be an integer, not None"):
+        bsc.CollisionDetector(mesh, rings=None)

@@ -160,7 +160,7 @@ def test_no_queries_give_no_answers():
         (np.zeros((3, 8, 3), dtype=int), "float32 or float64"),
         (np.zeros((3, 8, 2)), r"shape \(n, 8, 3\)"),
         (np.zeros((8, 3)), r"shape \(n, 8, 3\)"),
-        (np.broadcast_to(0.0, (2**29, 8, 3)), r"at most 2\^29 - 1 queries"),
+        (np.broadcast_to(0.0, (2**29, 8, 3)), r"points must have at most 2\^29 - 1 rows"),
         (np.where(np.arange(72).reshape(3, 8, 3) == 30, np.nan, 0.0), r"points\[1\]"),
         (np.where(np.arange(72).reshape(3, 8, 3) == 70, np.inf, 0.0), r"points\[2\]"),
     ],

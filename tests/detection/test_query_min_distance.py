@@ -3,9 +3,12 @@
 import distances
 import numpy as np
 import pytest
+from flushing import subnormals_flushed
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.detection.launch import cores
+from warp_bsc.detection.proximities import ProximityFinder
 
 KINDS = distances.KINDS
 QUERIES = {kind: getattr(bsc, f"query_{kind}") for kind in KINDS}
@@ -79,3 +82,66 @@ def test_bad_distances_are_refused():
         bsc.query_edge_edge(points, min_distance=[1.0, 1.0])
     with pytest.raises(ValueError, match=r"shape \(n, 6, 3\)"):
         bsc.query_vertex_edge(points, min_distance=1.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_least_distances_are_right_on_a_processor_that_flushes_subnormals(kind):
+    """Lattices as small as the distances, and distances that are reached exactly, or missed by one in eight."""
+    half = distances.POINTS[kind]
+    points = np.random.default_rng(8).integers(-3, 4, (60, 2 * half, 3)).astype(np.float64)
+    for exponent in (-1021, -1019, -1000):
+        distance = np.ldexp(np.resize([1.0, 1.125, 2.0, 3.0], 60), exponent)
+        rows = np.ldexp(points, exponent)
+        truth = getattr(checker, kind)(points, np.ldexp(distance, -exponent))
+        assert 0 < truth.sum() < 60
+        assert np.array_equal(getattr(checker, kind)(rows, distance), truth)
+        with subnormals_flushed(), cores(1):
+            checked = getattr(checker, kind)(rows, distance)
+            exact = QUERIES[kind](rows, min_distance=distance, device="cpu")
+            conservative = QUERIES[kind](rows, min_distance=distance, method="conservative", device="cpu")
+        assert np.array_equal(checked, truth)
+        assert np.array_equal(exact.hit, truth)
+        assert conservative.hit[truth].all()
+        assert truth[conservative.status == 1].all() and not truth[conservative.status == 0].any()
+
+
+def refused():
+    """Calls that have a distance or a radius, by name."""
+    points, mesh = np.zeros((3, 8, 3)), bsc.CollisionMesh([[0, 1, 2]], 3, device="cpu")
+    return {
+        "query": lambda d: bsc.query_vertex_face(points, min_distance=d, device="cpu"),
+        "queries": lambda d: bsc.query_edge_edge(points, min_distance=[0.0, 1.0, d], device="cpu"),
+        "checker": lambda d: checker.edge_edge(points, d),
+        "mesh": lambda d: bsc.CollisionMesh([[0, 1, 2]], 3, radius=d, device="cpu"),
+        "radii": lambda d: bsc.CollisionMesh([[0, 1, 2]], 3, radius=[0.0, d, 1.0], device="cpu"),
+        "detector": lambda d: bsc.CollisionDetector(mesh, min_distance=d),
+        "proximities": lambda d: ProximityFinder(mesh, d),
+    }
+
+
+@pytest.mark.parametrize("name", refused())
+@pytest.mark.parametrize("flushed", [False, True])
+def test_smaller_distances_are_refused(name, flushed):
+    """Also where the processor takes them for 0, which is allowed."""
+    call = refused()[name]
+    for distance in (2.0**-1074, 2.0**-1060, 2.0**-1040, 2.0**-1022, np.nextafter(2.0**-1021, 0.0)):
+        with pytest.raises(ValueError, match=r"(min_distance|distance|radius).* at least 2\^-1021"):
+            if flushed:
+                with subnormals_flushed(), cores(1):
+                    call(distance)
+            else:
+                call(distance)
+    call(2.0**-1021)
+
+
+@pytest.mark.parametrize("flushed", [False, True])
+def test_distances_in_single_precision_may_be_subnormal_there(flushed):
+    """As doubles they are normal."""
+    given = np.array([0.0, 1e-45, 1e-38, 2.0], dtype=np.float32)
+    expected = given.astype(np.float64)
+    if flushed:
+        with subnormals_flushed(), cores(1):
+            radius = bsc.CollisionMesh([], 4, radius=given, device="cpu").radius
+    else:
+        radius = bsc.CollisionMesh([], 4, radius=given, device="cpu").radius
+    assert radius.tobytes() == expected.tobytes()

@@ -233,8 +233,8 @@ def test_springs_that_take_part(device):
     ("options", "message"),
     [
         ({"min_distance": -1.0}, "min_distance must be finite and at least 0"),
-        ({"radius": np.ones(3)}, r"radius must be one number or 59, one a particle"),
-        ({"radius": np.nan}, "radii must be finite and at least 0"),
+        ({"radius": np.ones(3)}, r"radius must be one number or have shape \(59,\)"),
+        ({"radius": np.nan}, "radius must be finite and at least 0"),
     ],
 )
 def test_bad_distances_are_refused(options, message, device):

@@ -252,7 +252,7 @@ def _kernels(kind: PairKind):
 def check_query_count(count: int) -> None:
     """Raises ValueError if there are too few or too many queries."""
     if not 1 <= count <= _MOST_QUERIES:
-        raise ValueError(f"the number of queries must be in [1, {_MOST_QUERIES}], not {count}")
+        raise ValueError(f"count must be in [1, {_MOST_QUERIES}], not {count}")
 
 
 def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:

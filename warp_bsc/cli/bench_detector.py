@@ -19,6 +19,7 @@ from .options import (
     add_json,
     add_repeat,
     add_threads,
+    natural,
 )
 from .tables import Console
 
@@ -49,7 +50,7 @@ def add_to(commands: Commands) -> None:
     )
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure")
     command.add_argument(
-        "--interval", type=int, default=0, metavar="N", help="interval of a USD file, counted from 0 (default: 0)"
+        "--interval", type=natural, default=0, metavar="N", help="interval of a USD file, counted from 0 (default: 0)"
     )
     add_repeat(command, default=5)
     add_threads(command)

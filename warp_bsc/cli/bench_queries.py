@@ -8,7 +8,17 @@ from ..bench.timing import count_threads, limited_threads
 from ..detection.settings import PairKind
 from .bench_queries_tables import print_query_benchmarks, query_benchmarks_to_dict
 from .device import find_device, loading_kernels
-from .options import BENCH_EXIT_STATUS, Commands, add_command, add_device, add_json, add_repeat, add_threads
+from .options import (
+    BENCH_EXIT_STATUS,
+    Commands,
+    add_command,
+    add_device,
+    add_json,
+    add_repeat,
+    add_threads,
+    naming_options,
+    positive,
+)
 from .tables import Console
 
 __all__ = ["add_to"]
@@ -34,7 +44,7 @@ def add_to(commands: Commands) -> None:
         commands, "queries", _run, summary="measure elementary queries", description=_DESCRIPTION, epilog=_EPILOG
     )
     command.add_argument(
-        "--count", type=int, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
+        "--count", type=positive, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
     )
     add_repeat(command, default=20)
     add_threads(command)
@@ -44,7 +54,8 @@ def add_to(commands: Commands) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.count is not None:
-        check_query_count(arguments.count)
+        with naming_options("count"):
+            check_query_count(arguments.count)
     device = find_device(arguments.device)
     options = {"device": device, "repeat": arguments.repeat}
     with limited_threads(arguments.threads):

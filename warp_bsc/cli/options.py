@@ -1,9 +1,12 @@
 """What several commands share: options, their types, and the parts of the help texts."""
 
 import argparse
+import contextlib
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
 
+from .._arguments import LEAST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
@@ -19,6 +22,9 @@ __all__ = [
     "add_json",
     "add_repeat",
     "add_threads",
+    "distance",
+    "naming_options",
+    "natural",
     "positive",
 ]
 
@@ -122,31 +128,56 @@ def add_threads(command: argparse.ArgumentParser) -> None:
     )
 
 
-def positive_number(text: str) -> float:
-    """The finite number that an argument holds.
+def distance(text: str) -> float:
+    """The distance that an argument holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no number, not finite or not more than 0.
+        argparse.ArgumentTypeError: If it is no number, not finite or less than 2^-1021, as 0 is.
     """
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not 0.0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
+    if not LEAST_DISTANCE <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
     return number
+
+
+@contextlib.contextmanager
+def naming_options(*names: str) -> Iterator[None]:
+    """Names the option in place of the argument, one of some names, with which the message of an error begins."""
+    try:
+        yield
+    except ValueError as error:
+        argument = re.match("|".join(names), str(error))
+        if not argument:
+            raise
+        raise ValueError(f"--{argument[0].replace('_', '-')}{str(error)[argument.end() :]}") from error
 
 
 def positive(text: str) -> int:
     """The integer that an argument holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no integer or less than 1.
+        argparse.ArgumentTypeError: If it is no integer or not in [1, 2^31).
     """
+    return _integer(text, 1)
+
+
+def natural(text: str) -> int:
+    """The integer that an argument holds, which may be 0.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is no integer or not in [0, 2^31).
+    """
+    return _integer(text, 0)
+
+
+def _integer(text: str, least: int) -> int:
     try:
         number = int(text)
     except ValueError:
-        number = 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be an integer of at least 1, not {text}")
+        number = least - 1
+    if not least <= number < 2**31:
+        raise argparse.ArgumentTypeError(f"must be an integer of at least {least}, less than 2^31, not {text}")
     return number

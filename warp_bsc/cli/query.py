@@ -17,7 +17,7 @@ from .options import (
     add_detection_options,
     add_fail_on_collision,
     add_json,
-    positive_number,
+    distance,
 )
 from .query_file import KINDS, find_query_files, read_query_file
 from .query_tables import QueryAnswers, print_queries, queries_to_dict
@@ -58,7 +58,7 @@ def add_to(commands: Commands) -> None:
     )
     command.add_argument(
         "--min-distance",
-        type=positive_number,
+        type=distance,
         default=0.0,
         metavar="D",
         help="pairs collide that come within D of each other, in the unit of the points (default: that touch); true "

@@ -37,8 +37,9 @@ from .options import (
     Commands,
     add_command,
     add_detection_options,
+    distance,
+    naming_options,
     positive,
-    positive_number,
 )
 from .replay_tables import print_new, print_replay, print_work
 from .tables import Console, say
@@ -132,7 +133,7 @@ def add_to(commands: Commands) -> None:
     )
     which.add_argument(
         "--min-distance",
-        type=positive_number,
+        type=distance,
         metavar="D",
         help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
         "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
@@ -314,7 +315,8 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         importlib.import_module("warp_bsc.usd.meshes")
     INTERRUPTS.check()
     try:
-        with _Progress("Comparing vertices") as progress:
+        names = "prims", "exclude", "between", "frames", "subdivide"
+        with naming_options(*names), _Progress("Comparing vertices") as progress:
             scene = Scene(
                 arguments.scene,
                 selection=selection,

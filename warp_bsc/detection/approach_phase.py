@@ -5,7 +5,6 @@ start, if it was nearer, less the rounding of distances. Pairs that an edge of t
 like without touching: neighbours are always near. The reach is how much nearer than that other pairs are reported.
 """
 
-import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,7 +20,7 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF
 from .distance_phase import distance_of_corners, firsts_of
 from .kernels import PairStages
-from .launch import launch_over_queue
+from .launch import launch_over_queue, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings, make_rings
@@ -100,7 +99,7 @@ def distances_of_pair(
     return start, wp.min(distance_of_corners(kind, corners, distances.radius), _KEPT * start)
 
 
-@functools.cache
+@made_once
 def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels that cull and decide, for one type of position."""
 

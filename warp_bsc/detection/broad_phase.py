@@ -1,5 +1,6 @@
 """What a broad phase does, and which one a device has."""
 
+import threading
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -18,7 +19,12 @@ class BroadPhase(Protocol):
 
     A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
     single precision, rounded so that no overlap is lost. An element with a position that is not finite has no pairs.
+
+    Attributes:
+        lock: Held by all that share the broad phase while they run it and read what it enqueued.
     """
+
+    lock: threading.RLock
 
     @property
     def buffers(self) -> Sequence[wp.array]:

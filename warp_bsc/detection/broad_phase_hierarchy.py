@@ -6,7 +6,7 @@ that have collapsed: the cells of the mesh are its faces, then these edges, then
 have no such order, and are compared by brute force in the worst case, 1,024 pairs of cells at a time.
 """
 
-import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -37,7 +37,7 @@ from ..kernels.pipeline.hierarchy import (
 )
 from ..kernels.pipeline.pairs import owns_edge, owns_vertex
 from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
-from .launch import most_blocks
+from .launch import launch, made_once, most_blocks
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, Count, capacity_for
 
@@ -124,7 +124,7 @@ def empty_box() -> BoxRows:
     return wp.matrix_from_rows(low, -low, low, -low)
 
 
-@functools.cache
+@made_once
 def _box_elements(dtype: type, padded: bool) -> wp.Kernel:
     """The kernel that boxes moving elements and clusters, for one type of position, with or without a padding.
 
@@ -263,7 +263,7 @@ def _box_groups(clusters: HierarchyLevel, groups: HierarchyLevel):
     fit_parent(i, low, high, has_changed, groups)
 
 
-@functools.cache
+@made_once
 def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     """Returns a kernel that visits the pairs of faces whose swept boxes overlap, each pair once.
 
@@ -660,6 +660,7 @@ class BroadPhaseHierarchy:
             checked: Nonzero for each vertex that is counted, array of int; None for all.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+        self.lock = threading.RLock()
         self._padding = padding
         self._device = device = mesh.device
         self._count = count
@@ -748,16 +749,16 @@ class BroadPhaseHierarchy:
         """
         inputs, outputs = [x0, x1, changed, self._checked, self._padding, self.hierarchy], [self._not_finite]
         kernel = _box_elements(x0.dtype, self._padding is not None)
-        wp.launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
+        launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
         if self._groups:
             inputs = [self.hierarchy.clusters, self.hierarchy.groups]
-            wp.launch(_box_groups, WIDTH * self._groups, inputs=inputs, device=self._device, record_tape=False)
+            launch(_box_groups, WIDTH * self._groups, inputs=inputs, device=self._device, record_tape=False)
 
     def traverse(self, kernel: wp.Kernel, arguments: Any) -> None:
         """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""
         threads = self._clusters * self._warps_of_cluster * WIDTH
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
-        wp.launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
+        launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
     def _pair_faces(self, x0, x1, changed=None):
         """Enqueues the pairs of faces whose swept boxes overlap, each once."""
@@ -774,4 +775,4 @@ class BroadPhaseHierarchy:
     def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
         blocks = most_blocks(self._device, 256)
-        wp.launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)
+        launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)

@@ -4,15 +4,15 @@ The trees are those of :mod:`warp_bsc.kernels.pipeline.wide_bvh`. Elements are s
 with 2^10 cells an axis, world by world. Along a Morton curve, packets are larger, and a third more of them overlap.
 """
 
-import functools
 import itertools
+import threading
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
-from .launch import launch_over
+from .launch import launch_over, made_once
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count
 
@@ -52,7 +52,7 @@ def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
     return wp.vec3i(cells[0] ^ turned, cells[1] ^ turned, cells[2] ^ turned)
 
 
-@functools.cache
+@made_once
 def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels that encode elements and fit packets, for one type of position."""
     fit_packet = fit_packet_of(dtype)
@@ -359,6 +359,7 @@ class BroadPhaseSimd:
             count: Not used.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
+        self.lock = threading.RLock()
 
         def of_vertices(vertices: np.ndarray) -> _Tree:
             return _Tree(vertices.reshape(-1, 1), vertices, mesh.world, padding)

@@ -3,7 +3,8 @@
 import numpy as np
 import warp as wp
 
-from .._arrays import check_finite
+from .._arguments import check_finite, check_instance, checked_distance
+from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
@@ -33,6 +34,9 @@ class CollisionDetector:
     Run one detection first to size the buffers. After that a detection can be captured in a CUDA graph, where it
     allocates nothing and does not synchronize, and replayed on new positions in the same arrays.
 
+    Threads may share a detector: each detection waits for the one before, and its results stay as they are. To detect
+    at the same time, make a detector for each thread; they may share the mesh.
+
     Attributes:
         mesh: The mesh.
         method: The method.
@@ -61,15 +65,14 @@ class CollisionDetector:
             rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
                 a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
                 rest has no collisions at a distance below half of its shortest edge; triangles much thinner than their
-                edges are long need more.
+                edges are long need more. At most so many that vertices have 256 others within these on average.
 
         Raises:
+            TypeError: If an argument has another type.
             ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
         """
+        check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self.mesh = mesh
-        self.method = method
-        self.tolerance = tolerance
-        self.min_distance = min_distance
         self._pipeline = DetectionPipeline(
             mesh,
             method=method,
@@ -78,10 +81,15 @@ class CollisionDetector:
             rings=rings,
             only_used_vertices=True,
         )
+        self.method = method
+        self.tolerance = self._pipeline.tolerance
+        self.min_distance = checked_distance(min_distance, "min_distance")
+        self._lock = self._pipeline.broad_phase.lock
         self._result_buffers = ContactBufferPool(mesh.device)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
 
+    @one_at_a_time
     def detect(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Collisions | CapturedCollisions:
         """Finds the collisions of a motion.
 
@@ -95,13 +103,14 @@ class CollisionDetector:
             All collisions; while a graph is captured :class:`CapturedCollisions`, to be read after a replay.
 
         Raises:
-            ValueError: If the positions have another shape or type, differ in type, or are not finite.
+            TypeError: If the positions are no arrays of numbers.
+            ValueError: If they have another shape or type, differ in type, or are not finite.
             RuntimeError: If the first detection is captured in a CUDA graph.
         """
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
-            raise ValueError("x0 and x1 must have the same type")
+            raise ValueError(f"x1 must have the type of x0, {x0.dtype.__name__}, not {x1.dtype.__name__}")
         if self.mesh.device.is_capturing:
             return (self._capture_on_cpu if self.mesh.device.is_cpu else self._capture_on_cuda)(x0, x1)
 
@@ -141,7 +150,8 @@ class CollisionDetector:
             ``mesh.edges``, sorted, int32, shape [n, 2].
 
         Raises:
-            ValueError: If the positions have another shape or type, or are not finite.
+            TypeError: If the positions are no array of numbers.
+            ValueError: If they have another shape or type, or are not finite.
         """
         return find_intersections(self.mesh, x)
 
@@ -158,13 +168,14 @@ class CollisionDetector:
             rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
 
         Raises:
+            TypeError: If an argument has another type.
             ValueError: If the positions have another shape or type, are not finite or more than 2^1000, the distance is
-                no finite number more than 0 or out of the range of their type, or the rings are less than 0.
+                not finite, less than 2^-1021 or out of the range of their type, or the rings are out of range.
         """
         return ProximityFinder(self.mesh, distance, rings=rings).find(x)
 
     def intersection_finder(self) -> IntersectionFinder:
-        """Returns a finder of intersections that shares trees with this detector on a CPU."""
+        """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
     def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
@@ -236,6 +247,10 @@ class CollisionDetector:
             contacts = self._ordered_contacts(counts, recycle=True)
             return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
 
+        def read_alone() -> Collisions:
+            with self._lock:
+                return read()
+
         arrays = None
         if x0.requires_grad or x1.requires_grad:
             capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
@@ -246,7 +261,7 @@ class CollisionDetector:
                 for narrow_phase, capacity in zip(pipeline.narrow_phases, capacities, strict=True)
             }
             arrays = self._differentiable(x0, x1, whole)
-        return CapturedCollisions(arrays, read)
+        return CapturedCollisions(arrays, read_alone)
 
     def _differentiable(self, x0, x1, contacts):
         return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)

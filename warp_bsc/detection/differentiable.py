@@ -1,6 +1,5 @@
 """Collisions on the device, as differentiable functions of the positions that they were found for."""
 
-import functools
 from collections.abc import Mapping
 
 import warp as wp
@@ -14,13 +13,14 @@ from ..kernels.signs import HIT, UNSURE
 from ..kernels.time_of_impact import Impact
 from .contact_buffer import ContactBuffer
 from .distance_phase import distance_of_corners
+from .launch import launch, made_once
 from .mesh import CollisionMesh
 from .settings import DistanceKind
 
 __all__ = ["CollisionArrays"]
 
 
-@functools.cache
+@made_once
 def _kernel(dtype: type) -> wp.Kernel:
     """The kernel for one type of position, in a module of its own."""
 
@@ -76,7 +76,7 @@ def _kernel(dtype: type) -> wp.Kernel:
     return differentiate
 
 
-@functools.cache
+@made_once
 def _distance_kernel(dtype: type) -> wp.Kernel:
     """The kernel for pairs with a minimum distance, for one type of position, in a module of its own."""
 
@@ -197,7 +197,7 @@ class CollisionArrays:
                 coordinates, normal = found.coordinates, found.normal
                 kernel, inputs = _distance_kernel(x0.dtype), [*inputs, radius, tolerance, found]
                 outputs = [toi, grazing]
-            wp.launch(kernel, len(found.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
+            launch(kernel, len(found.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
             setattr(self, kind.label, found.pairs)
             results = {"toi": toi, "normal": normal, "grazing": grazing}
             if kind != DistanceKind.VERTEX_VERTEX:

@@ -5,7 +5,6 @@ contacts. The minimum distance of a pair is the sum of two radii, rounded to dou
 its own, that of an edge or a face the largest one of its vertices.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,14 +20,13 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .contact_buffer import HostContacts
 from .kernels import PairStages
-from .launch import launch_over, launch_over_queue
+from .launch import launch, launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings
 from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
 from .stage_timer import StageTimer
 
 __all__ = [
-    "checked_distance",
     "decide_distances_on_host",
     "distance_of_corners",
     "firsts_of",
@@ -50,21 +48,6 @@ _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
-
-
-def checked_distance(min_distance: float | np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
-    """Returns a minimum distance, or one each, in double precision.
-
-    Raises:
-        ValueError: If the distances are neither one number nor of the shape, or not finite and at least 0.
-    """
-    distance = np.asarray(min_distance, dtype=np.float64)
-    if distance.shape not in ((), shape):
-        shapes = "must be one number" + (f" or have shape {shape}" if shape else "")
-        raise ValueError(f"min_distance {shapes}, not {distance.shape}")
-    if not (np.isfinite(distance) & (distance >= 0.0)).all():
-        raise ValueError("min_distance must be finite and at least 0")
-    return distance
 
 
 @wp.func
@@ -139,7 +122,7 @@ class _Kernels(NamedTuple):
     find_closest: wp.Kernel
 
 
-@functools.cache
+@made_once
 def _kernels(dtype: type) -> _Kernels:
     """Returns the kernels for one type of position, each in a module of its own."""
 
@@ -394,5 +377,5 @@ def decide_distances_on_host(
     timed_pairs = wp.array(contacts.pairs[again], dtype=wp.vec2i, device=x0.device)
     inputs = [x0, x1, elements, int(kind), timed_pairs, wp.array(toi[again], dtype=wp.float64, device=x0.device)]
     kernel = _kernels(x0.dtype).find_closest
-    wp.launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
+    launch(kernel, len(again), inputs=inputs, outputs=outputs, device=x0.device, record_tape=False)
     contacts.coordinates[again], contacts.normal[again] = (output.numpy() for output in outputs)

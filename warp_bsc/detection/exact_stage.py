@@ -7,7 +7,6 @@ too wide for eight limbs are counted and left to the host. Each width has its ow
 small.
 """
 
-import functools
 import math
 
 import warp as wp
@@ -21,13 +20,13 @@ from ..kernels.pipeline.queues import take_slot
 from ..kernels.signs import FREE, HIT
 from ..kernels.time_of_impact import LEAST_DIGITS
 from .contact_buffer import ContactBuffer
-from .launch import launch_over_queue
+from .launch import launch_over_queue, made_once
 from .settings import NO_FUSED_OPERATIONS, DistanceKind, PairKind
 
 __all__ = ["launch_exact_stage"]
 
 
-@functools.cache
+@made_once
 def _kernel(dtype: type, limbs: int) -> wp.Kernel:
     """The kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.hierarchy import WIDTH
+from .launch import launch
 from .settings import NO_GRADIENTS
 
 __all__ = ["CLUSTER", "GROUP", "order_faces"]
@@ -342,7 +343,7 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     order = on_host(np.arange(n) if world is None else np.argsort(world, kind="stable"))
     starts, count, queue = on_host(np.zeros(n)), on_host(np.zeros(1)), wp.empty_like(order)
     inputs = [on_host(links), order, on_host(np.zeros(n)), starts, count, queue]
-    wp.launch(_find_components, 1, inputs=inputs, device="cpu", record_tape=False)
+    launch(_find_components, 1, inputs=inputs, device="cpu", record_tape=False)
 
     # neighbours get numbers close to one another, which processor caches reward
     face_of = queue.numpy()
@@ -363,5 +364,5 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     scratch.append(wp.empty((4, n), dtype=int, device="cpu"))
     inputs = [on_host(links), on_host(places[:-1][large]), on_host(sizes[large])]
     inputs += [result, on_host(place_of), on_host(np.zeros(n)), *scratch]
-    wp.launch(_order_components, 1, inputs=inputs, device="cpu", record_tape=False)
+    launch(_order_components, 1, inputs=inputs, device="cpu", record_tape=False)
     return np.where(result.numpy() < 0, -1, face_of[result.numpy()])

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from .launch import launch
+
 __all__ = ["run_on_host"]
 
 
@@ -113,4 +115,4 @@ def run_on_host(function: Callable[[], object], device: wp.Device) -> None:
     _functions[number] = function, failure
     weakref.finalize(graph, _functions.pop, number)
     call = ctypes.cast(_call, ctypes.c_void_p).value
-    wp.launch(_call_kernel, 1, inputs=[call, number, failure.flag], device=device, record_tape=False)
+    launch(_call_kernel, 1, inputs=[call, number, failure.flag], device=device, record_tape=False)

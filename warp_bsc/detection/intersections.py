@@ -8,13 +8,14 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from .._arrays import check_finite
+from .._arguments import check_finite, check_instance
+from .._one_thread import one_at_a_time
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
 from .broad_phase import BroadPhase, make_broad_phase
 from .collisions import Collisions
-from .launch import launch_over_queue, retry_until_fits
+from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
@@ -26,7 +27,7 @@ _PAIRS_OF_HIT = 8
 """Pairs of an edge and a face for each collision, roughly. More of them than edges take longer than a search."""
 
 
-@functools.cache
+@made_once
 def _keep_crossings(dtype: type) -> wp.Kernel:
     """The kernel that keeps the pairs that are not certified apart, for one type of position."""
 
@@ -75,6 +76,7 @@ class CrossingCandidates:
         pairs: Queue of the pairs, array of vec2i.
         counts: Counts of the pairs by :class:`Count`, on the device, array of int64.
         count: Number of pairs that the last :meth:`grow` has read.
+        lock: That of the broad phase, held by all that find candidates while they use them.
     """
 
     def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
@@ -87,6 +89,7 @@ class CrossingCandidates:
         self._counters = Counters(mesh.device)
         if broad_phase is None or broad_phase.capacity < UNLIMITED:
             broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self.lock = broad_phase.lock
         self._broad_phase = broad_phase
         # the counts of the edges' pairs with faces take the place of those with edges
         self.counts = self._counters.edge_edge
@@ -136,7 +139,11 @@ class Intersections:
 
 
 class IntersectionFinder:
-    """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses."""
+    """Finds the intersections of a mesh in one configuration after another, with buffers and trees that it reuses.
+
+    Threads may share a finder: each call waits for the one before. Where it shares the trees of a detector, no other
+    thread may detect a motion between the one whose end is given and that call.
+    """
 
     def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
         """Allocates the buffers on the mesh's device.
@@ -145,8 +152,10 @@ class IntersectionFinder:
             mesh: The mesh.
             broad_phase: As of :class:`CrossingCandidates`.
         """
+        check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self._mesh = mesh
         self._candidates = CrossingCandidates(mesh, broad_phase)
+        self._lock = self._candidates.lock
         self._has_run = False
         self._allocate(len(mesh.faces))
 
@@ -159,7 +168,8 @@ class IntersectionFinder:
             is_end: Whether they are those at the end of the last motion that the given broad phase has seen.
 
         Raises:
-            ValueError: If the positions have another shape or type, or are not finite.
+            TypeError: If the positions are no array of numbers.
+            ValueError: If they have another shape or type, or are not finite.
         """
         found = self._find(x, lambda positions: self._candidates.find(positions, refit=self._has_run, is_end=is_end))
         self._has_run = True
@@ -189,6 +199,7 @@ class IntersectionFinder:
         pairs = self._pairs_that_may_meet(start, collisions)
         return self._find(x, lambda _: self._candidates.put(pairs))
 
+    @one_at_a_time
     def _find(self, x: np.ndarray | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
         """Returns which of the pairs that a function enqueues for positions on the device meet."""
         mesh = self._mesh

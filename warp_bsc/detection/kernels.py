@@ -1,6 +1,5 @@
 """The kernels of the narrow phase: culls, classification, times of impact, and contacts in order."""
 
-import functools
 from typing import NamedTuple
 
 import warp as wp
@@ -17,7 +16,8 @@ from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import Impact, impact
 from .contact_buffer import ContactBuffer
-from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, PairKind
+from .launch import made_once
+from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, PairKind
 
 __all__ = [
     "PairKernels",
@@ -130,7 +130,7 @@ def _decide(i: int, pair: wp.vec2i, status: int, timed: bool, stages: PairStages
         stages.for_exact[wp.int32(take_slot(stages.counts, _FOR_EXACT))] = i
 
 
-@functools.cache
+@made_once
 def pair_kernels(dtype: type) -> PairKernels:
     """Returns the kernels for one type of position, each in a module of its own."""
 
@@ -238,8 +238,8 @@ def pair_kernels(dtype: type) -> PairKernels:
     return PairKernels(classify_survivors, find_impacts, find_contact_points)
 
 
-@functools.cache
-def culling_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
+@made_once
+def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
     """Returns the kernel that culls on a GPU, for one kind of pair and one type of position.
 
     Each kind has its own, because one for both takes an eighth more registers, which costs more than a launch.
@@ -279,8 +279,8 @@ def culling_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
     return cull
 
 
-@functools.cache
-def batch_culling_kernel(kind: PairKind, dtype: type) -> wp.Kernel:
+@made_once
+def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position."""
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
 

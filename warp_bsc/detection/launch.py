@@ -1,16 +1,31 @@
-"""Launches over queues whose length only the device knows, on no tape, and launches until the buffers suffice."""
+"""Launches in any thread, over queues whose length only the device knows, and until the buffers suffice.
+
+Warp neither loads one module in two threads at once nor two modules of one name, such as that of a kernel made twice:
+the process crashes. Here, one lock is held while a kernel is made, and while it is launched for the first time.
+"""
 
 import contextlib
 import contextvars
 import functools
 import os
+import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
-__all__ = ["GrowingBuffers", "cores", "launch_over", "launch_over_queue", "most_blocks", "retry_until_fits"]
+__all__ = [
+    "GrowingBuffers",
+    "cores",
+    "launch",
+    "launch_over",
+    "launch_over_queue",
+    "made_once",
+    "most_blocks",
+    "retry_until_fits",
+]
 
 _THREADS = os.cpu_count() or 1
 
@@ -18,6 +33,47 @@ _THREADS_OF_MULTIPROCESSOR = 1024
 """Threads of a launch over a queue for each multiprocessor of a GPU."""
 
 _threads = contextvars.ContextVar("threads", default=_THREADS)
+
+_KERNELS = threading.RLock()
+"""Held while a kernel is made or loaded."""
+
+_loaded: weakref.WeakKeyDictionary[wp.Kernel, set[tuple[str, int]]] = weakref.WeakKeyDictionary()
+"""Devices and sizes of blocks for which a kernel has been launched; 0 for the default size, which the CPU has."""
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def made_once(make: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Returns a function that makes kernels as this one does, once for each of its arguments, in whichever thread."""
+    cached = functools.cache(make)
+
+    @functools.wraps(make)
+    def get(*arguments: _Arguments.args, **options: _Arguments.kwargs) -> _Result:
+        with _KERNELS:
+            return cached(*arguments, **options)
+
+    return get
+
+
+@contextlib.contextmanager
+def _loading(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> Iterator[None]:
+    """Keeps other threads from loading kernels within, if this one must be loaded."""
+    key, loaded = (device.alias, block_dim), _loaded.setdefault(kernel, set())
+    if key in loaded:
+        yield
+        return
+    with _KERNELS:
+        yield
+    loaded.add(key)
+
+
+def launch(kernel: wp.Kernel, dim: int, *, device: wp.DeviceLike, **options: Any) -> None:
+    """Launches a kernel as :func:`warp.launch` does, in whichever thread."""
+    device = wp.get_device(device)
+    if dim:
+        with _loading(kernel, device, options.get("block_dim", 0)):
+            wp.launch(kernel, dim, device=device, **options)
 
 
 @contextlib.contextmanager
@@ -87,7 +143,7 @@ def launch_over(
         RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
     """
     if device.is_cuda:
-        wp.launch(
+        launch(
             kernel,
             count,
             inputs=[0, *inputs],
@@ -100,14 +156,17 @@ def launch_over(
         return
     if device.is_capturing:
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
+    if not count:
+        return
     threads = _threads.get() if _may_share(kernel) else 1
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
     # Threads only run what this one has prepared: Warp loads a kernel and packs its arguments for one thread at a time.
     options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
-    commands = [
-        wp.launch(kernel, min(chunk, count - first), inputs=[first, *inputs], **options)
-        for first in range(0, count, chunk)
-    ]
+    with _loading(kernel, device, 0):
+        commands = [
+            wp.launch(kernel, min(chunk, count - first), inputs=[first, *inputs], **options)
+            for first in range(0, count, chunk)
+        ]
     run = map if len(commands) < 2 else _pool(threads).map
     list(run(wp.Launch.launch, commands))
 
@@ -156,9 +215,6 @@ class GrowingBuffers(Protocol):
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
         ...
-
-
-_Result = TypeVar("_Result")
 
 
 def retry_until_fits(launch: Callable[[], _Result], buffers: GrowingBuffers, device: wp.Device) -> _Result:

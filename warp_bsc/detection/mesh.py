@@ -2,14 +2,14 @@
 
 import functools
 from collections.abc import Sequence
-from numbers import Integral
 
 import numpy as np
 import warp as wp
 
-from .._arrays import checked_shape
+from .._arguments import as_numpy, checked_distances, checked_flag, checked_integer, checked_shape
 from .face_order import order_faces
 from .settings import DistanceKind, PairKind
+from .start import checked_device
 
 __all__ = ["CollisionMesh"]
 
@@ -60,8 +60,9 @@ class CollisionMesh:
             edges: Vertex indices of edges that take part although no face has them, integers, shape [n, 2], NumPy or
                 Warp array. Those that faces have are no others.
             points: Vertices that take part although no face has them, integers, shape [n], NumPy or Warp array.
-            radius: Radius of each vertex, in the unit of the positions, at least 0, float, shape [vertex_count], NumPy
-                or Warp array; or one for all. A pair collides if it comes within the sum of its two radii.
+            radius: Radius of each vertex, in the unit of the positions, 0 or at least 2^-1021, float, shape
+                [vertex_count], NumPy or Warp array; or one for all. A pair collides if it comes within the sum of its
+                two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
             only_free: Whether to find only the pairs with a vertex or an edge that no face has. The others, which
@@ -69,18 +70,19 @@ class CollisionMesh:
             device: Warp device; default: Warp's default.
 
         Raises:
+            TypeError: If an argument has another type.
             ValueError: If the faces, edges, points, radii or worlds have another shape or type or are out of range, an
-                index is not in [0, vertex_count), that is no integer in [0, 2^31), an edge has one vertex twice, or the
-                worlds differ within a face or an edge.
+                index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one vertex twice, entries are
+                masked, the worlds differ within a face or an edge, or there is no such device.
         """
-        if not isinstance(vertex_count, Integral) or not 0 <= vertex_count < 2**31:
-            raise ValueError(f"vertex_count must be an integer in [0, 2^31), not {vertex_count!r}")
-        self.vertex_count = int(vertex_count)
+        self.vertex_count = checked_integer(vertex_count, "vertex_count")
+        self.only_free = checked_flag(only_free, "only_free")
+        self.device = checked_device(device)
         faces = self._checked_indices(faces, 3, "face")
         given_edges = self._checked_indices(() if edges is None else edges, 2, "edge")
         same = np.flatnonzero(given_edges[:, 0] == given_edges[:, 1])
         if len(same):
-            raise ValueError(f"edge {same[0]} has vertex {given_edges[same[0], 0]} twice")
+            raise ValueError(f"edges[{same[0]}] has vertex {given_edges[same[0], 0]} twice")
         given_points = self._checked_indices(() if points is None else points, 1, "point")
         self.faces = faces
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -109,8 +111,6 @@ class CollisionMesh:
         first_sides = first_sides[proper & (first_sides < len(sides))]
         np.bitwise_or.at(owned, first_sides // 3, 8 << (first_sides % 3))
         self.face_edges, self.owned = face_edges.astype(np.int32), owned
-        self.only_free = only_free
-        self.device = wp.get_device(device)
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
@@ -166,6 +166,7 @@ class CollisionMesh:
             name: What to call them in errors.
 
         Raises:
+            TypeError: If they are no array of numbers.
             ValueError: If they have another shape or type; or if a graph is captured or they require gradients, and
                 they are no Warp array of vec3 or vec3d on the device.
         """
@@ -186,7 +187,7 @@ class CollisionMesh:
     def _checked_indices(self, given: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
         """Returns the vertex indices of elements, int32, shape [n, corners], or [n] for points."""
         shape = (0,) if corners == 1 else (0, corners)
-        elements: np.ndarray = np.asarray(given.numpy() if isinstance(given, wp.array) else given)
+        elements = as_numpy(given.numpy() if isinstance(given, wp.array) else given, f"{name}s")
         if elements.shape == (0,):
             elements = np.empty(shape, np.int32)
         if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:
@@ -202,36 +203,33 @@ class CollisionMesh:
         )
         if len(bad):
             raise ValueError(
-                f"{name} {bad[0]} is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
+                f"{name}s[{bad[0]}] is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
                 + (f" ({len(bad)} such {name}s)" if len(bad) > 1 else "")
             )
         return np.ascontiguousarray(elements, dtype=np.int32)
 
     def _checked_radius(self, radius: float | np.ndarray | wp.array) -> np.ndarray | None:
         """Returns the radius of each vertex, float64, shape [vertex_count], or None if all are 0."""
-        values = np.asarray(radius.numpy() if isinstance(radius, wp.array) else radius, dtype=np.float64)
-        if values.shape not in ((), (self.vertex_count,)):
-            raise ValueError(f"radius must be one number or {self.vertex_count}, one a vertex, got {values.shape}")
-        if not (np.isfinite(values) & (values >= 0.0)).all():
-            raise ValueError("radii must be finite and at least 0")
+        given = radius.numpy() if isinstance(radius, wp.array) else radius
+        values = checked_distances(given, "radius", self.vertex_count)
         return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face or an edge."""
-        worlds: np.ndarray = np.asarray(world.numpy() if isinstance(world, wp.array) else world)
+        worlds = as_numpy(world.numpy() if isinstance(world, wp.array) else world, "world")
         if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):
             raise ValueError(
                 f"world must be {self.vertex_count} integers, one a vertex, got {worlds.dtype} {worlds.shape}"
             )
         bad = (worlds < 0) | (worlds >= 2**31)
         if bad.any():
-            raise ValueError(f"vertex {np.argmax(bad)} is in world {worlds[np.argmax(bad)]}; worlds are in [0, 2^31)")
+            raise ValueError(f"world[{np.argmax(bad)}] must be in [0, 2^31), not {worlds[np.argmax(bad)]}")
         of_faces = worlds[self.faces]
         mixed = np.flatnonzero((of_faces != of_faces[:, :1]).any(axis=1))
         if len(mixed):
-            raise ValueError(f"face {mixed[0]} has vertices in worlds {of_faces[mixed[0]].tolist()}")
+            raise ValueError(f"world must be one for a face, but faces[{mixed[0]}] has {of_faces[mixed[0]].tolist()}")
         mixed = np.flatnonzero(worlds[self.edges[:, 0]] != worlds[self.edges[:, 1]])
         if len(mixed):
             edge = self.edges[mixed[0]]
-            raise ValueError(f"edge {edge.tolist()} has vertices in worlds {worlds[edge].tolist()}")
+            raise ValueError(f"world must be one for an edge, but edge {edge.tolist()} has {worlds[edge].tolist()}")
         return worlds.astype(np.int32)

@@ -16,7 +16,7 @@ from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
 from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
-from .launch import launch_over, launch_over_queue, most_blocks
+from .launch import launch, launch_over, launch_over_queue, most_blocks
 from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
@@ -284,7 +284,7 @@ def decide_on_host(
     normal = wp.empty_like(coordinates)
     times = wp.array(toi[again], dtype=wp.float64, device=x0.device)
     timed_pairs = wp.array(pairs[again], dtype=wp.vec2i, device=x0.device)
-    wp.launch(
+    launch(
         pair_kernels(x0.dtype).find_contact_points,
         len(again),
         inputs=[x0, x1, elements, int(kind), timed_pairs, times],

@@ -1,17 +1,17 @@
 """Detection on the device alone: broad phase and narrow phases, without results on the host."""
 
-import functools
-
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_choice, checked_distance, checked_integer
 from .approach_phase import MinDistances, run_approach_phases
 from .broad_phase import BroadPhase, make_broad_phase
-from .distance_phase import checked_distance, run_distance_phases
+from .distance_phase import run_distance_phases
+from .launch import launch, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
 from .rings import Rings, make_rings
-from .settings import NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, check_method, check_tolerance
+from .settings import METHODS, NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, checked_tolerance
 from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
@@ -25,7 +25,7 @@ _LARGEST_RADIUS = 2.0**1000
 _UNTIMED = StageTimer(None)
 
 
-@functools.cache
+@made_once
 def _count_not_finite(dtype: type) -> wp.Kernel:
     """The kernel that counts positions that are not finite, for one type of position."""
 
@@ -49,15 +49,13 @@ def _count_not_finite(dtype: type) -> wp.Kernel:
 
 def _radius(mesh: CollisionMesh, min_distance: float) -> np.ndarray | None:
     """Returns the radius of each vertex with half of the minimum distance, float64; None if all are 0."""
-    if min_distance > 0.0 and 2.0 * (0.5 * min_distance) != min_distance:
-        raise ValueError(f"min_distance must be 0 or at least 2^-1021, not {min_distance!r}")
     if mesh.radius is None and min_distance == 0.0:
         return None
     radius = np.full(mesh.vertex_count, 0.5 * min_distance)
     if mesh.radius is not None:
         radius += mesh.radius
     if radius.max(initial=0.0) > _LARGEST_RADIUS:
-        raise ValueError(f"radii and half of min_distance must be at most 2^1000 together, not {radius.max():g}")
+        raise ValueError(f"min_distance / 2 and radius must be at most 2^1000 together, not {radius.max():g}")
     return radius
 
 
@@ -126,8 +124,9 @@ class DetectionPipeline:
         Raises:
             ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
         """
-        check_method(method)
-        check_tolerance(tolerance)
+        checked_choice(method, "method", METHODS)
+        tolerance, rings = checked_tolerance(tolerance), checked_integer(rings, "rings")
+        min_distance = checked_distance(min_distance, "min_distance")
         self.mesh = mesh
         self.method = method
         self.tolerance = tolerance
@@ -140,7 +139,7 @@ class DetectionPipeline:
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
         self._keeping = keeping
         if keeping is None:
-            self.radius = _radius(mesh, float(checked_distance(min_distance)))
+            self.radius = _radius(mesh, min_distance)
         else:
             self.radius = keeping.radius.numpy() + 0.5 * keeping.reach
         self._rings = Rings() if self.radius is None or keeping is not None else make_rings(mesh, rings)
@@ -286,4 +285,4 @@ class DetectionPipeline:
         vertices, device = self._checked_vertices, self.mesh.device
         dim = self.mesh.vertex_count if vertices is None else len(vertices)
         inputs, outputs = [x0, x1, vertices], [self.counters.not_finite]
-        wp.launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)
+        launch(_count_not_finite(x0.dtype), dim, inputs=inputs, outputs=outputs, device=device, record_tape=False)

@@ -1,21 +1,20 @@
 """Proximities of a mesh with itself in one configuration: pairs of elements that are at most some distance apart."""
 
-import functools
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from .. import checker
-from .._arrays import check_finite
+from .._arguments import check_finite, check_instance, checked_distance
+from .._one_thread import one_at_a_time
 from ..kernels.distance import DISTANCE_ERROR, closest_points
 from ..kernels.pipeline.pairs import points_of_pair
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .broad_phase import make_broad_phase
 from .distance_phase import pair_distances
-from .launch import launch_over_queue, retry_until_fits
+from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .rings import Rings, are_within_rings, make_rings
 from .settings import NO_GRADIENTS, Count, Counters, DistanceKind, capacity_for
@@ -28,7 +27,7 @@ _LARGEST = 2.0**1000
 """Largest coordinate: differences and their sums stay finite."""
 
 
-@functools.cache
+@made_once
 def _keep_near(dtype: type) -> wp.Kernel:
     """The kernel that keeps the pairs that are near and not joined, for one type of position."""
 
@@ -154,7 +153,7 @@ class ProximityFinder:
 
     A pair is a vertex and a face, two edges, a point and an edge that no face has, or two points. Radii of the mesh are
     not counted. Pairs that share a vertex or that a few edges of the mesh join are excluded, since neighbours are
-    always near.
+    always near. Threads may share a finder: each call waits for the one before.
     """
 
     def __init__(self, mesh: CollisionMesh, distance: float, *, rings: int = 1):
@@ -166,14 +165,15 @@ class ProximityFinder:
             rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
 
         Raises:
-            ValueError: If the distance is no finite number more than 0, or the rings are less than 0.
+            TypeError: If an argument has another type.
+            ValueError: If the distance is not finite or less than 2^-1021, or the rings are out of range.
         """
-        if not (math.isfinite(distance) and distance > 0.0):
-            raise ValueError(f"a distance must be a finite number more than 0, not {distance!r}")
+        check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self._mesh = mesh
-        self._distance = float(distance)
+        self._distance = checked_distance(distance, "distance", zero=False)
         self._counters = Counters(mesh.device)
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._lock = self._broad_phase.lock
         elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
         self._near = [
             _NearPairs(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in DistanceKind
@@ -181,6 +181,7 @@ class ProximityFinder:
         self._rings = make_rings(mesh, rings)
         self._has_run = False
 
+    @one_at_a_time
     def find(self, x: np.ndarray | wp.array) -> Proximities:
         """Returns the proximities of one configuration.
 
@@ -203,7 +204,7 @@ class ProximityFinder:
         check_finite(positions, "x", mesh.vertices)
         largest = float(np.abs(positions[mesh.vertices]).max(initial=0.0))
         if largest > _LARGEST:
-            raise ValueError(f"positions must be at most 2^1000 to have distances, not {largest:g}")
+            raise ValueError(f"x must be at most 2^1000 to have distances, not {largest:g}")
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True

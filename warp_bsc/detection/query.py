@@ -5,15 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .._arrays import check_finite, checked_shape
+from .._arguments import check_finite, checked_choice, checked_distances, checked_flag, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
 from .contact_buffer import HostContacts, read_contacts
-from .distance_phase import checked_distance, decide_distances_on_host, run_distance_phases
+from .distance_phase import decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
 from .rings import Rings
-from .settings import TOLERANCE, Count, DistanceKind, PairCounts, PairKind, check_method, check_tolerance
+from .settings import METHODS, TOLERANCE, Count, DistanceKind, PairCounts, PairKind, checked_tolerance
 from .stage_timer import StageTimer
+from .start import checked_device
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
 
@@ -56,8 +57,8 @@ def query_vertex_face(
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1:
             vertex p and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
-            one for all queries, or one each, shape [n].
+        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
+            as exact: one for all queries, or one each, shape [n].
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
@@ -67,8 +68,9 @@ def query_vertex_face(
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance is no
-            finite number of at least 0, or there is no such method.
+        TypeError: If an argument has another type.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
+            tolerance is out of range, or there is no such method.
     """
     return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
@@ -87,8 +89,8 @@ def query_edge_edge(
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
             edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: Distance up to which a pair collides, in the unit of the positions, at least 0, taken as exact:
-            one for all queries, or one each, shape [n].
+        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
+            as exact: one for all queries, or one each, shape [n].
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
@@ -98,8 +100,9 @@ def query_edge_edge(
         QueryResult: One row a query.
 
     Raises:
-        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance is no
-            finite number of at least 0, or there is no such method.
+        TypeError: If an argument has another type.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
+            tolerance is out of range, or there is no such method.
     """
     return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
 
@@ -128,6 +131,7 @@ def query_vertex_edge(
         QueryResult: One row a query.
 
     Raises:
+        TypeError: As :func:`query_vertex_face`.
         ValueError: As :func:`query_vertex_face`.
     """
     return _query(DistanceKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
@@ -157,6 +161,7 @@ def query_vertex_vertex(
         QueryResult: One row a query.
 
     Raises:
+        TypeError: As :func:`query_vertex_face`.
         ValueError: As :func:`query_vertex_face`.
     """
     return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
@@ -171,18 +176,19 @@ def _query(
     tolerance: float,
     device: wp.DeviceLike,
 ) -> QueryResult:
-    check_method(method)
-    check_tolerance(tolerance)
+    checked_choice(method, "method", METHODS)
+    tolerance = checked_tolerance(tolerance)
+    timed = checked_flag(timed, "toi")
     if isinstance(points, wp.array):
         device = points.device if device is None else device
         points = points.numpy()
     points = checked_shape(points, (2 * kind.points, 3), "points")
     n = len(points)
     if n >= 2**29:  # their vertices are numbered by int32
-        raise ValueError(f"at most 2^29 - 1 queries can be decided at once, not {n}")
+        raise ValueError(f"points must have at most 2^29 - 1 rows, not {n}")
     check_finite(points, "points")
-    distance = checked_distance(min_distance, (n,))
-    device = wp.get_device(device)
+    distance = checked_distances(min_distance, "min_distance", n)
+    device = checked_device(device)
     # a mesh in which each query has vertices of its own
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
     half = kind.points

@@ -3,9 +3,16 @@
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_integer
 from .mesh import CollisionMesh
 
 __all__ = ["Rings", "are_within_rings", "make_rings"]
+
+_MOST_NEIGHBOURS = 256
+"""Vertices within the rings of one, on average: each candidate compares its vertices with these."""
+
+_MOST_PAIRS = 2**22
+"""Pairs of vertices that a small mesh may always have."""
 
 
 @wp.struct
@@ -43,24 +50,37 @@ def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
         rings: Number of edges, at least 0.
 
     Raises:
-        ValueError: If the number is no integer of at least 0.
+        TypeError: If the number is no integer.
+        ValueError: If it is negative, or so large that vertices have more than 256 others within it on average, and all
+            together more than 2^22.
     """
-    if int(rings) != rings or rings < 0:
-        raise ValueError(f"rings must be an integer of at least 0, not {rings!r}")
+    rings = checked_integer(rings, "rings")
     result = Rings()
     if rings == 0:
         return result
     n = mesh.vertex_count
+    most = min(max(_MOST_PAIRS, _MOST_NEIGHBOURS * n), 2**31 - 1)
     edges = np.unique(np.concatenate([mesh.edges, mesh.edges[:, ::-1]]).astype(np.int64), axis=0)
     starts = np.searchsorted(edges[:, 0], np.arange(n + 1))
-    reached = edges
-    for _ in range(rings - 1):
-        # every pair (vertex, neighbour) goes on to the neighbours of that neighbour
-        degrees = np.diff(starts)[reached[:, 1]]
-        first = np.repeat(starts[reached[:, 1]] - (np.cumsum(degrees) - degrees), degrees)
+    # each pair (vertex, neighbour) is one number; those of a ring are neighbours of the ring before it
+    ring, before = edges @ np.array([n, 1]), np.arange(n) * (n + 1)
+    reached = [ring]
+    while len(reached) < rings and len(ring):
+        vertices, neighbours = np.divmod(ring, n)
+        degrees = np.diff(starts)[neighbours]
+        if sum(map(len, reached)) > most or degrees.sum() > 2 * most:
+            break
+        first = np.repeat(starts[neighbours] - (np.cumsum(degrees) - degrees), degrees)
         ends = edges[first + np.arange(degrees.sum()), 1]
-        more = np.stack([np.repeat(reached[:, 0], degrees), ends], axis=1)
-        reached = np.unique(np.concatenate([reached, more[more[:, 0] != more[:, 1]]]), axis=0)
-    result.starts = wp.array(np.searchsorted(reached[:, 0], np.arange(n + 1)), dtype=int, device=mesh.device)
-    result.neighbours = wp.array(reached[:, 1], dtype=int, device=mesh.device)
+        further = np.unique(np.repeat(vertices, degrees) * n + ends)
+        further = np.setdiff1d(further, ring, assume_unique=True)
+        ring, before = np.setdiff1d(further, before, assume_unique=True), ring
+        reached.append(ring)
+    pairs = np.sort(np.concatenate(reached))
+    if len(pairs) > most or (len(reached) < rings and len(ring)):
+        near = f"{len(pairs)} pairs of its {n} vertices are within {len(reached)} edges"
+        raise ValueError(f"rings must be less for this mesh, not {rings}: {near}, more than can be excluded")
+    vertices, neighbours = np.divmod(pairs, max(1, n))
+    result.starts = wp.array(np.searchsorted(vertices, np.arange(n + 1)), dtype=int, device=mesh.device)
+    result.neighbours = wp.array(neighbours, dtype=int, device=mesh.device)
     return result

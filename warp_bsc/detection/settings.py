@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_number
 from ..kernels import polynomials
 
 __all__ = [
@@ -21,8 +22,7 @@ __all__ = [
     "PairCounts",
     "PairKind",
     "capacity_for",
-    "check_method",
-    "check_tolerance",
+    "checked_tolerance",
 ]
 
 METHODS = ("float", "conservative", "exact")
@@ -90,16 +90,9 @@ class DistanceKind(enum.IntEnum):
         return max(self.point_order) + 1
 
 
-def check_method(method: str) -> None:
-    """Raises ValueError if there is no such method."""
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
-
-
-def check_tolerance(tolerance: float) -> None:
-    """Raises ValueError if the tolerance is out of the range that halving the step reaches."""
-    if not 2.0**-38 <= tolerance <= 1.0:
-        raise ValueError(f"tolerance must be in [2^-38, 1], not {tolerance!r}")
+def checked_tolerance(tolerance: float) -> float:
+    """Returns a tolerance; raises TypeError or ValueError if it is not in the range that halving the step reaches."""
+    return checked_number(tolerance, "tolerance", 2.0**-38, 1.0)
 
 
 def capacity_for(count: int, buffer: str) -> int:

@@ -5,7 +5,9 @@ import sys
 
 import warp as wp
 
-__all__ = ["find_device", "gpu_count", "is_cpu", "start_warp"]
+from .._arguments import check_instance
+
+__all__ = ["checked_device", "find_device", "gpu_count", "is_cpu", "start_warp"]
 
 
 def start_warp() -> None:
@@ -20,6 +22,21 @@ def start_warp() -> None:
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
+
+
+def checked_device(device: wp.DeviceLike) -> wp.Device:
+    """Returns a Warp device; Warp's default for None.
+
+    Raises:
+        TypeError: If it is neither a device nor the name of one.
+        ValueError: If there is no such device.
+    """
+    if device is not None:
+        check_instance(device, "device", (str, wp.Device), "a Warp device or its name")
+    try:
+        return wp.get_device(device)
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"device must be one of this machine, not {device!r}: {error}") from None
 
 
 def find_device(name: str | None) -> wp.Device:

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
+from .._arguments import check_instance, checked_choice, checked_distance, checked_flag, checked_integer, given
+from ..detection.settings import METHODS
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
@@ -55,10 +57,10 @@ def replay(
             themselves then: their collisions and intersections are only counted. Of a mesh that is inside another then,
             it is ignored that it is inside that one, nothing else.
         min_distance: Distance up to which elements are found to be near each other at each time, in the scene's unit of
-            length: a vertex and a face, or two edges, that share no vertex and that no edge joins. No such pair is
-            missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found between the
-            times, and where an edge passes through a face, both may be far from each other's borders: these are
-            intersections. None to look for none.
+            length, at least 2^-1021: a vertex and a face, or two edges, that share no vertex and that no edge joins. No
+            such pair is missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found
+            between the times, and where an edge passes through a face, both may be far from each other's borders: these
+            are intersections. None to look for none.
         validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
             for all.
         earlier: Results of the first intervals, in order, that an earlier replay has found: they are yielded, and the
@@ -75,21 +77,42 @@ def replay(
         intervals are read, and on a CPU one is detected, meanwhile.
 
     Raises:
+        TypeError: If an argument has another type, at the call, as for all errors of arguments.
         ValueError: If the positions at some time are broken, there is no such method, initial intersections are to be
-            ignored and none are to be found, or the distance is no finite number more than 0.
+            ignored and none are to be found, or a number is out of range.
         OSError: If no scheduler answers, or if workers die again and again while they check the same intervals.
         ModuleNotFoundError: If Dask is needed and not installed.
     """
-    if ignore_initial and not intersections:
-        raise ValueError("what crosses at first can be ignored only if intersections are found")
+    check_instance(scene, "scene", Scene, "a Scene")
+    if not isinstance(device, str | None) and not hasattr(device, "alias"):
+        raise TypeError(f"device must be a Warp device or its name, not {given(device)}")
+    if checked_flag(ignore_initial, "ignore_initial") and not checked_flag(intersections, "intersections"):
+        raise ValueError("ignore_initial: what crosses at first can be ignored only if intersections are found")
+    check_instance(earlier, "earlier", Iterable, "results of a replay")
+    if scheduler is not None:
+        check_instance(scheduler, "scheduler", str, "the address of a scheduler")
+    if checked_integer(workers, "workers", 1) > 1 and scheduler is not None:
+        raise ValueError("workers, scheduler: either processes on this machine, or those of a cluster")
     checks = Checks(
         selection=scene.selection,
-        method=method,
+        method=checked_choice(method, "method", METHODS),
         device=None if device is None else str(device),
-        intersections=intersections,
-        min_distance=min_distance,
-        validate_most=validate_most,
+        intersections=checked_flag(intersections, "intersections"),
+        min_distance=None if min_distance is None else checked_distance(min_distance, "min_distance", zero=False),
+        validate_most=None if validate_most is None else checked_integer(validate_most, "validate_most"),
     )
+    return _replay(scene, checks, bool(ignore_initial), earlier, workers, scheduler)
+
+
+def _replay(
+    scene: Scene,
+    checks: Checks,
+    ignore_initial: bool,
+    earlier: Iterable[IntervalResult],
+    workers: int,
+    scheduler: str | None,
+) -> Iterator[IntervalResult]:
+    """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:
         processes = None
         if scheduler is not None or workers > 1:

@@ -7,6 +7,8 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
+from .._arguments import check_instance, given
+from .._one_thread import Occupied, one_at_a_time
 from .solver_ccd import SolverCCD
 
 __all__ = ["CapturedSteps"]
@@ -47,7 +49,17 @@ class CapturedSteps:
                 that it does. If it goes back through a tape, it also has to clear the gradients first.
             solver: The solver.
             state: All states and arrays that ``steps`` both reads and changes.
+
+        Raises:
+            TypeError: If an argument has another type.
         """
+        if not callable(steps):
+            raise TypeError(f"steps must be a function, not {given(steps)}")
+        check_instance(solver, "solver", SolverBase, "a solver of Newton")
+        check_instance(state, "state", (list, tuple), "a list of states and arrays")
+        for x in state:
+            check_instance(x, "state", (newton.State, wp.array), "a list of states and arrays")
+        self._lock = Occupied("CapturedSteps")
         self._steps, self._solver, self._device = steps, solver, solver.model.device
         self._report = solver.report if isinstance(solver, SolverCCD) else None
         self._state = list(state)
@@ -59,8 +71,13 @@ class CapturedSteps:
         self._graph = None
         self.retaken = 0
 
+    @one_at_a_time
     def __call__(self) -> None:
-        """Runs the steps once. Synchronizes with the device where a run may have to be taken back."""
+        """Runs the steps once. Synchronizes with the device where a run may have to be taken back.
+
+        Raises:
+            RuntimeError: If another thread is running them.
+        """
         if self._graph is None or not self._launch():
             self._steps()
             self._capture()

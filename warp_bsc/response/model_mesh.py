@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
+from .._arguments import checked_distance, checked_distances
 from ..detection.approach_phase import MinDistances, make_min_distances
-from ..detection.distance_phase import checked_distance
 from ..detection.mesh import CollisionMesh
 
 __all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "vertex_position"]
@@ -169,20 +169,17 @@ class ModelMesh(CollisionMesh):
         """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 
         Args:
-            min_distance: Minimum distance of all pairs [m], at least 0.
-            radius: Radius of each particle [m], at least 0, shape [particle_count], or one for all; None for 0.
+            min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
+            radius: Radius of each particle [m], as the distance, shape [particle_count], or one for all; None for 0.
             reach: How much farther apart than their distance near pairs are at most [m].
 
         Raises:
-            ValueError: If the distance or the radii have another shape, or are not finite and at least 0.
+            TypeError: If the distance or the radii are no numbers.
+            ValueError: If they have another shape or are out of range.
         """
-        distance = float(checked_distance(min_distance))
-        count = self.model.particle_count
-        radii = np.asarray(0.0 if radius is None else radius.numpy() if isinstance(radius, wp.array) else radius)
-        if radii.shape not in ((), (count,)):
-            raise ValueError(f"radius must be one number or {count}, one a particle, not of shape {radii.shape}")
-        if not (np.isfinite(radii) & (radii >= 0.0)).all():
-            raise ValueError("radii must be finite and at least 0")
+        distance, count = checked_distance(min_distance, "min_distance"), self.model.particle_count
+        given = 0.0 if radius is None else radius.numpy() if isinstance(radius, wp.array) else radius
+        radii = checked_distances(given, "radius", count)
         every = np.full(self.vertex_count, 0.5 * distance)
         every[:count] += radii
         group = np.full(self.vertex_count, -1)

@@ -10,6 +10,16 @@ import warp as wp
 from newton import BodyFlags
 from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 
+from .._arguments import (
+    check_instance,
+    checked_distance,
+    checked_distances,
+    checked_flag,
+    checked_integer,
+    checked_number,
+    given,
+)
+from .._one_thread import Occupied, one_at_a_time
 from ..detection.host_function import run_on_host
 from .adjoint import RecordedStep, StepAdjoint
 from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
@@ -25,6 +35,8 @@ from .speed_limit import has_speed_limit, without_speed_limit
 from .step_record import RecordCounts, StepRecorder
 
 __all__ = ["CollisionMonitor", "SolverCCD"]
+
+_MOST_SUBSTEPS = 1024
 
 _SEPARATION = 5e-3
 """Default distance that contacts are moved apart, as a share of the median edge length."""
@@ -141,11 +153,6 @@ class _Arrays(NamedTuple):
     body_qd: wp.array | None
 
 
-def _numpy(values):
-    """Returns a number or an array as a NumPy array."""
-    return values.numpy() if isinstance(values, wp.array) else np.asarray(values)
-
-
 def _arrays(state):
     return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
 
@@ -203,6 +210,11 @@ class SolverCCD(SolverBase, CouplingHooks):
     differentiated as it was computed, see :mod:`.adjoint`. With ``requires_grad`` all sweeps are made, so that results
     do not jump.
 
+    A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
+    one stage for each thread. Warp and Newton load their kernels in the first steps that need them, which two threads
+    must not do at the same time: let one thread take first steps. A stage cannot be copied by :func:`copy.deepcopy`:
+    put a new one behind a solver of the same model.
+
     Attributes:
         solver: The inner solver.
         respond: Whether the stage responds to collisions, or only reports them.
@@ -236,7 +248,7 @@ class SolverCCD(SolverBase, CouplingHooks):
                 shapes, as with ``requires_grad``. Negative values count as 0.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
-            coupling: Substeps in which the inner solver takes a step that collides, at least 2, so that it pulls
+            coupling: Substeps in which the inner solver takes a step that collides, 2 to 1024, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none. ``"auto"`` takes a step again only where
                 contacts strain cloth or soft bodies by more than 1% against what the inner solver wanted, in up to 32
                 substeps.
@@ -274,11 +286,21 @@ class SolverCCD(SolverBase, CouplingHooks):
                 given. With a minimum distance, it counts the pairs that come nearer than they may.
 
         Raises:
+            TypeError: If an argument has another type.
             ValueError: If a number or the friction of a shape that collides with particles is out of range, or an
                 argument is given without a response.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`, or if a coupled
                 solver is to be differentiated, or to have a contact layer.
         """
+        check_instance(solver, "solver", SolverBase, "a solver of Newton")
+        respond, lift_speed_limit = checked_flag(respond, "respond"), checked_flag(lift_speed_limit, "lift_speed_limit")
+        bodies = None if bodies is None else checked_flag(bodies, "bodies")
+        coupling = self._checked_coupling(coupling)
+        min_distance = 0.0 if min_distance is None else checked_distance(min_distance, "min_distance")
+        for name, distance in (("separation", separation), ("contact_layer", contact_layer)):
+            if distance is not None:
+                checked_distance(distance, name, zero=False)
+        self._lock = Occupied(type(self).__name__)
         self.solver = solver
         super().__init__(solver.model)
         self.collision_pipeline = solver.collision_pipeline
@@ -298,22 +320,18 @@ class SolverCCD(SolverBase, CouplingHooks):
         friction = self._coefficients("friction", friction, most, lengths=(1, model.particle_count))
         restitution = model.soft_contact_restitution if restitution is None else restitution
         restitution = self._coefficients("restitution", restitution, 1.0, lengths=(1,))
-        if coupling is not None and coupling != "auto" and not (isinstance(coupling, int) and coupling >= 2):
-            raise ValueError(f"coupling takes at least 2 substeps, or 'auto', not {coupling!r}")
         if coupling is not None and model.requires_grad:
             raise NotImplementedError("coupled steps carry no gradients: omit coupling, or requires_grad")
-        if contact_layer is not None and not 0.0 < contact_layer < np.inf:
-            raise ValueError(f"contact_layer must be more than 0, not {contact_layer!r}")
         if contact_layer is not None and coupling is not None:
             raise NotImplementedError("coupled steps have no contact layer: omit coupling, or contact_layer")
-        keeps_distances = bool(np.any(min_distance)) or (radius is not None and bool(_numpy(radius).any()))
+        radii = radius.numpy() if isinstance(radius, wp.array) else 0.0 if radius is None else radius
+        radii = checked_distances(radii, "radius", model.particle_count)
+        keeps_distances = min_distance > 0.0 or bool(radii.any())
         self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
             separation = _SEPARATION * self._median_edge()
-        elif not 0.0 < separation < np.inf:
-            raise ValueError(f"separation must be more than 0, not {separation!r}")
         if keeps_distances:
-            mesh.keep_distances(min_distance or 0.0, radius, reach=separation if respond else 0.0)
+            mesh.keep_distances(min_distance, radii, reach=separation if respond else 0.0)
         self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(
             mesh, self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
@@ -349,10 +367,19 @@ class SolverCCD(SolverBase, CouplingHooks):
                 self._motion.friction,
                 thickness=float(contact_layer),
                 restitution=restitution,
-                distances=mesh.min_distances(min_distance or 0.0, radius, reach=float(contact_layer)),
+                distances=mesh.min_distances(min_distance, radii, reach=float(contact_layer)),
                 layerless_steps=self.report._totals.layerless_steps,
             )
             self._layer.prepare(self._motion)
+
+    @staticmethod
+    def _checked_coupling(coupling):
+        """Returns the argument ``coupling``: None, "auto" or a number of substeps."""
+        if coupling is None or (isinstance(coupling, str) and coupling == "auto"):
+            return coupling
+        if isinstance(coupling, str):
+            raise ValueError(f"coupling takes 2 substeps or more, or 'auto', not {given(coupling)}")
+        return checked_integer(coupling, "coupling", 2, _MOST_SUBSTEPS)
 
     def _find_moves_bodies(self, bodies):
         """Returns whether the response can move bodies, as the argument ``bodies`` says."""
@@ -376,7 +403,7 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _coefficients(self, name, value, most, lengths):
         """Returns an argument that is a coefficient, or an array of some, as an array; checks it for the response."""
         if not isinstance(value, wp.array):
-            values = np.full(1, value)
+            values = np.full(1, checked_number(value, name))
         elif value.dtype is not wp.float32 or value.ndim != 1 or len(value) not in lengths:
             allowed = " or ".join(map(str, dict.fromkeys(lengths)))
             raise ValueError(f"{name} must be a number, or an array of float32 of length {allowed}")
@@ -413,6 +440,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
         return float(np.median(lengths)) if lengths.any() else 1.0
 
+    @one_at_a_time
     def step(
         self,
         state_in: newton.State,
@@ -431,17 +459,21 @@ class SolverCCD(SolverBase, CouplingHooks):
             state_out: The state at the end. May be the same.
             control: As for the inner solver.
             contacts: As for the inner solver.
-            dt: Length of the step [s].
+            dt: Length of the step [s], more than 0.
             options: As for the inner solver.
 
         Raises:
-            ValueError: If a tape records gradients of the response, and both states are the same.
+            TypeError: If the length is no number.
+            ValueError: If the length is not finite or not more than 0, or if a tape records gradients of the response,
+                and both states are the same.
             NotImplementedError: If a tape records gradients of a response that keeps a minimum distance, or of one with
                 a contact layer where shapes move with bodies.
             RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before.
+            RuntimeError: If another thread is using this stage.
             NotImplementedError: If ``coupling="auto"`` is captured in a CUDA graph behind a solver that may allocate
                 memory, such as ``SolverXPBD``.
         """
+        checked_number(dt, "dt", 0.0, above=True)
         with _paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
@@ -469,6 +501,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
             self.solver.step(*arguments, **options)
 
+    @one_at_a_time
     def _inspect(self, end, dt):
         """Detects the collisions of the motion from the start of the step to a state, and counts the step."""
         with self._timed():
@@ -508,6 +541,10 @@ class SolverCCD(SolverBase, CouplingHooks):
                 self._launch(_count_record, 1, inputs, outputs)
 
         def backward():
+            with self._lock:
+                go_back()
+
+        def go_back():
             if recorded is not None:
                 StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
             if pushed is not None:
@@ -525,6 +562,7 @@ class SolverCCD(SolverBase, CouplingHooks):
     def _set_end(self, end, dt):
         self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
 
+    @one_at_a_time
     def _resolve(self, end, dt, record=None):
         """Resolves the motion from the start of the step to a state, and changes it."""
         with self._timed():
@@ -538,6 +576,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             self._finish(resolution, end)
         return resolution
 
+    @one_at_a_time
     def _couple(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
@@ -579,6 +618,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         yield
         self.report._end = now()
 
+    @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         self.solver.notify_model_changed(flags)
@@ -621,6 +661,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         """Delegates to the inner solver."""
         return self.solver.validate_observables(*arguments, **options)
 
+    @one_at_a_time
     def reset(self, state, world_mask=None, flags=None):
         """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
         self.solver.reset(state, world_mask, flags)
@@ -629,6 +670,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver."""
         self.solver.update_contacts(contacts, state)
+
+    def __deepcopy__(self, memo):
+        """Raises a TypeError: buffers on the device, and graphs that write to them, cannot be copied."""
+        raise TypeError(f"a {type(self).__name__} cannot be copied: put a new one behind a solver of the same model")
 
     def __getattr__(self, name):
         """Delegates other attributes to the inner solver."""
@@ -653,6 +698,7 @@ class CollisionMonitor(SolverCCD):
             solver: Any Newton solver that moves particles.
 
         Raises:
+            TypeError: If it is no solver of Newton.
             NotImplementedError: If the model has shapes that are not supported, see :class:`ModelMesh`.
         """
         super().__init__(solver, respond=False)

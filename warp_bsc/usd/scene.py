@@ -49,12 +49,16 @@ unselected meshes) and the changes that it makes to the motion.
 
 import math
 import os
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from numbers import Integral
 
 import numpy as np
 
+from .._arguments import check_instance, checked_flag, checked_integer, checked_number, given
+from .._one_thread import one_at_a_time
 from .files import SceneFiles
 from .interval import (
     Interval,
@@ -71,6 +75,7 @@ from .selection import Selection
 __all__ = ["FrameRange", "Scene"]
 
 _JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
+_MOST_PARTS = 10_000  # of a step between two times
 _NAMED = 5  # most parts left out, and most messages of OpenUSD, that the warnings list
 _ROUNDING = 1e-12
 _SAME_TIME = 1e-6
@@ -89,12 +94,26 @@ class FrameRange:
     Attributes:
         start: First time code, None for that of the scene.
         end: Last time code, None for that of the scene.
-        step: Time codes from one time to the next, None for the samples that the scene has.
+        step: Time codes from one time to the next, more than 0, None for the samples that the scene has.
+
+    Raises:
+        TypeError: If one of them is no number.
+        ValueError: If one of them is not finite, the end is not after the start, or the step is not more than 0.
     """
 
     start: float | None = None
     end: float | None = None
     step: float | None = None
+
+    def __post_init__(self):
+        """Checks the attributes."""
+        for name in ("start", "end", "step"):
+            value = getattr(self, name)
+            if value is not None:
+                limits = {"least": 0.0, "above": True} if name == "step" else {}
+                object.__setattr__(self, name, checked_number(value, name, **limits))
+        if self.start is not None and self.end is not None and self.end <= self.start:
+            raise ValueError(f"end must be after the start, {self.start:g}, not {self.end:g}")
 
     def bounds(self, samples: list[float]) -> tuple[float, float]:
         """Returns the first and the last time, given all times of the scene, ascending."""
@@ -124,7 +143,7 @@ class FrameRange:
         times = sorted(time for time in times if low <= time <= high)
         if len(times) < 2:
             raise ValueError(
-                f"--frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
+                f"frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
                 f"{samples[-1]:g}"
             )
         return times
@@ -133,7 +152,8 @@ class FrameRange:
 class Scene:
     """The moving meshes of a USD file, as intervals between consecutive times: ``for interval in scene``.
 
-    A scene holds one segment of the motion in memory and reads others when an interval needs them.
+    A scene holds one segment of the motion in memory and reads others when an interval needs them. Threads may share a
+    scene: each interval that one reads waits for the one before. Jumps are found between intervals read in order.
 
     It can be pickled, for another process that reads other intervals of the same files: the pickle holds its path, its
     options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if it is not
@@ -178,7 +198,7 @@ class Scene:
             path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
             selection: Which of its meshes are checked; default: those to be rendered.
             frames: The part of its time; default: all.
-            subdivide: Number of intervals, at least 1, into which each step between two times is divided.
+            subdivide: Number of intervals, 1 to 10,000, into which each step between two times is divided.
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
@@ -186,11 +206,25 @@ class Scene:
                 have been compared, and of all.
 
         Raises:
+            TypeError: If an argument has another type.
             FileNotFoundError: If there is no such file.
             ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
                 ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
-        options = _Options(selection, frames, subdivide, sample_turns, strict)
+        check_instance(path, "path", (str, os.PathLike), "the path of a file")
+        if selection is not None:
+            check_instance(selection, "selection", Selection, "a Selection")
+        if frames is not None:
+            check_instance(frames, "frames", FrameRange, "a FrameRange")
+        if progress is not None and not callable(progress):
+            raise TypeError(f"progress must be a function, not {given(progress)}")
+        options = _Options(
+            selection,
+            frames,
+            checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
+            checked_flag(sample_turns, "sample_turns"),
+            checked_flag(strict, "strict"),
+        )
         self._open(path, options, _Revealed(), progress)
 
     def _open(
@@ -206,6 +240,7 @@ class Scene:
         from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
         from . import stage as usd_stage  # noqa: PLC0415
 
+        self._lock = threading.RLock()
         self._options = options
         self.path = str(path)
         self.selection = options.selection or Selection()
@@ -294,11 +329,16 @@ class Scene:
             stop: Number of the interval after the last one; default: all.
 
         Raises:
+            TypeError: If a number is no integer.
             IndexError: If there is no such interval.
             ValueError: As of :meth:`interval`.
         """
+        first = self._checked_index(first, "first", len(self))
+        stop = len(self) if stop is None else self._checked_index(stop, "stop", len(self))
+        return self._intervals(first, stop)
+
+    def _intervals(self, first: int, stop: int) -> Iterator[Interval]:
         self.take_notes()
-        stop = len(self) if stop is None else stop
         if 0 < first < stop and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
             self._read_positions(first - 1)
         for index in range(first, stop):
@@ -311,12 +351,15 @@ class Scene:
             index: Number of the interval, from 0: it starts at that one of :attr:`times`.
 
         Raises:
+            TypeError: If a number is no integer.
             IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
+        index = self._checked_index(index, "index", len(self) - 1)
         self.take_notes()
         return self._read(index)
 
+    @one_at_a_time
     def segment(self, index: int, progress: Callable[[int, int], None] | None = None) -> Segment:
         """Returns the segment that an interval is in: the one in memory if possible.
 
@@ -343,12 +386,14 @@ class Scene:
                 self._welded = max(self._welded, self._segment.welded)
         return self._segment
 
+    @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
         """Returns what reading has revealed since this was called last, or since the scene was opened; and jumps."""
         parts, messages = self._noted
         self._noted = len(self._parts), len(self._messages)
         return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
 
+    @one_at_a_time
     def note(self, index: int, notes: ReadingNotes) -> None:
         """Records what reading an interval has revealed in another process, as if this scene had read it.
 
@@ -363,6 +408,7 @@ class Scene:
         for name in notes.jumps:
             self._jump_times.setdefault(name, set()).add(self.times[index])
 
+    @one_at_a_time
     def _read(self, index) -> Interval:
         """Reads an interval, with all that reading has revealed since notes were taken last."""
         segment, x0, x1, jumps = self._read_positions(index)
@@ -370,10 +416,9 @@ class Scene:
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
 
+    @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
         """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.path}: there is no interval {index}, they go from 0 to {len(self) - 1}")
         start, end = self.times[index : index + 2]
         with self._collecting(self._messages, self.path):
             while True:
@@ -390,6 +435,15 @@ class Scene:
         for name in jumps:
             self._jump_times.setdefault(name, set()).add(start)
         return segment, x0, x1, jumps
+
+    def _checked_index(self, index, name, last) -> int:
+        """Returns the number of an interval; raises a TypeError, or an IndexError if it is not in [0, last]."""
+        if not isinstance(index, Integral) or isinstance(index, bool):
+            raise TypeError(f"{name} must be an integer, not {given(index)}")
+        if not 0 <= int(index) <= last:
+            number = given(int(index))
+            raise IndexError(f"{self.path}: {name}: there is no interval {number}, they go from 0 to {len(self) - 1}")
+        return int(index)
 
     def _contents(self) -> tuple:
         """Returns facts of the scene that another process must find, too."""

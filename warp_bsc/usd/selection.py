@@ -1,12 +1,14 @@
 """Selects the meshes of a scene that are checked, and the pairs of them."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Protocol
 
 import numpy as np
+
+from .._arguments import checked_choice, checked_flag, given
 
 __all__ = ["PURPOSES", "NamedMesh", "Selection"]
 
@@ -41,6 +43,10 @@ class Selection:
         ignore: Pairs of patterns: pairs of a mesh of the first and a mesh of the second are not checked.
         ignored_names: Pairs of names of meshes that are not checked with each other, each pair sorted.
         ignored_inside: Names of a mesh and of another one that it may be inside.
+
+    Raises:
+        TypeError: If an argument has another type; a string is not a sequence of patterns.
+        ValueError: If a pair has not two entries, or there is no such purpose.
     """
 
     prims: tuple[str, ...] = ()
@@ -51,6 +57,22 @@ class Selection:
     ignore: tuple[tuple[str, str], ...] = ()
     ignored_names: frozenset[tuple[str, str]] = frozenset()
     ignored_inside: frozenset[tuple[str, str]] = frozenset()
+
+    def __post_init__(self):
+        """Checks the attributes, and makes tuples and sets of them."""
+        checked: dict[str, object] = {}
+        for name in ("prims", "exclude", "purposes"):
+            checked[name] = _checked_strings(getattr(self, name), name)
+        for purpose in _checked_strings(self.purposes, "purposes"):
+            checked_choice(purpose, "purposes", PURPOSES)
+        checked["self_collisions"] = checked_flag(self.self_collisions, "self_collisions")
+        if self.between is not None:
+            checked["between"] = _checked_pair(self.between, "between")
+        checked["ignore"] = _checked_pairs(self.ignore, "ignore")
+        for name in ("ignored_names", "ignored_inside"):
+            checked[name] = frozenset(_checked_pairs(getattr(self, name), name))
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     def includes(self, mesh: NamedMesh) -> bool:
         """Returns whether a mesh is checked at all, whatever its purpose."""
@@ -66,11 +88,10 @@ class Selection:
         Raises:
             ValueError: If a pattern matches none.
         """
-        named = {"--prims": self.prims, "--exclude": self.exclude, "--between": self.between or ()}
-        for option, patterns in named.items():
-            for pattern in patterns:
+        for name in ("prims", "exclude", "between"):
+            for pattern in getattr(self, name) or ():
                 if not any(_matches(mesh, pattern) for mesh in meshes):
-                    raise ValueError(f"{option} {pattern}: there is no such mesh")
+                    raise ValueError(f"{name} {pattern}: there is no such mesh")
 
     def unmatched(self, meshes: Sequence[NamedMesh]) -> list[tuple[str, str]]:
         """Returns the pairs to ignore of which a pattern matches none of all meshes."""
@@ -113,6 +134,29 @@ class Selection:
             a, b = pairs.T
             counted &= (first[a] & second[b]) | (first[b] & second[a])
         return counted
+
+
+def _checked_strings(values, name) -> tuple[str, ...]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
+    values = tuple(values)
+    for value in values:
+        if not isinstance(value, str):
+            raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
+    return values
+
+
+def _checked_pair(values, name) -> tuple[str, str]:
+    pair = _checked_strings(values, name)
+    if len(pair) != 2:
+        raise ValueError(f"{name} must have two strings a pair, not {given(pair)}")
+    return pair[0], pair[1]
+
+
+def _checked_pairs(values, name) -> tuple[tuple[str, str], ...]:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"{name} must be pairs of strings, not {given(values)}")
+    return tuple(_checked_pair(pair, name) for pair in values)
 
 
 def _matches(mesh, pattern) -> bool:

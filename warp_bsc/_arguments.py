@@ -1,0 +1,233 @@
+"""Checks the arguments that users pass in: numbers, flags, choices, arrays. Errors begin with the argument's name.
+
+A wrong type is a TypeError, a wrong value a ValueError. NumPy's scalars are as good as Python's; a string is never a
+number, and a bool is none either.
+"""
+
+import math
+import reprlib
+from collections.abc import Sequence
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = [
+    "LEAST_DISTANCE",
+    "as_numpy",
+    "check_finite",
+    "check_instance",
+    "checked_choice",
+    "checked_coordinates",
+    "checked_distance",
+    "checked_distances",
+    "checked_flag",
+    "checked_integer",
+    "checked_number",
+    "checked_shape",
+    "given",
+]
+
+LEAST_DISTANCE = 2.0**-1021
+"""Least distance or radius that is not 0: half of it is a normal number, which a processor may not take for 0."""
+
+_LEAST_BITS = int(np.float64(LEAST_DISTANCE).view(np.int64))
+
+_LARGEST_COUNT = 2**31 - 1
+
+
+def given(value: object) -> str:
+    """Returns what was given, as errors show it."""
+    text = reprlib.repr(value)
+    return text if isinstance(value, str | Real | None) else f"{type(value).__name__} {text}"
+
+
+def checked_integer(value: Any, name: str, least: int = 0, most: int = _LARGEST_COUNT) -> int:
+    """Returns an integer in [least, most].
+
+    Raises:
+        TypeError: If it is no integer.
+        ValueError: If it is out of range.
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        raise TypeError(f"{name} must be an integer, not {given(value)}")
+    integer = int(value)
+    if not least <= integer <= most:
+        bounds = f"of at least {least}, less than 2^31" if most == _LARGEST_COUNT else f"in [{least}, {most}]"
+        raise ValueError(f"{name} must be an integer {bounds}, not {given(value)}")
+    return integer
+
+
+def checked_number(
+    value: Any, name: str, least: float = -math.inf, most: float = math.inf, *, above: bool = False
+) -> float:
+    """Returns a finite number in [least, most], in (least, most] if ``above``.
+
+    Raises:
+        TypeError: If it is no number.
+        ValueError: If it is out of range or not finite.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name} must be a number, not {given(value)}")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number) or not least <= number <= most or (above and number == least):
+        bounds = "finite"
+        if math.isfinite(least):
+            bounds += f" and {'more than' if above else 'at least'} {least:g}"
+        if math.isfinite(most):
+            bounds += f" and at most {most:g}"
+        raise ValueError(f"{name} must be {bounds}, not {given(value)}")
+    return number
+
+
+def checked_flag(value: Any, name: str) -> bool:
+    """Returns True or False.
+
+    Raises:
+        TypeError: If it is neither.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, not {given(value)}")
+    return bool(value)
+
+
+def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
+    """Returns one of some strings.
+
+    Raises:
+        TypeError: If it is no string.
+        ValueError: If it is none of these.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
+    return value
+
+
+def check_instance(value: Any, name: str, types: type | tuple[type, ...], what: str) -> None:
+    """Raises a TypeError if a value is no instance of a type, which ``what`` describes: "a CollisionMesh"."""
+    if not isinstance(value, types):
+        raise TypeError(f"{name} must be {what}, not {given(value)}")
+
+
+def as_numpy(array: ArrayLike, name: str) -> np.ndarray:
+    """Returns an array of numbers as NumPy, in this machine's order of bytes.
+
+    Raises:
+        TypeError: If its entries are no numbers.
+        ValueError: If its rows have different lengths, or entries are masked.
+    """
+    if np.ma.is_masked(array):
+        raise ValueError(f"{name} must have no masked entries, which have no value")
+    try:
+        values = np.asarray(array)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array with rows of the same length: {error}") from None
+    if values.dtype.kind not in "biufc":
+        raise TypeError(f"{name} must be an array of numbers, not {given(array)}")
+    return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
+
+
+def checked_shape(array: ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Returns an array of coordinates, as NumPy, finite or not.
+
+    Args:
+        array: Coordinates, float32 or float64, first dimension n, then ``shape``.
+        shape: All dimensions except the first.
+        name: Name of the array in errors.
+
+    Returns:
+        NumPy array.
+
+    Raises:
+        TypeError: If its entries are no numbers.
+        ValueError: If the shape or the type is wrong, or entries are masked.
+    """
+    array = as_numpy(array, name)
+    if array.dtype not in (np.float32, np.float64):
+        raise ValueError(f"{name} must be float32 or float64, got {array.dtype}")
+    if array.ndim == 0 or array.shape[1:] != shape:
+        raise ValueError(f"{name} must have shape (n, {', '.join(map(str, shape))}), got {array.shape}")
+    return array
+
+
+def check_finite(array: np.ndarray, name: str, rows: np.ndarray | None = None) -> None:
+    """Raises a ValueError that names the first row that is not finite, of an array or of some of its rows."""
+    if np.isfinite(array).all():  # copying rows takes a hundred times as long
+        return
+    finite = np.isfinite(array if rows is None else array[rows]).all(axis=tuple(range(1, array.ndim)))
+    if not finite.all():
+        row = np.argmin(finite)
+        raise ValueError(f"{name}[{row if rows is None else rows[row]}] has a coordinate that is not finite")
+
+
+def checked_coordinates(array: ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Returns an array of coordinates, as NumPy, with arguments and errors of :func:`checked_shape`.
+
+    Raises:
+        ValueError: Also if a coordinate is not finite.
+    """
+    array = checked_shape(array, shape, name)
+    check_finite(array, name)
+    return array
+
+
+def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
+    """Returns distances or radii, one or many, in double precision.
+
+    Processors that flush subnormal numbers to zero take such a distance for 0, in comparisons, too: bits are compared.
+
+    Args:
+        distances: One number, or an array of shape (count,).
+        name: Name of the argument in errors.
+        count: Number of distances.
+
+    Raises:
+        TypeError: If they are no numbers.
+        ValueError: If they have another shape, are masked, negative or not finite, or are less than
+            :data:`LEAST_DISTANCE` and not 0.
+    """
+    values = as_numpy(distances, name)
+    if values.dtype.kind not in "iuf":
+        raise TypeError(f"{name} must be one number or an array of numbers, not {given(distances)}")
+    if values.shape not in ((), (count,)):
+        raise ValueError(f"{name} must be one number or have shape ({count},), not {values.shape}")
+    converted = np.ascontiguousarray(_as_double(values)).reshape(values.shape)
+    bits = converted.view(np.int64)
+    is_zero = bits << 1 == 0
+    if values.dtype.itemsize > 8:  # of numbers that are longer than doubles, some become 0
+        is_zero &= values == 0
+    bad = ~(np.isfinite(converted) & (is_zero | (bits >= _LEAST_BITS)))
+    if bad.any():
+        which = np.flatnonzero(bad)[0]
+        where = f"{name}[{which}]" if values.ndim else name
+        raise ValueError(
+            f"{where} must be finite and at least 0, and at least 2^-1021 if not 0, not {values.reshape(-1)[which]}"
+        )
+    return converted
+
+
+def checked_distance(distance: Any, name: str, *, zero: bool = True) -> float:
+    """Returns one distance in double precision, more than 0 unless ``zero``; errors as :func:`checked_distances`."""
+    if isinstance(distance, np.ndarray | list | tuple):
+        raise TypeError(f"{name} must be a number, not {given(distance)}")
+    checked = checked_distances(distance, name, 0)
+    if not zero and checked == 0.0:
+        raise ValueError(f"{name} must be more than 0, not {given(distance)}")
+    return float(checked)
+
+
+def _as_double(values: np.ndarray) -> np.ndarray:
+    """Returns numbers in double precision; subnormal numbers of single precision as well if processors flush these."""
+    if values.dtype != np.float32:
+        with np.errstate(over="ignore"):
+            return values.astype(np.float64)
+    bits = np.ascontiguousarray(values).reshape(values.shape).view(np.int32)
+    sizes = bits & 0x7FFFFFFF
+    subnormal = sizes < 2**23
+    return np.where(subnormal, np.where(bits < 0, -1.0, 1.0) * sizes * 2.0**-149, values.astype(np.float64))
