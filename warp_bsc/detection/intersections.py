@@ -10,11 +10,13 @@ import warp as wp
 from .. import checker
 from .._arrays import check_finite
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
+from ..kernels.exact.edge_face import BITS, edge_meets_face_in
+from ..kernels.motion import double
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
 from .broad_phase import BroadPhase, make_broad_phase
 from .collisions import Collisions
-from .launch import launch_over_queue, retry_until_fits
+from .launch import launch_over, launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
@@ -66,6 +68,44 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
                 status[wp.int32(slot)] = wp.int8(answer)
 
     return keep_crossings
+
+
+@functools.cache
+def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
+    """The kernel that decides unsure pairs in wide integers, for one type of position and one width."""
+    edge_meets_face = edge_meets_face_in(limbs)
+
+    @wp.kernel(**NO_GRADIENTS)
+    def decide_exactly(
+        first: int,
+        # mesh
+        x: wp.array[dtype],
+        edges: wp.array2d[int],
+        faces: wp.array2d[int],
+        across: wp.array2d[int],
+        # in
+        pairs: wp.array[wp.vec2i],
+        # in and out
+        status: wp.array[wp.int8],
+    ):
+        i = first + wp.tid()
+        if int(status[i]) != UNSURE:
+            return
+        edge = pairs[i][0]
+        face = pairs[i][1]
+        answer = edge_meets_face(
+            double(x[edges[edge, 0]]),
+            double(x[edges[edge, 1]]),
+            double(x[faces[face, 0]]),
+            double(x[faces[face, 1]]),
+            double(x[faces[face, 2]]),
+            double(x[across[face, 0]]),
+            double(x[across[face, 1]]),
+            double(x[across[face, 2]]),
+        )
+        status[i] = wp.int8(answer)
+
+    return decide_exactly
 
 
 class CrossingCandidates:
@@ -201,9 +241,9 @@ class IntersectionFinder:
             self._keep_crossings(x)
 
         retry_until_fits(launch, self, mesh.device)
-        status = self._status.numpy()[: self._count]
+        status = self._decided_exactly(x)
         pairs = self._kept.numpy()[: self._count]
-        meets, crosses = np.ones(len(pairs), dtype=bool), status == HIT
+        meets, crosses = status != FREE, status == HIT
         (unsure,) = np.nonzero(status == UNSURE)
         if len(unsure):
             edges, faces = pairs[unsure].T
@@ -217,6 +257,23 @@ class IntersectionFinder:
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         return Intersections(pairs[order], crosses[order])
+
+    def _decided_exactly(self, x: wp.array) -> np.ndarray:
+        """Returns the status of the kept pairs, UNSURE only where their exponents are too far apart for the device."""
+        mesh = self._mesh
+        for limbs in BITS:
+            status = self._status.numpy()[: self._count]
+            if not (status == UNSURE).any():
+                break
+            launch_over(
+                _decide_exactly(x.dtype, limbs),
+                self._count,
+                inputs=[x, mesh.device_edges, mesh.device_faces, self._device_across, self._kept],
+                outputs=[self._status],
+                device=mesh.device,
+                block_dim=64,
+            )
+        return self._status.numpy()[: self._count]
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
@@ -239,6 +296,10 @@ class IntersectionFinder:
         across = opposite.copy()
         across[one], across[other] = opposite[other], opposite[one]
         return across.reshape(-1, 3)
+
+    @functools.cached_property
+    def _device_across(self) -> wp.array:
+        return wp.array(self._across, dtype=int, device=self._mesh.device)
 
     def _allocate(self, capacity: int) -> None:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)

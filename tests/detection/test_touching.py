@@ -1,0 +1,58 @@
+"""Meshes that touch exactly, such as copies of one another: the device decides, and agrees with the exact checker."""
+
+import numpy as np
+import pytest
+from sheets import grid
+
+import warp_bsc as bsc
+from warp_bsc import checker
+from warp_bsc.detection.intersections import IntersectionFinder
+
+_CHECKS = ("edge_face_crossings", "edges_pass_faces")
+
+
+def copies(count, resolution, dtype, turn=None):
+    """Flat sheets in one place: positions and faces."""
+    x, faces = grid(resolution)
+    x = (x if turn is None else x @ turn).astype(dtype)
+    return np.tile(x, (count, 1)), np.concatenate([faces + i * len(x) for i in range(count)])
+
+
+def all_pairs(mesh):
+    """All pairs of an edge and a face that share no vertex."""
+    edges, faces = (numbers.ravel() for numbers in np.indices((len(mesh.edges), len(mesh.faces))))
+    apart = (mesh.edges[edges][:, :, None] != mesh.faces[faces][:, None, :]).all(axis=(1, 2))
+    return np.stack([edges[apart], faces[apart]], axis=1)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_copies_of_a_sheet_need_no_checker(dtype, monkeypatch):
+    turned, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    for turn in (None, turned):
+        x, faces = copies(3, 3, dtype, turn)
+        mesh = bsc.CollisionMesh(faces, len(x))
+        pairs = all_pairs(mesh)
+        expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[faces[pairs[:, 1]]])]
+        with monkeypatch.context() as patch:
+            for name in _CHECKS:
+                patch.setattr(checker, name, lambda *_: pytest.fail("the host has decided a pair"))
+            found = IntersectionFinder(mesh).find(x)
+        np.testing.assert_array_equal(found.pairs, expected)
+        if turn is None:
+            assert len(found.pairs) > 500
+            assert not found.crosses.any()  # all is in one plane
+
+
+def test_touching_pairs_too_wide_for_the_device_go_to_the_checker(monkeypatch):
+    """Triangles in one plane with a corner in common and others 2^-500 from there."""
+    x = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 0), (2.0**-500, 2.0**-500, 0), (0, 2.0**-500, 0)])
+    mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)
+    decided = []
+    for name in _CHECKS:
+        check = getattr(checker, name)
+        monkeypatch.setattr(checker, name, lambda *pairs, check=check: decided.append(len(pairs[0])) or check(*pairs))
+    found = IntersectionFinder(mesh).find(x)
+    assert sum(decided) > 0
+    pairs = all_pairs(mesh)
+    expected = checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[mesh.faces[pairs[:, 1]]])
+    np.testing.assert_array_equal(found.pairs, pairs[expected])
