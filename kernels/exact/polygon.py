@@ -114,7 +114,7 @@ def top_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 
 @wp.func
-def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
+def widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
     """Returns exponents e such that the corners of the polygon at one time are below 2^e, for each axis."""
     if kind == VERTEX_FACE:
         return wp.max(top_bits(a, b), wp.max(top_bits(a, c), top_bits(a, d)))
@@ -137,7 +137,7 @@ def spread(
 ):
     """Returns the exponent of the power of two to divide each axis by, and the bits B of the corners after that."""
     lowest = wp.min(wp.min(lowest_bits(a0, b0), lowest_bits(c0, d0)), wp.min(lowest_bits(a1, b1), lowest_bits(c1, d1)))
-    bits = wp.max(_widest(kind, a0, b0, c0, d0), _widest(kind, a1, b1, c1, d1)) - lowest
+    bits = wp.max(widest(kind, a0, b0, c0, d0), widest(kind, a1, b1, c1, d1)) - lowest
     return lowest, wp.max(wp.max(bits), 0)
 
 

@@ -199,6 +199,12 @@ SCALED = """
 """For native functions: arrays of limbs of finite numbers divided by a power of two that divides them, and of
 differences, modulo 2 to the width."""
 
+_SCALED_LIKE = f"""{SCALED}
+    ret_type r;
+    scaled(x, exponent, r);
+    return r;
+"""
+
 
 def _returning(snippet: str, limbs: int) -> str:
     """Returns a snippet preceded by the definition of its return type."""
@@ -232,6 +238,11 @@ for _limbs in LIMBS:
     @wp.func_native(snippet=_returning(_SHIFT, _limbs))
     def shift(a: _Single, bits: int) -> _Single:
         """Returns the integer times 2^bits."""
+        ...
+
+    @wp.func_native(snippet=_returning(_SCALED_LIKE, _limbs))
+    def scaled_like(a: _Single, x: wp.float64, exponent: int) -> _Single:
+        """Returns a finite number divided by a power of two that divides it, as wide as an integer."""
         ...
 
     if _limbs < LIMBS[-1]:
