@@ -19,7 +19,7 @@ d included. In units of a power of two to that, |e| and |i| < 2 sqrt(3), thus fo
 g.q < 36, of degree 4, and (g.q)^2 < 2^11 and d^2 g.g < 2^9, of degree 8. With coordinates of L limbs, g and g.q of 4 L
 and the rest of 8 L limbs, everything fits, with one bit for the sign, for
 
-    B + k <= (512 L - 13) / 8:  126 bits for L = 2 limbs a coordinate, 510 for eight.
+    B + k <= (512 L - 13) / 8:  126 bits for L = 2 limbs a coordinate, 254 for four.
 """
 
 import functools
@@ -45,7 +45,7 @@ from .wide_integers import (
     widen,
 )
 
-BITS = {2: 126, 8: 510}
+BITS = {2: 126, 4: 254}
 """Largest B + k for each number of limbs of a coordinate."""
 
 TOO_WIDE = wp.constant(-1)

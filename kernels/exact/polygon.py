@@ -28,7 +28,7 @@ from typing import Any
 import warp as wp
 
 from ..polynomials import VERTEX_FACE
-from .wide_integers import SCALED, add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
+from .wide_integers import LIMBS, SCALED, add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
 BITS = {1: 35, 2: 71, 8: 291}
 """Largest B for each number of limbs of a coordinate."""
@@ -51,7 +51,7 @@ _FROM_POINTS = f"""{SCALED}
     }}
 """
 
-for _limbs in BITS:
+for _limbs in LIMBS[:4]:
     _Integer = integer(_limbs)
 
     @wp.func_native(snippet=_FROM_POINTS)
