@@ -6,6 +6,7 @@ from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.detection.containment import ContainmentFinder
 from warp_bsc.detection.intersections import IntersectionFinder
 
 _CHECKS = ("edge_face_crossings", "edges_pass_faces")
@@ -56,3 +57,20 @@ def test_touching_pairs_too_wide_for_the_device_go_to_the_checker(monkeypatch):
     pairs = all_pairs(mesh)
     expected = checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[mesh.faces[pairs[:, 1]]])
     np.testing.assert_array_equal(found.pairs, pairs[expected])
+
+
+def test_vertices_on_a_touching_body_need_no_checker(monkeypatch):
+    """Boxes in one place, and a smaller one that touches a wall from within."""
+    x = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float32)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box = np.array([corners for a, b, c, d in quads for corners in ((a, b, c), (a, c, d))])
+    bodies = np.repeat([0, 1], len(box))
+    mesh = bsc.CollisionMesh(np.concatenate([box, box + 8]), 16)
+    monkeypatch.setattr(checker, "edge_face_crossings", lambda *_: pytest.fail("the host has decided a pair"))
+    for other, inside in ((x, []), (0.5 * x + np.float32([0, 0.25, 0.25]), [[1, 0]])):
+        positions = np.concatenate([x, other])
+        found = IntersectionFinder(mesh).find(positions)
+        contained = ContainmentFinder(mesh, bodies).find(
+            positions, found, lambda pairs: np.ones(len(pairs), dtype=bool)
+        )
+        assert contained.bodies.tolist() == inside

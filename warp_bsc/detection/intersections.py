@@ -20,7 +20,7 @@ from .launch import launch_over, launch_over_queue, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections"]
+__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections", "vertices_on_faces"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -106,6 +106,56 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
         status[i] = wp.int8(answer)
 
     return decide_exactly
+
+
+def _decided(
+    mesh: CollisionMesh, x: wp.array, edges: wp.array, across: wp.array, pairs: wp.array, status: wp.array, count: int
+) -> np.ndarray:
+    """Returns the status of pairs after the exact stage, UNSURE only where exponents are too far apart for it.
+
+    Args:
+        mesh: The mesh.
+        x: Positions, array of vec3 or vec3d.
+        edges: Vertices of both ends of each edge, two-dimensional array of int.
+        across: Vertices across the sides of each face, as of :meth:`IntersectionFinder._across`, likewise.
+        pairs: (edge, face), array of vec2i.
+        status: Status of each pair, array of int8, which is overwritten.
+        count: Number of pairs.
+    """
+    for limbs in BITS:
+        if not (status.numpy()[:count] == UNSURE).any():
+            break
+        inputs = [x, edges, mesh.device_faces, across, pairs]
+        kernel = _decide_exactly(x.dtype, limbs)
+        launch_over(kernel, count, inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
+    return status.numpy()[:count]
+
+
+def vertices_on_faces(mesh: CollisionMesh, x: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Returns which vertices are on which faces, exactly, pair by pair.
+
+    Args:
+        mesh: The mesh.
+        x: Positions, finite, any unit of length, shape [vertex_count, 3], float32 or float64.
+        vertices: The vertices, integers, shape [n].
+        faces: The faces, integers, shape [n].
+
+    Returns:
+        Bool array of shape [n].
+    """
+    device, n = mesh.device, len(vertices)
+    points, row = np.unique(vertices, return_inverse=True)
+    edges = wp.array(np.stack([points, points], axis=1), dtype=int, device=device)  # whose ends are one vertex
+    pairs = wp.array(np.stack([row.reshape(-1), faces], axis=1), dtype=wp.vec2i, device=device)
+    status = wp.full(n, int(UNSURE), dtype=wp.int8, device=device)
+    # what passes through a face does not matter, nor do the faces' neighbours
+    status = _decided(mesh, mesh.device_positions(x, "x"), edges, mesh.device_faces, pairs, status, n)
+    on_face = status != FREE
+    (unsure,) = np.nonzero(status == UNSURE)
+    if len(unsure):
+        ends = np.repeat(x[vertices[unsure], None], 2, axis=1)
+        on_face[unsure] = checker.edge_face_crossings(ends, x[mesh.faces[faces[unsure]]])
+    return on_face
 
 
 class CrossingCandidates:
@@ -241,7 +291,7 @@ class IntersectionFinder:
             self._keep_crossings(x)
 
         retry_until_fits(launch, self, mesh.device)
-        status = self._decided_exactly(x)
+        status = _decided(mesh, x, mesh.device_edges, self._device_across, self._kept, self._status, self._count)
         pairs = self._kept.numpy()[: self._count]
         meets, crosses = status != FREE, status == HIT
         (unsure,) = np.nonzero(status == UNSURE)
@@ -257,23 +307,6 @@ class IntersectionFinder:
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         return Intersections(pairs[order], crosses[order])
-
-    def _decided_exactly(self, x: wp.array) -> np.ndarray:
-        """Returns the status of the kept pairs, UNSURE only where their exponents are too far apart for the device."""
-        mesh = self._mesh
-        for limbs in BITS:
-            status = self._status.numpy()[: self._count]
-            if not (status == UNSURE).any():
-                break
-            launch_over(
-                _decide_exactly(x.dtype, limbs),
-                self._count,
-                inputs=[x, mesh.device_edges, mesh.device_faces, self._device_across, self._kept],
-                outputs=[self._status],
-                device=mesh.device,
-                block_dim=64,
-            )
-        return self._status.numpy()[: self._count]
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
