@@ -74,3 +74,24 @@ def test_vertices_on_a_touching_body_need_no_checker(monkeypatch):
             positions, found, lambda pairs: np.ones(len(pairs), dtype=bool)
         )
         assert contained.bodies.tolist() == inside
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_proximities_exactly_at_the_distance_need_no_checker(dtype, monkeypatch):
+    """Sheets one above the other, at the distance and at its neighbours in floating point, in the scale of each."""
+    x, faces = copies(2, 3, dtype)
+    x[len(x) // 2 :, 2] = dtype(0.01)
+    mesh = bsc.CollisionMesh(faces, len(x))
+    height = float(x[-1, 2])
+    truth = {}
+    for distance in (np.nextafter(height, 0.0), height, np.nextafter(height, 1.0)):
+        rows = np.indices((len(x), len(faces))).reshape(2, -1).T
+        rows = rows[rows[:, 0] // (len(x) // 2) != rows[:, 1] // (len(faces) // 2)]  # not of the same sheet
+        points = np.concatenate([x[rows[:, 0], None], x[faces[rows[:, 1]]]], axis=1)
+        truth[distance] = rows[checker.vertex_face(np.concatenate([points, points], axis=1), distance)]
+    for kind in ("vertex_face", "edge_edge"):
+        monkeypatch.setattr(checker, kind, lambda *_: pytest.fail("the host has decided a pair"))
+    for distance, expected in truth.items():
+        found = bsc.CollisionDetector(mesh).find_proximities(x, distance, rings=9)
+        np.testing.assert_array_equal(found.vertex_face, expected)
+    assert len({len(expected) for expected in truth.values()}) > 1

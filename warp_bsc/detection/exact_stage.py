@@ -13,6 +13,7 @@ the others, and those that are too wide.
 import functools
 import math
 
+import numpy as np
 import warp as wp
 
 from ..kernels.closest import contact_at
@@ -24,14 +25,14 @@ from ..kernels.motion import double, relative_motion
 from ..kernels.pipeline.pairs import distance_of_corners, points_of_pair, vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..kernels.signs import FREE, HIT
+from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import LEAST_DIGITS
-from .contact_buffer import ContactBuffer
+from .contact_buffer import ContactBuffer, make_contact_buffer
 from .kernels import PairStages
 from .launch import launch_over_queue
 from .settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 
-__all__ = ["launch_exact_distances", "launch_exact_stage"]
+__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
@@ -170,6 +171,35 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
             take_slot(stages.counts, _TOO_WIDE)
 
     return decide_distances
+
+
+def are_within_distance(
+    kind: DistanceKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns which pairs at rest are within a distance, and which of these answers are known; bool, shape [n] each.
+
+    Args:
+        kind: The kind of pair.
+        x: Positions, array of vec3 or vec3d.
+        elements: Vertex indices of the faces or edges, two-dimensional array of int.
+        pairs: The pairs, int32, shape [n, 2].
+        distance: The distance, more than 0.
+    """
+    n, device = len(pairs), x.device
+    stages = PairStages()
+    stages.elements = elements
+    stages.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    stages.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
+    stages.contacts = make_contact_buffer(n, device)
+    stages.contacts.pairs.assign(pairs)
+    stages.contacts.decided.fill_(int(UNSURE))
+    stages.contacts.toi.zero_()
+    stages.keys = wp.empty(n, dtype=wp.int64, device=device)
+    half = wp.full(len(x), 0.5 * distance, dtype=wp.float64, device=device)  # whose double is exact
+    if 2.0 * (0.5 * distance) == distance:
+        launch_exact_distances(x, x, half, kind, timed=False, tolerance=1.0, stages=stages)
+    decided = stages.contacts.decided.numpy()
+    return decided == HIT, decided != UNSURE
 
 
 def launch_exact_distances(
