@@ -1,8 +1,8 @@
 """Measures exactly touching sheets on one core of the CPU, and holds some of the answers against the exact checker.
 
-``python tests/support/touching.py`` prints a table of processor times, and exits with status 1 if an answer is wrong. The sheets are flat
-and have the same vertices. "intersections" are all edges that meet faces; "at a distance" are pairs of sheets that lie
-one above the other exactly at the minimum distance, at rest or moving together.
+``python tests/support/touching.py`` prints a table of processor times, and exits with status 1 if an answer is wrong.
+The sheets are flat and have the same vertices. "intersections" are all edges that meet faces; "at a distance" are pairs
+of sheets that lie one above the other exactly at the minimum distance, at rest or moving together.
 """
 
 import argparse
