@@ -28,57 +28,30 @@ from typing import Any
 import warp as wp
 
 from ..polynomials import VERTEX_FACE
-from .wide_integers import add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
+from .wide_integers import LIMBS, SCALED, add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
 BITS = {1: 35, 2: 71, 8: 291}
 """Largest B for each number of limbs of a coordinate."""
 
-_FROM_POINTS = """
+_FROM_POINTS = f"""{SCALED}
     // both points of the difference that each corner is; 0 to 3: the points of the query in order
-    const int first[2][4] = {{0, 0, 0, 0}, {2, 2, 3, 3}}, second[2][4] = {{1, 2, 3, 3}, {0, 1, 1, 0}};
-    const wp::vec_t<3, wp::float64> points[2][4] = {{a0, b0, c0, d0}, {a1, b1, c1, d1}};
+    const int first[2][4] = {{{{0, 0, 0, 0}}, {{2, 2, 3, 3}}}}, second[2][4] = {{{{1, 2, 3, 3}}, {{0, 1, 1, 0}}}};
+    const wp::vec_t<3, wp::float64> points[2][4] = {{{{a0, b0, c0, d0}}, {{a1, b1, c1, d1}}}};
     constexpr int L = sizeof(*polygon.data) / 8;
-    for (int axis = 0; axis < 3; ++axis) {
-        for (int end = 0; end < 2; ++end) {
+    for (int axis = 0; axis < 3; ++axis) {{
+        for (int end = 0; end < 2; ++end) {{
             wp::uint64 x[4][L];
-            for (int point = 0; point < 4; ++point) {
-                union { wp::float64 value; wp::uint64 bits; } word;
-                word.value = points[end][point][axis];
-                const int field = (int)((word.bits >> 52) & 2047);
-                wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
-                if (field > 0)
-                    mantissa |= 1ull << 52;
-                int shift = (field > 0 ? field : 1) - 1075 - exponents[axis];
-                if (shift < 0) {
-                    mantissa = shift > -64 ? mantissa >> -shift : 0;
-                    shift = 0;
-                }
-                const wp::uint64 mask = 0 - (word.bits >> 63);
-                wp::uint64 carry = word.bits >> 63;
-                for (int i = 0; i < L; ++i) {
-                    const int from = 64 * i - shift;  // bit of the mantissa that is the lowest of this limb
-                    wp::uint64 limb = 0;
-                    if (from > -64 && from <= 0)
-                        limb = mantissa << -from;
-                    else if (from > 0 && from < 64)
-                        limb = mantissa >> from;
-                    x[point][i] = (limb ^ mask) + carry;
-                    carry &= x[point][i] == 0;
-                }
-            }
-            for (int corner = 0; corner < 4; ++corner) {
-                const wp::uint64 *p = x[first[edges][corner]], *q = x[second[edges][corner]];
-                wp::uint64 borrow = 0;
-                for (int i = 0; i < L; ++i) {
-                    polygon.data[(end * 4 + corner) * 3 + axis][i] = p[i] - q[i] - borrow;
-                    borrow = (p[i] < q[i]) | ((p[i] == q[i]) & borrow);
-                }
-            }
-        }
-    }
+            for (int point = 0; point < 4; ++point)
+                scaled(points[end][point][axis], exponents[axis], x[point]);
+            for (int corner = 0; corner < 4; ++corner)
+                difference(
+                    x[first[edges][corner]], x[second[edges][corner]], polygon.data[(end * 4 + corner) * 3 + axis]
+                );
+        }}
+    }}
 """
 
-for _limbs in BITS:
+for _limbs in LIMBS[:4]:
     _Integer = integer(_limbs)
 
     @wp.func_native(snippet=_FROM_POINTS)
@@ -124,7 +97,7 @@ def coordinate(polygon: wp.array[Any], corner: int, end: int, axis: int):
 
 
 @wp.func
-def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+def lowest_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
     """Returns the exponents of the lowest bits of two points, for each axis."""
     return wp.min(
         wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2])),
@@ -133,7 +106,7 @@ def _lowest(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 
 @wp.func
-def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
+def top_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
     """Returns exponents e such that the difference of two points is below 2^e, for each axis."""
     return wp.vec3i(
         top_bit_of_difference(x[0], y[0]), top_bit_of_difference(x[1], y[1]), top_bit_of_difference(x[2], y[2])
@@ -141,11 +114,11 @@ def _top(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 
 @wp.func
-def _widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
+def widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
     """Returns exponents e such that the corners of the polygon at one time are below 2^e, for each axis."""
     if kind == VERTEX_FACE:
-        return wp.max(_top(a, b), wp.max(_top(a, c), _top(a, d)))
-    return wp.max(wp.max(_top(c, a), _top(c, b)), wp.max(_top(d, a), _top(d, b)))
+        return wp.max(top_bits(a, b), wp.max(top_bits(a, c), top_bits(a, d)))
+    return wp.max(wp.max(top_bits(c, a), top_bits(c, b)), wp.max(top_bits(d, a), top_bits(d, b)))
 
 
 @wp.func
@@ -163,8 +136,8 @@ def spread(
     d1: wp.vec3d,
 ):
     """Returns the exponent of the power of two to divide each axis by, and the bits B of the corners after that."""
-    lowest = wp.min(wp.min(_lowest(a0, b0), _lowest(c0, d0)), wp.min(_lowest(a1, b1), _lowest(c1, d1)))
-    bits = wp.max(_widest(kind, a0, b0, c0, d0), _widest(kind, a1, b1, c1, d1)) - lowest
+    lowest = wp.min(wp.min(lowest_bits(a0, b0), lowest_bits(c0, d0)), wp.min(lowest_bits(a1, b1), lowest_bits(c1, d1)))
+    bits = wp.max(widest(kind, a0, b0, c0, d0), widest(kind, a1, b1, c1, d1)) - lowest
     return lowest, wp.max(wp.max(bits), 0)
 
 

@@ -161,6 +161,51 @@ _SHIFT = """
 """
 
 
+SCALED = """
+    const auto scaled = [](wp::float64 value, int exponent, auto& x) {
+        constexpr int L = sizeof(x) / 8;
+        union { wp::float64 value; wp::uint64 bits; } word;
+        word.value = value;
+        const int field = (int)((word.bits >> 52) & 2047);
+        wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
+        if (field > 0)
+            mantissa |= 1ull << 52;
+        int shift = (field > 0 ? field : 1) - 1075 - exponent;
+        if (shift < 0) {
+            mantissa = shift > -64 ? mantissa >> -shift : 0;
+            shift = 0;
+        }
+        const wp::uint64 mask = 0 - (word.bits >> 63);
+        wp::uint64 carry = word.bits >> 63;
+        for (int i = 0; i < L; ++i) {
+            const int from = 64 * i - shift;  // bit of the mantissa that is the lowest of this limb
+            wp::uint64 limb = 0;
+            if (from > -64 && from <= 0)
+                limb = mantissa << -from;
+            else if (from > 0 && from < 64)
+                limb = mantissa >> from;
+            x[i] = (limb ^ mask) + carry;
+            carry &= x[i] == 0;
+        }
+    };
+    const auto difference = [](const auto& x, const auto& y, auto& d) {
+        wp::uint64 borrow = 0;
+        for (int i = 0; i < (int)(sizeof(x) / 8); ++i) {
+            d[i] = x[i] - y[i] - borrow;
+            borrow = (x[i] < y[i]) | ((x[i] == y[i]) & borrow);
+        }
+    };
+"""
+"""For native functions: arrays of limbs of finite numbers divided by a power of two that divides them, and of
+differences, modulo 2 to the width."""
+
+_SCALED_LIKE = f"""{SCALED}
+    ret_type r;
+    scaled(x, exponent, r);
+    return r;
+"""
+
+
 def _returning(snippet: str, limbs: int) -> str:
     """Returns a snippet preceded by the definition of its return type."""
     return f"    using ret_type = wp::vec_t<{limbs}, wp::uint64>;{snippet}"
@@ -193,6 +238,11 @@ for _limbs in LIMBS:
     @wp.func_native(snippet=_returning(_SHIFT, _limbs))
     def shift(a: _Single, bits: int) -> _Single:
         """Returns the integer times 2^bits."""
+        ...
+
+    @wp.func_native(snippet=_returning(_SCALED_LIKE, _limbs))
+    def scaled_like(a: _Single, x: wp.float64, exponent: int) -> _Single:
+        """Returns a finite number divided by a power of two that divides it, as wide as an integer."""
         ...
 
     if _limbs < LIMBS[-1]:

@@ -6,7 +6,7 @@ have representatives with overlapping boxes, so that one traversal over faces fi
 
 import warp as wp
 
-from ..polynomials import VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
+from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 
 @wp.func
@@ -42,3 +42,20 @@ def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.v
     if kind == VERTEX_VERTEX:
         return wp.vec4i(pair[0], pair[1], pair[1], pair[1])
     return vertices_of_pair(kind, elements, pair)
+
+
+@wp.func
+def firsts_of(kind: int) -> int:
+    """Returns how many of the four places of a pair the first element has."""
+    return wp.where(kind == EDGE_EDGE, 2, 1)
+
+
+@wp.func
+def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) -> wp.float64:
+    """Returns the minimum distance of a pair."""
+    a = radius[v[0]]
+    b = radius[v[1]]
+    other = wp.max(radius[v[2]], radius[v[3]])
+    if kind == EDGE_EDGE:
+        return wp.max(a, b) + other
+    return a + wp.max(b, other)

@@ -201,16 +201,16 @@ def test_radii_of_elements_are_the_largest_of_their_vertices():
 
 
 def test_distance_that_is_reached_to_the_last_bit():
-    """Only exact arithmetic knows; the host decides, as the statistics say."""
-    x0 = np.array([[0, 0, 7.0], [0, 0, 0]])
-    x1 = np.array([[0, 0, 0.1], [0, 0, 0]])
+    """Only exact arithmetic knows: at an end of the step on the device, in between on the host."""
     mesh = bsc.CollisionMesh([], 2, points=[0, 1])
-    for distance, hits in ((0.1, 1), (np.nextafter(0.1, 0.0), 0)):
-        exact = bsc.CollisionDetector(mesh, method="exact", min_distance=distance).detect(x0, x1)
-        assert len(exact.vertex_vertex) == hits
-        assert exact.stats.vertex_vertex.host == 1
-        conservative = bsc.CollisionDetector(mesh, min_distance=distance).detect(x0, x1)
-        assert len(conservative.vertex_vertex) == conservative.stats.vertex_vertex.unsure == 1
+    for start, end, host in ((7.0, 0.1, 0), (0.1, 0.1, 0), (0.1, 3.0, 0), ([-1, 0, 0.1], [2, 0, 0.1], 1)):
+        x0, x1 = (np.array([np.broadcast_to([0, 0, z] if np.isscalar(z) else z, 3), np.zeros(3)]) for z in (start, end))
+        for distance, hits in ((0.1, 1), (np.nextafter(0.1, 0.0), 0)):
+            exact = bsc.CollisionDetector(mesh, method="exact", min_distance=distance).detect(x0, x1)
+            assert len(exact.vertex_vertex) == hits
+            assert (exact.stats.vertex_vertex.exact, exact.stats.vertex_vertex.host) == (1 - host, host)
+            conservative = bsc.CollisionDetector(mesh, min_distance=distance).detect(x0, x1)
+            assert len(conservative.vertex_vertex) == conservative.stats.vertex_vertex.unsure == 1
 
 
 def test_buffers_grow():

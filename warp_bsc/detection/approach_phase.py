@@ -14,11 +14,10 @@ from ..kernels.ccd import impact_at_distance
 from ..kernels.distance import closest_points
 from ..kernels.min_distance import clears_at_once, closest_at
 from ..kernels.motion import doubles, motion_and_distance
-from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF
-from .distance_phase import distance_of_corners, firsts_of
 from .kernels import PairStages
 from .launch import launch_over_queue, made_once
 from .mesh import CollisionMesh

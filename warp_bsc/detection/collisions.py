@@ -26,8 +26,8 @@ class StageCounts:
         hits: Candidates certified to collide.
         unsure: Candidates that floating point could not certify either way.
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
-        host: Candidates whose exponents are too far apart for that, or that have a minimum distance. The host decides
-            them, but not in a CUDA graph, where they stay unsure.
+        host: Candidates whose exponents are too far apart for that, or that may come within a minimum distance only for
+            a moment of the step. The host decides them, but not in a CUDA graph, where they stay unsure.
     """
 
     candidates: int = 0

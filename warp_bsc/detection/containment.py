@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .. import checker
-from .intersections import Intersections
+from .intersections import Intersections, vertices_on_faces
 from .mesh import CollisionMesh
 
 __all__ = ["Containment", "ContainmentFinder"]
@@ -43,7 +43,7 @@ class ContainmentFinder:
     A part is wholly inside a body if it is inside at one of its vertices and its edges and faces pass through none of
     the body's. A part that touches the body is inside if none of its vertices is outside, and not all are on the body.
 
-    No floating-point error can change the answer: signs that are not certain are computed in rational arithmetic.
+    No floating-point error can change the answer: signs that are not certain are computed exactly.
     """
 
     def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
@@ -83,7 +83,7 @@ class ContainmentFinder:
         of_bodies = np.concatenate([of_bodies, of_bodies[:, ::-1]])
         passing = of_bodies[:, 0] * len(low) + parts.body[of_bodies[:, 1]]
         kept = ~np.isin(pairs[:, 0] * len(low) + parts.body[pairs[:, 1]], passing)
-        return self._decide(x.astype(np.float64), found, pairs[kept], is_touching[kept])
+        return self._decide(x, found, pairs[kept], is_touching[kept])
 
     @functools.cached_property
     def _parts(self) -> "_Parts":
@@ -111,9 +111,9 @@ class ContainmentFinder:
         firsts = np.cumsum(counts) - counts
         rows, places = _expand(firsts[case_of_query], (firsts + counts)[case_of_query])
         compared = _keys(np.stack([rows, pairs[order[places], 1]], axis=1), len(parts.body))
-        points = x[vertices]
+        points = x[vertices].astype(np.float64)
         faces = self._faces_ahead(x, points, pairs[:, 1])
-        corners = x[self._mesh.faces[faces]]
+        corners = x[self._mesh.faces[faces]].astype(np.float64)
         low, high = corners.min(axis=1), corners.max(axis=1)
 
         def pair_up(box_low: np.ndarray, axes: int) -> np.ndarray:
@@ -127,10 +127,10 @@ class ContainmentFinder:
         if touches.any():
             met = pair_up(low, 3)
             met = met[touches[case_of_query[met[:, 0]]]]
-            at = np.repeat(points[met[:, 0], None], 2, axis=1)
-            on_surface[met[checker.edge_face_crossings(at, corners[met[:, 1]]), 0]] = True
-        # rays along +x
+            on_surface[met[vertices_on_faces(self._mesh, x, vertices[met[:, 0]], faces[met[:, 1]]), 0]] = True
+        # rays along +x, of the others
         met = pair_up(np.where([True, False, False], -np.inf, low), 2)
+        met = met[~on_surface[met[:, 0]]]
         signs = checker.rays_pass_faces(points[met[:, 0]], corners[met[:, 1]]).astype(np.int64)
         met, signs = met[signs != 0], signs[signs != 0]
         keys, pair_of_ray = np.unique(

@@ -1,8 +1,8 @@
-"""The narrow phase of pairs with a minimum distance: culls -> advancement -> subdivision -> order.
+"""The narrow phase of pairs with a minimum distance: culls -> advancement -> subdivision -> exact stage -> order.
 
-The host decides the rest. The stages write to the buffers of a :class:`.narrow_phase.NarrowPhase`, which sorts the
-contacts. The minimum distance of a pair is the sum of two radii, rounded to double precision: the radius of a vertex is
-its own, that of an edge or a face the largest one of its vertices.
+The host decides the rest exactly. The stages write to the buffers of a :class:`.narrow_phase.NarrowPhase`, which sorts
+the contacts. The minimum distance of a pair is the sum of two radii, rounded to double precision: the radius of a
+vertex is its own, that of an edge or a face the largest one of its vertices.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,12 @@ import warp as wp
 from .. import checker
 from ..kernels.min_distance import Search, advance, begin_search, clears_at_once, closest_at, end_search, visit_part
 from ..kernels.motion import all_finite, motion_and_distance, relative_motion
-from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, Motion
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .contact_buffer import HostContacts
+from .exact_stage import launch_exact_distances
 from .kernels import PairStages
 from .launch import launch, launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
@@ -28,8 +29,6 @@ from .stage_timer import StageTimer
 
 __all__ = [
     "decide_distances_on_host",
-    "distance_of_corners",
-    "firsts_of",
     "pair_distances",
     "run_distance_phases",
 ]
@@ -47,24 +46,6 @@ _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
-_TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
-
-
-@wp.func
-def firsts_of(kind: int) -> int:
-    """Returns how many of the four places of a pair the first element has."""
-    return wp.where(kind == EDGE_EDGE, 2, 1)
-
-
-@wp.func
-def distance_of_corners(kind: int, v: wp.vec4i, radius: wp.array[wp.float64]) -> wp.float64:
-    """Returns the minimum distance of a pair."""
-    a = radius[v[0]]
-    b = radius[v[1]]
-    other = wp.max(radius[v[2]], radius[v[3]])
-    if kind == EDGE_EDGE:
-        return wp.max(a, b) + other
-    return a + wp.max(b, other)
 
 
 @wp.func
@@ -98,7 +79,6 @@ def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, stages: Pai
         take_slot(stages.counts, _UNSURE)
     if result.status == UNSURE or (timed and result.status == HIT and result.within_tolerance == 0):
         take_slot(stages.counts, _FOR_EXACT)
-        take_slot(stages.counts, _TOO_WIDE)
     if k >= 0:
         contacts = stages.contacts
         contacts.status[k] = wp.int8(result.status)
@@ -292,7 +272,7 @@ def run_distance_phases(
         x1: Positions at its end, of the same type.
         radius: Radius of each vertex, array of float64.
         rings: Vertices whose elements are excluded.
-        method: One of :data:`METHODS`; with "exact" what is left goes to :func:`decide_distances_on_host`.
+        method: One of :data:`METHODS`; with "exact" pairs left undecided go to :func:`decide_distances_on_host`.
         timed: Whether to find times of impact within the tolerance.
         tolerance: Of the times of impact, as a share of the step.
         timer: Measures the stages.
@@ -318,6 +298,13 @@ def run_distance_phases(
                     threads = 2**31
                 inputs = [x0, x1, radius, int(phase.kind), roundoff, timed, tolerance, threads]
                 launch_over(kernel, entries, inputs=inputs, outputs=[stages], device=device, block_dim=_BLOCK)
+    if method == "exact":
+        with timer.stage("exact"):
+            for phase, elements in phases:
+                stages = phase.stages(elements)
+                launch_exact_distances(
+                    x0, x1, radius, DistanceKind(phase.kind), timed=timed, tolerance=tolerance, stages=stages
+                )
 
 
 def pair_distances(

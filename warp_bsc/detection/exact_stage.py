@@ -5,25 +5,37 @@ Contacts that the stage before has enqueued are decided in integers of one limb 
 for two limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are
 too wide for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays
 small.
+
+Of contacts with a minimum distance, those are decided that :mod:`warp_bsc.kernels.exact.distance` can. The host decides
+the others, and those that are too wide.
 """
 
 import math
 
+import numpy as np
 import warp as wp
 
 from ..kernels.closest import contact_at
+from ..kernels.exact.distance import BITS as DISTANCE_BITS
+from ..kernels.exact.distance import decide_distance_in
 from ..kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
 from ..kernels.motion import double, relative_motion
-from ..kernels.pipeline.pairs import vertices_of_pair
+from ..kernels.pipeline.pairs import distance_of_corners, points_of_pair, vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
-from ..kernels.signs import FREE, HIT
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.signs import FREE, HIT, UNSURE
 from ..kernels.time_of_impact import LEAST_DIGITS
-from .contact_buffer import ContactBuffer
+from .contact_buffer import ContactBuffer, make_contact_buffer
+from .kernels import PairStages
 from .launch import launch_over_queue, made_once
-from .settings import NO_FUSED_OPERATIONS, DistanceKind, PairKind
+from .settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 
-__all__ = ["launch_exact_stage"]
+__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
+
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
+_REFUTED = wp.constant(int(Count.REFUTED))
 
 
 @made_once
@@ -102,6 +114,125 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
                 contacts.normal[i] = direction
 
     return decide_contacts
+
+
+@made_once
+def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
+    """The kernel for contacts with a minimum distance, for one type of position and one width."""
+    decide = decide_distance_in(limbs)
+    is_last = limbs == max(DISTANCE_BITS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_distances(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        radius: wp.array[wp.float64],
+        kind: int,
+        timed: bool,
+        digits: int,
+        # in and out
+        stages: PairStages,
+    ):
+        k = first + wp.tid()
+        contacts = stages.contacts
+        if k >= contacts.pairs.shape[0] or wp.int64(k) >= stages.counts[_CONTACTS]:
+            return
+        known = int(contacts.decided[k])
+        if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
+            return
+        v = points_of_pair(kind, stages.elements, contacts.pairs[k])
+        status = decide(
+            wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE),
+            double(x0[v[0]]),
+            double(x0[v[1]]),
+            double(x0[v[2]]),
+            double(x0[v[3]]),
+            double(x1[v[0]]),
+            double(x1[v[1]]),
+            double(x1[v[2]]),
+            double(x1[v[3]]),
+            distance_of_corners(kind, v, radius),
+            contacts.toi[k],
+            digits,
+            timed,
+        )
+        if status == FREE:
+            contacts.decided[k] = wp.int8(FREE)
+            stages.keys[k] = stages.last_key
+            take_slot(stages.counts, _REFUTED)
+        elif status == HIT:
+            # coordinates and normal are those at the time of impact already
+            contacts.decided[k] = wp.int8(HIT)
+            contacts.within_tolerance[k] = timed
+        elif wp.static(is_last):
+            take_slot(stages.counts, _TOO_WIDE)
+
+    return decide_distances
+
+
+def are_within_distance(
+    kind: DistanceKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns which pairs at rest are within a distance, and which of these answers are known; bool, shape [n] each.
+
+    Args:
+        kind: The kind of pair.
+        x: Positions, array of vec3 or vec3d.
+        elements: Vertex indices of the faces or edges, two-dimensional array of int.
+        pairs: The pairs, int32, shape [n, 2].
+        distance: The distance, more than 0.
+    """
+    n, device = len(pairs), x.device
+    stages = PairStages()
+    stages.elements = elements
+    stages.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    stages.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
+    stages.contacts = make_contact_buffer(n, device)
+    stages.contacts.pairs.assign(pairs)
+    stages.contacts.decided.fill_(int(UNSURE))
+    stages.contacts.toi.zero_()
+    stages.keys = wp.empty(n, dtype=wp.int64, device=device)
+    half = wp.full(len(x), 0.5 * distance, dtype=wp.float64, device=device)  # whose double is exact
+    if 2.0 * (0.5 * distance) == distance:
+        launch_exact_distances(x, x, half, kind, timed=False, tolerance=1.0, stages=stages)
+    decided = stages.contacts.decided.numpy()
+    return decided == HIT, decided != UNSURE
+
+
+def launch_exact_distances(
+    x0: wp.array,
+    x1: wp.array,
+    radius: wp.array,
+    kind: DistanceKind,
+    *,
+    timed: bool,
+    tolerance: float,
+    stages: PairStages,
+) -> None:
+    """Decides contacts with a minimum distance exactly, and counts those left to the host; waits for no GPU.
+
+    Args:
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        radius: Radius of each vertex, array of float64.
+        kind: The kind of pair.
+        timed: Whether to find times of impact.
+        tolerance: Of the times of impact, as a share of the step.
+        stages: The buffers of the narrow phase.
+    """
+    digits = 1 + max(LEAST_DIGITS, math.ceil(-math.log2(tolerance)))
+    for limbs in DISTANCE_BITS:
+        launch_over_queue(
+            _distance_kernel(x0.dtype, limbs),
+            stages.contacts.pairs,
+            stages.counts,
+            Count.CONTACTS,
+            inputs=[x0, x1, radius, int(kind), timed, digits],
+            outputs=[stages],
+            block_dim=64,
+        )
 
 
 def launch_exact_stage(

@@ -11,15 +11,17 @@ from .. import checker
 from .._arguments import check_finite, check_instance
 from .._one_thread import one_at_a_time
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
+from ..kernels.exact.edge_face import BITS, edge_meets_face_in
+from ..kernels.motion import double
 from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.signs import FREE, HIT, UNSURE
 from .broad_phase import BroadPhase, make_broad_phase
 from .collisions import Collisions
-from .launch import launch_over_queue, made_once, retry_until_fits
+from .launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections"]
+__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections", "vertices_on_faces"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -67,6 +69,94 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
                 status[wp.int32(slot)] = wp.int8(answer)
 
     return keep_crossings
+
+
+@made_once
+def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
+    """The kernel that decides unsure pairs in wide integers, for one type of position and one width."""
+    edge_meets_face = edge_meets_face_in(limbs)
+
+    @wp.kernel(**NO_GRADIENTS)
+    def decide_exactly(
+        first: int,
+        # mesh
+        x: wp.array[dtype],
+        edges: wp.array2d[int],
+        faces: wp.array2d[int],
+        across: wp.array2d[int],
+        # in
+        pairs: wp.array[wp.vec2i],
+        # in and out
+        status: wp.array[wp.int8],
+    ):
+        i = first + wp.tid()
+        if int(status[i]) != UNSURE:
+            return
+        edge = pairs[i][0]
+        face = pairs[i][1]
+        answer = edge_meets_face(
+            double(x[edges[edge, 0]]),
+            double(x[edges[edge, 1]]),
+            double(x[faces[face, 0]]),
+            double(x[faces[face, 1]]),
+            double(x[faces[face, 2]]),
+            double(x[across[face, 0]]),
+            double(x[across[face, 1]]),
+            double(x[across[face, 2]]),
+        )
+        status[i] = wp.int8(answer)
+
+    return decide_exactly
+
+
+def _decided(
+    mesh: CollisionMesh, x: wp.array, edges: wp.array, across: wp.array, pairs: wp.array, status: wp.array, count: int
+) -> np.ndarray:
+    """Returns the status of pairs after the exact stage, UNSURE only where exponents are too far apart for it.
+
+    Args:
+        mesh: The mesh.
+        x: Positions, array of vec3 or vec3d.
+        edges: Vertices of both ends of each edge, two-dimensional array of int.
+        across: Vertices across the sides of each face, as of :meth:`IntersectionFinder._across`, likewise.
+        pairs: (edge, face), array of vec2i.
+        status: Status of each pair, array of int8, which is overwritten.
+        count: Number of pairs.
+    """
+    for limbs in BITS:
+        if not (status.numpy()[:count] == UNSURE).any():
+            break
+        inputs = [x, edges, mesh.device_faces, across, pairs]
+        kernel = _decide_exactly(x.dtype, limbs)
+        launch_over(kernel, count, inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
+    return status.numpy()[:count]
+
+
+def vertices_on_faces(mesh: CollisionMesh, x: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Returns which vertices are on which faces, exactly, pair by pair.
+
+    Args:
+        mesh: The mesh.
+        x: Positions, finite, any unit of length, shape [vertex_count, 3], float32 or float64.
+        vertices: The vertices, integers, shape [n].
+        faces: The faces, integers, shape [n].
+
+    Returns:
+        Bool array of shape [n].
+    """
+    device, n = mesh.device, len(vertices)
+    points, row = np.unique(vertices, return_inverse=True)
+    edges = wp.array(np.stack([points, points], axis=1), dtype=int, device=device)  # whose ends are one vertex
+    pairs = wp.array(np.stack([row.reshape(-1), faces], axis=1), dtype=wp.vec2i, device=device)
+    status = wp.full(n, int(UNSURE), dtype=wp.int8, device=device)
+    # what passes through a face does not matter, nor do the faces' neighbours
+    status = _decided(mesh, mesh.device_positions(x, "x"), edges, mesh.device_faces, pairs, status, n)
+    on_face = status != FREE
+    (unsure,) = np.nonzero(status == UNSURE)
+    if len(unsure):
+        ends = np.repeat(x[vertices[unsure], None], 2, axis=1)
+        on_face[unsure] = checker.edge_face_crossings(ends, x[mesh.faces[faces[unsure]]])
+    return on_face
 
 
 class CrossingCandidates:
@@ -212,9 +302,9 @@ class IntersectionFinder:
             self._keep_crossings(x)
 
         retry_until_fits(launch, self, mesh.device)
-        status = self._status.numpy()[: self._count]
+        status = _decided(mesh, x, mesh.device_edges, self._device_across, self._kept, self._status, self._count)
         pairs = self._kept.numpy()[: self._count]
-        meets, crosses = np.ones(len(pairs), dtype=bool), status == HIT
+        meets, crosses = status != FREE, status == HIT
         (unsure,) = np.nonzero(status == UNSURE)
         if len(unsure):
             edges, faces = pairs[unsure].T
@@ -250,6 +340,10 @@ class IntersectionFinder:
         across = opposite.copy()
         across[one], across[other] = opposite[other], opposite[one]
         return across.reshape(-1, 3)
+
+    @functools.cached_property
+    def _device_across(self) -> wp.array:
+        return wp.array(self._across, dtype=int, device=self._mesh.device)
 
     def _allocate(self, capacity: int) -> None:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)

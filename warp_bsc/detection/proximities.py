@@ -14,6 +14,7 @@ from ..kernels.pipeline.queues import is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .broad_phase import make_broad_phase
 from .distance_phase import pair_distances
+from .exact_stage import are_within_distance
 from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .rings import Rings, are_within_rings, make_rings
@@ -185,8 +186,8 @@ class ProximityFinder:
     def find(self, x: np.ndarray | wp.array) -> Proximities:
         """Returns the proximities of one configuration.
 
-        The pairs are exactly those whose distance is at most the given one: the exact checker decides where the
-        computed distance is not certain. Distances are computed in double precision and off by at most 2^-40 of the
+        The pairs are exactly those whose distance is at most the given one: exact arithmetic decides where the computed
+        distance is not certain. Distances are computed in double precision and off by at most 2^-40 of the
         largest component of the vectors along both edges of the face or along the two edges, and between the first
         corners.
 
@@ -208,25 +209,28 @@ class ProximityFinder:
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True
-        found = [self._exactly(near, positions, largest) for near in self._near]
+        found = [self._exactly(near, x, largest) for near in self._near]
         vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
         distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
         return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position)
 
-    def _exactly(
-        self, near: _NearPairs, positions: np.ndarray, largest: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _exactly(self, near: _NearPairs, x: wp.array, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns pairs, distances and positions of a kind, without the pairs that are farther than the distance."""
         pairs, distance, position = near.read()
         # differences of positions are at most twice the largest coordinate
         unsure = distance >= self._distance - 4.0 * float(DISTANCE_ERROR) * largest
         if not unsure.any():
             return pairs, distance, position
-        elements = self._mesh.device_elements(near.kind).numpy()
-        corners, _ = pair_distances(near.kind, elements, pairs[unsure], np.zeros(self._mesh.vertex_count))
-        points = positions[corners]
+        elements = self._mesh.device_elements(near.kind)
+        (rows,) = np.nonzero(unsure)
         kept = np.ones(len(pairs), dtype=bool)
-        kept[unsure] = getattr(checker, near.kind.label)(np.concatenate([points, points], axis=1), self._distance)
+        kept[rows], known = are_within_distance(near.kind, x, elements, pairs[rows], self._distance)
+        rows = rows[~known]
+        if len(rows):
+            positions = x.numpy()
+            corners, _ = pair_distances(near.kind, elements.numpy(), pairs[rows], np.zeros(len(positions)))
+            points = positions[corners]
+            kept[rows] = getattr(checker, near.kind.label)(np.concatenate([points, points], axis=1), self._distance)
         return pairs[kept], distance[kept], position[kept]
 
     def grow(self) -> bool:

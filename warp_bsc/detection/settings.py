@@ -121,7 +121,8 @@ class Count(enum.IntEnum):
         FOR_EXACT: Found pairs that the exact stage decides or, where times are wanted, times.
         TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
         TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
-        TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs: left to the host.
+        TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs or, with a minimum
+            distance, that it does not decide: left to the host.
         REFUTED: Found pairs that the exact stage decides to be free.
         SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
     """

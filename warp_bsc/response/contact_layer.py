@@ -19,13 +19,12 @@ from dataclasses import dataclass
 import warp as wp
 
 from ..detection.approach_phase import MinDistances
-from ..detection.distance_phase import distance_of_corners, firsts_of
 from ..detection.launch import retry_until_fits
 from ..detection.pipeline import DetectionPipeline
 from ..detection.rings import are_within_rings
 from ..detection.settings import Count
 from ..kernels.closest import closest_coordinates
-from ..kernels.pipeline.pairs import points_of_pair
+from ..kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
 from ..kernels.pipeline.queues import is_filled
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .body_adjoint import attach_gradients, launch_adjoint

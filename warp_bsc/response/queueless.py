@@ -11,13 +11,13 @@ from ..detection.broad_phase_hierarchy import (
     overlapping_vertices,
     traversal_kernel,
 )
-from ..detection.distance_phase import distance_of_corners
 from ..detection.settings import TOLERANCE
 from ..kernels.ccd import impact_at_distance
 from ..kernels.classification import classify
 from ..kernels.min_distance import clears_at_once
 from ..kernels.motion import motion_and_distance, relative_motion
 from ..kernels.pipeline.hierarchy import lowest_place
+from ..kernels.pipeline.pairs import distance_of_corners
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ..kernels.time_of_impact import impact
