@@ -11,6 +11,9 @@ With ``"auto"`` a step is resolved as without coupling first. Only where contact
 strain below, if that is in proportion to the length of a substep. The number follows from the step alone, not from
 those before.
 
+Contacts that a program passes on are shared out before the step, see :mod:`.inner_contacts`: whole steps and substeps
+get the same ones. Those between bodies were found at the start of the step, and remain for all substeps.
+
 References:
     M. Macklin, K. Storey, M. Lu, P. Terdiman, N. Chentanez, S. Jeschke and M. Mueller, Small Steps in Physics
     Simulation, Symposium on Computer Animation, 2019, doi:10.1145/3309486.3340247.
@@ -426,6 +429,9 @@ class Coupling:
         touches, so that the substeps cost their time in each step, and ``"auto"`` refuses them. ``SolverVBD`` and
         ``SolverStyle3D`` themselves are known not to allocate; every other solver and derived class counts as one that
         does. Python attributes that the inner solver changes in place, and not by assignment, are not restored.
+
+        An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or between
+        particles, resolves them beside the stage: a whole step may leave stretch that substeps release.
 
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken again.

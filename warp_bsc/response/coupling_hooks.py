@@ -10,6 +10,7 @@ from newton.solvers.experimental.coupled import CouplingInterface
 from .bodies import inertia_at
 from .buffers import Motion, Vertices
 from .constraints import to_double, to_single
+from .inner_contacts import InnerContacts
 
 __all__ = ["CouplingHooks"]
 
@@ -96,6 +97,7 @@ class CouplingHooks(CouplingInterface):
     solver: SolverBase
 
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
+    _inner_contacts: InnerContacts | None = None  # None where the inner solver gets all contacts
 
     def _hook(self, name):
         return getattr(self.solver if isinstance(self.solver, CouplingInterface) else super(), name)
@@ -135,6 +137,8 @@ class CouplingHooks(CouplingInterface):
         self._harvest(hook, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
 
     def _harvest(self, hook, name, proxy, forces, options):
+        if self._inner_contacts is not None:
+            options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
         if self._coupled is not None and not _is_default(self.solver, hook):  # that sees the changed velocities
             impulses = getattr(self._coupled, name)

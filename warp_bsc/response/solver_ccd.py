@@ -27,6 +27,7 @@ from .contact_layer import ContactLayer
 from .coupling import SUBSTEPS, Coupling
 from .coupling_hooks import CouplingHooks
 from .friction import Friction
+from .inner_contacts import InnerContacts
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -251,7 +252,8 @@ class SolverCCD(SolverBase, CouplingHooks):
             coupling: Substeps in which the inner solver takes a step that collides, 2 to 1024, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none. ``"auto"`` takes a step again only where
                 contacts strain cloth or soft bodies by more than 1% against what the inner solver wanted, in up to 32
-                substeps.
+                substeps. The stage then resolves contacts of particles with shapes alone, also where ``contacts`` are
+                passed to :meth:`step`: cloth rests at the shape, or with ``radius`` at that distance.
             bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
                 friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
                 keeps bodies in maximal coordinates (VBD that integrates bodies, XPBD, semi-implicit); contacts between
@@ -352,6 +354,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
+            self._inner_contacts = InnerContacts(mesh, moves_bodies=self._moves_bodies)
             choices = SUBSTEPS if coupling == "auto" else (coupling,)
             arguments = self._step_inner, solver, mesh, self._motion, self._response, choices
             self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
@@ -458,7 +461,8 @@ class SolverCCD(SolverBase, CouplingHooks):
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same.
             control: As for the inner solver.
-            contacts: As for the inner solver.
+            contacts: As for the inner solver. With ``coupling``, it gets those that the stage does not resolve only,
+                see :mod:`.inner_contacts`.
             dt: Length of the step [s], more than 0.
             options: As for the inner solver.
 
@@ -485,8 +489,15 @@ class SolverCCD(SolverBase, CouplingHooks):
             self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
             if self._coupling is not None:
                 self._coupling.save(state_in)
+            passed = contacts
+            if self._inner_contacts is not None:
+                external = getattr(self.solver, "integrate_with_external_rigid_solver", False)
+                leaves_bodies = self._coupled is not None or not external
+                contacts = self._inner_contacts.take_out(passed, state_in, leaves_bodies=leaves_bodies)
         self._step_inner(state_in, state_out, control, contacts, dt, **options)
         with _paused_tape() as tape:
+            if self._inner_contacts is not None:
+                self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), passed)
             if self._coupling is not None:
                 run_on_host(lambda: self._couple(state_out, control, contacts, dt), self.mesh.device)
             elif self.respond:
@@ -669,7 +680,10 @@ class SolverCCD(SolverBase, CouplingHooks):
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver."""
-        self.solver.update_contacts(contacts, state)
+        inner = self._inner_contacts
+        self.solver.update_contacts(contacts if inner is None else inner.packed(contacts), state)
+        if inner is not None:
+            inner.unpack(contacts.force, contacts)
 
     def __deepcopy__(self, memo):
         """Raises a TypeError: buffers on the device, and graphs that write to them, cannot be copied."""

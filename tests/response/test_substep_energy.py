@@ -1,0 +1,56 @@
+"""Substeps add no energy, whatever contacts a program passes on: scenes of ``tests/support/substep_energy.py``."""
+
+import newton
+import pytest
+import warp as wp
+from newton_scenes import SOFT
+from substep_energy import RISE, Scene, Settings
+
+import warp_bsc as bsc
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(1, "pile", "vbd", True, "auto", 60),
+        Settings(2, "bodies", "vbd", True, 4, 60),
+        Settings(3, "drape", "xpbd", True, 2, 60),
+    ],
+    ids=str,
+)
+def test_energy_rises_no_more_than_in_whole_steps_or_without_the_stage(settings, device):
+    scene = Scene(settings, device)
+    rise, report = scene.run(coupling=settings.coupling, duration=0.2)
+    assert report.coupled_steps > 4
+    if rise > RISE:
+        assert rise < max(scene.run(duration=0.2)[0], scene.run(stage=False, duration=0.2)[0]) + RISE
+
+
+def test_a_drape_with_contacts_passed_on_gains_no_energy(device):
+    """Whole steps on Newton's contacts would leave cloth stretched by a sixth, and substeps release that: 0.5 J."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.2)
+    cells = {"dim_x": 16, "dim_y": 16, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.0005}
+    at = wp.vec3(-0.4, -0.4, 0.23)
+    builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **SOFT)
+    builder.color()
+    model = builder.finalize(device=device)
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu, model.particle_mu = 1e4, 1e-2, 0.5, 0.5
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), coupling="auto")
+    pipeline = newton.CollisionPipeline(model)
+    start, end, control, contacts = model.state(), model.state(), model.control(), pipeline.contacts()
+    mass = model.particle_mass.numpy().astype(float)
+
+    def energy(state):
+        x, v = state.particle_q.numpy(), state.particle_qd.numpy()
+        return mass @ (0.5 * (v**2).sum(axis=1) + 9.81 * x[:, 2])
+
+    energies = [energy(start)]
+    for _ in range(22):
+        start.clear_forces()
+        pipeline.collide(start, contacts)
+        solver.step(start, end, control, contacts, 1.0 / 60.0)
+        start, end = end, start
+        energies.append(energy(start))
+    assert max(energies) <= (1.0 + RISE) * energies[0]
+    assert solver.report.coupled_steps > 10

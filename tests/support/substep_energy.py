@@ -1,0 +1,291 @@
+"""Energy of random scenes in coupled steps, whatever contacts the program passes on.
+
+``python tests/support/substep_energy.py --count 200`` prints a line for each scene whose energy rises by more than 1%,
+with its seed, and exits with status 1 if one of them rises more than without substeps and without the stage.
+"""
+
+import argparse
+import sys
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+
+import warp_bsc as bsc
+
+__all__ = ["RISE", "Scene", "Settings"]
+
+RISE = 0.01
+"""Rise of the energy that discrete steps may make, as a share of that at the start."""
+GRAVITY = 9.81
+KINDS = "drape", "block", "pile", "bodies"
+NUMBERS = 2, 4, 8, 16, 32, "auto"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a scene is, but for its random numbers.
+
+    Attributes:
+        seed: Seed of the random numbers.
+        kind: One of ``KINDS``.
+        inner: The inner solver: ``"vbd"``, ``"xpbd"`` or ``"style3d"``, the last one for drapes and piles.
+        contacts: Whether the program passes Newton's contacts on.
+        coupling: Number of substeps, or ``"auto"``.
+        rate: Steps a second.
+    """
+
+    seed: int
+    kind: str
+    inner: str
+    contacts: bool
+    coupling: int | str
+    rate: int
+
+    @classmethod
+    def draw(cls, seed):
+        """Returns random settings."""
+        rng = np.random.default_rng(seed)
+        kind = KINDS[rng.integers(len(KINDS))]
+        inners = ["vbd", "vbd", "xpbd", "style3d"] if kind in ("drape", "pile") else ["vbd", "xpbd"]
+        coupling = NUMBERS[rng.integers(len(NUMBERS))]
+        return cls(
+            seed,
+            kind,
+            inners[rng.integers(len(inners))],
+            bool(rng.integers(2)),
+            coupling if rng.integers(2) else "auto",
+            int(rng.choice([60, 120])),
+        )
+
+    def __str__(self):
+        contacts = "contacts passed on" if self.contacts else "no contacts passed on"
+        return f"{self.kind}, {self.inner}, {contacts}, coupling={self.coupling!r}, 1/{self.rate} s"
+
+
+class Scene:
+    """A scene on the ground, at rest in itself: cloth and soft bodies start unstrained, all with one velocity.
+
+    Attributes:
+        model: The model.
+    """
+
+    def __init__(self, settings, device):
+        self._settings = settings
+        self._rng = np.random.default_rng([settings.seed, 1])
+        builder = self._builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+        if settings.inner == "style3d":
+            newton.solvers.SolverStyle3D.register_custom_attributes(builder)
+        builder.add_ground_plane()
+        self._radius = self._rng.choice([0.002, 0.005])
+        getattr(self, f"_add_{settings.kind}")()
+        builder.color()
+        model = self.model = builder.finalize(device=device)
+        model.soft_contact_ke = 10.0 ** self._rng.uniform(2.0, 4.0)
+        model.soft_contact_kd = 1e-2
+        model.soft_contact_mu = model.particle_mu = self._rng.uniform(0.0, 1.0)
+
+    def _velocity(self, speed=1.0):
+        return wp.vec3(*self._rng.uniform(-speed, speed, 3))
+
+    def _add_cloth(self, at, side, n):
+        """Adds cloth whose corner is at a place, of a mass of 0.2 to 1 kg a square metre."""
+        rng, settings = self._rng, self._settings
+        cell = side / n
+        options = {"pos": wp.vec3(*at), "rot": wp.quat_identity(), "vel": self._velocity()}
+        options |= {"dim_x": n, "dim_y": n, "cell_x": cell, "cell_y": cell, "particle_radius": self._radius}
+        options |= {"mass": rng.uniform(0.2, 1.0) * cell * cell}
+        stiffness = 10.0 ** rng.uniform(2.0, 3.5)
+        if settings.inner == "style3d":
+            anisotropic = {"tri_aniso_ke": wp.vec3(stiffness, stiffness, 0.1 * stiffness)}
+            anisotropic["edge_aniso_ke"] = wp.vec3(2e-5, 1e-5, 5e-6)
+            newton.solvers.style3d.add_cloth_grid(self._builder, **options, **anisotropic)
+        elif settings.inner == "xpbd":
+            springs = {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": stiffness, "spring_kd": 0.0}
+            self._builder.add_cloth_grid(**options, **springs)
+        else:
+            material = {"tri_ke": stiffness, "tri_ka": stiffness, "tri_kd": 1e-4, "edge_ke": 1e-4, "edge_kd": 1e-6}
+            self._builder.add_cloth_grid(**options, **material)
+
+    def _add_support(self, size):
+        """Adds a sphere, capsule or box that stands on the ground."""
+        place = wp.transform(wp.vec3(0.0, 0.0, size), wp.quat_identity())
+        match self._rng.integers(3):
+            case 0:
+                self._builder.add_shape_sphere(-1, xform=place, radius=size)
+            case 1:
+                turned = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.5 * np.pi)
+                place = wp.transform(wp.vec3(0.0, 0.0, size), turned)
+                self._builder.add_shape_capsule(-1, xform=place, radius=size, half_height=0.1)
+            case _:
+                self._builder.add_shape_box(-1, xform=place, hx=size, hy=0.7 * size, hz=size)
+
+    def _add_drape(self):
+        self._add_support(0.15)
+        side = self._rng.uniform(0.5, 0.8)
+        gap = self._radius + self._rng.uniform(0.002, 0.05)
+        self._add_cloth((-0.5 * side, -0.5 * side, 0.3 + gap), side, int(self._rng.integers(5, 9)))
+
+    def _add_pile(self):
+        rng, height = self._rng, self._radius
+        for _ in range(rng.integers(2, 5)):
+            height += 0.01 + rng.uniform(0.0, 0.02)  # beyond the reach of contacts between particles
+            x, y = rng.uniform(-0.05, 0.05, 2)
+            self._add_cloth((x - 0.15, y - 0.15, height), 0.3, int(rng.integers(3, 7)))
+
+    def _add_block(self):
+        rng, height = self._rng, self._radius
+        for _ in range(rng.integers(1, 3)):
+            height += rng.uniform(0.005, 0.05)
+            stiffness = 10.0 ** rng.uniform(3.5, 5.0)
+            n, cell = int(rng.integers(2, 4)), 0.05
+            x, y = rng.uniform(-0.03, 0.03, 2)
+            self._builder.add_soft_grid(
+                pos=wp.vec3(x, y, height),
+                rot=wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), rng.uniform(0.0, 0.7)),
+                vel=self._velocity(),
+                dim_x=n,
+                dim_y=n,
+                dim_z=2,
+                cell_x=cell,
+                cell_y=cell,
+                cell_z=cell,
+                density=rng.uniform(200.0, 1000.0),
+                k_mu=stiffness,
+                k_lambda=stiffness,
+                k_damp=0.0,
+                particle_radius=self._radius,
+            )
+            height += 2.0 * cell + 2.0 * self._radius
+
+    def _add_bodies(self):
+        """Bodies under a cloth, or on one."""
+        rng, on_top = self._rng, bool(self._rng.integers(2))
+        size = rng.uniform(0.04, 0.08)
+        low = 0.002 + size if not on_top else 0.03 + 2.0 * self._radius + size
+        # the stage takes long to keep bodies apart by itself
+        for x in (-0.15, 0.15) if self._settings.contacts else (0.0,):
+            self._builder.default_shape_cfg.density = rng.uniform(100.0, 1000.0)
+            body = self._builder.add_body(xform=wp.transform(wp.vec3(x, 0.0, low), wp.quat_identity()))
+            self._builder.add_shape_box(body, hx=size, hy=0.7 * size, hz=size)
+        height = 0.01 + self._radius if on_top else low + size + 2.0 * self._radius
+        self._add_cloth((-0.3, -0.3, height), 0.6, int(rng.integers(4, 7)))
+
+    def _solver(self, stage, coupling):
+        """Returns the inner solver, behind the stage if asked."""
+        settings, model = self._settings, self.model
+        match settings.inner:
+            case "vbd":
+                solver = newton.solvers.SolverVBD(model, iterations=10)
+            case "xpbd":
+                solver = newton.solvers.SolverXPBD(model, iterations=10)
+            case _:
+                config = newton.solvers.SolverStyle3D.Config(iterations=5)
+                solver = newton.solvers.SolverStyle3D(model, config=config)
+        if not stage:
+            return solver
+        # without Newton's contacts, nobody but the stage keeps bodies on the ground
+        bodies = True if model.body_count and not settings.contacts else None
+        return bsc.SolverCCD(solver, coupling=coupling, bodies=bodies)
+
+    def elastic_energy(self, x):
+        """Returns the energy of stretched triangles (St. Venant-Kirchhoff, as in VBD) or springs [J]."""
+        model = self.model
+        if self._settings.inner == "xpbd":
+            ends = x[model.spring_indices.numpy().reshape(-1, 2)]
+            extension = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length.numpy()
+            return 0.5 * model.spring_stiffness.numpy() @ extension**2
+        corners = x[model.tri_indices.numpy().reshape(-1, 3)]
+        sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+        gradient = sides @ model.tri_poses.numpy().astype(np.float64)
+        strain = 0.5 * (gradient.transpose(0, 2, 1) @ gradient - np.eye(2))
+        mu, lam = model.tri_materials.numpy()[:, :2].T
+        density = mu * (strain**2).sum(axis=(1, 2)) + 0.5 * lam * np.trace(strain, axis1=1, axis2=2) ** 2
+        return model.tri_areas.numpy() @ density
+
+    def energy(self, state):
+        """Returns the kinetic energy of particles and bodies, and their potential energy above the ground [J].
+
+        The elastic energy of cloth is counted behind VBD and XPBD, not in blocks nor behind Style3D. Nothing is
+        strained at the start, so that there even the rest of the energy cannot rise above that at the start.
+        """
+        model, total = self.model, 0.0
+        if model.particle_count:
+            x, v = (array.numpy().astype(np.float64) for array in (state.particle_q, state.particle_qd))
+            total += model.particle_mass.numpy() @ (0.5 * (v * v).sum(axis=1) + GRAVITY * x[:, 2])
+            if self._settings.kind != "block" and self._settings.inner != "style3d":
+                total += self.elastic_energy(x)
+        if model.body_count:
+            q, qd = (array.numpy().astype(np.float64) for array in (state.body_q, state.body_qd))
+            for body in range(model.body_count):
+                mass, com = model.body_mass.numpy()[body], model.body_com.numpy()[body]
+                rotation = np.array(wp.quat_to_matrix(wp.quat(*q[body, 3:]))).reshape(3, 3)
+                center = q[body, :3] + rotation @ com
+                spin = rotation.T @ qd[body, 3:]
+                linear = qd[body, :3]
+                total += mass * (0.5 * linear @ linear + GRAVITY * center[2])
+                total += 0.5 * spin @ model.body_inertia.numpy()[body] @ spin
+        return float(total)
+
+    def run(self, *, stage=True, coupling=None, duration=0.4):
+        """Returns how far the energy rises above that at the start, as a share of it, and the stage's report.
+
+        Args:
+            stage: Whether the stage is behind the inner solver.
+            coupling: As for ``SolverCCD``.
+            duration: How long [s].
+        """
+        model, settings = self.model, self._settings
+        solver = self._solver(stage, coupling)
+        pipeline = newton.CollisionPipeline(model)
+        # Style3D needs contacts, if only none
+        contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
+        start, end, control = model.state(), model.state(), model.control()
+        energies = [self.energy(start)]
+        for _ in range(round(duration * settings.rate)):
+            start.clear_forces()
+            if settings.contacts:
+                pipeline.collide(start, contacts)
+            solver.step(start, end, control, contacts, 1.0 / settings.rate)
+            start, end = end, start
+            energies.append(self.energy(start))
+        rise = max(energies) / energies[0] - 1.0 if np.isfinite(energies).all() else np.inf
+        return max(float(rise), 0.0), getattr(solver, "report", None)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=200, help="number of scenes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first scene; the next one has the next")
+    parser.add_argument("--device", default=None)
+    arguments = parser.parse_args()
+    wp.config.quiet = True
+    rising, worse, coupled, uncertified = 0, 0, 0, 0
+    for seed in range(arguments.seed, arguments.seed + arguments.count):
+        settings = Settings.draw(seed)
+        scene = Scene(settings, arguments.device)
+        rise, report = scene.run(coupling=settings.coupling)
+        coupled += report.coupled_steps
+        uncertified += report.uncertified_steps > 0
+        if rise <= RISE:
+            continue
+        rising += 1
+        whole, _ = scene.run()
+        plain, _ = scene.run(stage=False)
+        is_worse = rise > max(whole, plain) + RISE
+        worse += is_worse
+        print(
+            f"{'WORSE' if is_worse else 'rises'} --seed {seed} --count 1 ({settings}): energy rises by {rise:.1%}, "
+            f"without substeps by {whole:.1%}, of the inner solver alone by {plain:.1%}; {report}",
+            flush=True,
+        )
+    print(
+        f"{arguments.count} scenes, {coupled} coupled steps, {uncertified} scenes with uncertified steps; the "
+        f"energy of {rising} rises by more than {RISE:.0%}, of {worse} more than in whole steps and without the stage"
+    )
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
