@@ -436,7 +436,7 @@ class Scene:
         since = max(index, self.times.index(error.time) - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
         self._apply(LeftOutMesh(error.mesh.name, since, self.left_out[-1]))
-        if not any(mesh.times and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
+        if not any((mesh.times or self.is_still) and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
             raise error
 
     def _apply(self, part: LeftOutMesh) -> None:
