@@ -14,9 +14,9 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .._atomic_file import STDOUT, naming
+from .._atomic_file import STDOUT, naming, unfinished_path
 from ..replay.baseline import Baseline
-from ..replay.earlier import EarlierReplay
+from ..replay.earlier import EarlierReplay, find_earlier
 from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
@@ -57,7 +57,8 @@ meshes that are wholly inside closed ones, obstacles and linear curves included;
 where nothing moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
-finished intervals, marked partial."""
+finished intervals, marked partial; one that is killed leaves, with --json, what
+--resume needs."""
 
 _EPILOG = f"""\
 examples:
@@ -213,8 +214,8 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--baseline",
         metavar="FILE",
-        help="compare with the JSON file of an earlier replay: print which meshes collide, cross, are inside others "
-        "or, with --min-distance, near each other at times at which they were not",
+        help="compare with the JSON file of an earlier replay, which had the same options: print which meshes collide, "
+        "cross, are inside others or, with --min-distance, near each other at times at which they were not",
     )
     out.add_argument(
         "--fail-on",
@@ -242,8 +243,8 @@ def add_to(commands: Commands) -> None:
     run.add_argument(
         "--resume",
         action="store_true",
-        help="take what the file of --json has of an earlier run with the same options and files, which was stopped, "
-        "and check the rest; without that file, check all",
+        help="take what the file of --json, or that file with .part appended, has of an earlier run with the same "
+        "options and files, which was stopped or killed, and check the rest; without these files, check all",
     )
     add_detection_options(command, method="exact")
 
@@ -252,7 +253,12 @@ def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
     baseline = None
     if arguments.baseline:
-        baseline = Baseline(arguments.baseline, arguments.min_distance, intersections=arguments.intersections)
+        baseline = Baseline(
+            arguments.baseline,
+            method=arguments.method,
+            min_distance=arguments.min_distance,
+            options=_describe_options(scene, arguments),
+        )
     if arguments.scheduler:
         try:
             return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device), baseline)
@@ -285,6 +291,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
             setattr(arguments, option, STDOUT)
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
+    is_saved = arguments.json not in (None, STDOUT)
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
@@ -292,13 +299,14 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--fail-on distance needs --min-distance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
         raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
-    if arguments.resume and arguments.json in (None, STDOUT):
+    if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
     if arguments.scheduler and arguments.workers > 1:
         raise ValueError("--workers, --scheduler: either processes on this machine, or those of a cluster")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
-    places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
+    written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
+    places = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
     for place in places:
         if places.count(place) > 1:
             raise ValueError(f"{place}: named twice, as two files of a replay")
@@ -327,7 +335,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise
     except Exception as error:
         raise ValueError(f"{arguments.scene}: {describe(error)}") from error
-    for file in outputs:
+    for file in written:
         if file in scene.files:
             raise ValueError(f"{file}: the scene is read from this file; write to another one")
     return scene
@@ -349,10 +357,12 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
     settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
     with contextlib.ExitStack() as stack:
-        earlier = None
-        if arguments.resume and os.path.exists(arguments.json):
-            earlier = stack.enter_context(contextlib.closing(EarlierReplay(arguments.json, facts)))
-        outputs = _open_outputs(stack, scene, arguments, facts)
+        earlier = find_earlier(arguments.json, facts) if arguments.resume else None
+        earlier_count = 0
+        if earlier:
+            stack.enter_context(contextlib.closing(earlier))
+            earlier_count = earlier.count
+        outputs = _open_outputs(stack, scene, arguments, facts, earlier_count)
         intervals, interrupt, problems = [], None, []
         works, writing = [], 0.0
 
@@ -388,6 +398,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
+            if len(intervals) < earlier_count:  # or a shorter one, from which a later run can go on
+                finished = [output for output in finished if not isinstance(output, HitsJson)]
             # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
             problems += _finish([output for output in finished if not output.file.is_stream], summary)
             try:
@@ -468,11 +480,18 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
 
 
 def _open_outputs(
-    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, facts: dict[str, Any]
+    stack: contextlib.ExitStack,
+    scene: Scene,
+    arguments: argparse.Namespace,
+    facts: dict[str, Any],
+    earlier_count: int,
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
-        (arguments.json, lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands)),
+        (
+            arguments.json,
+            lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands, earlier_count=earlier_count),
+        ),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
