@@ -233,10 +233,14 @@ def test_workers_end_with_the_process_that_started_them(tmp_path, waves, number)
 class Inline:
     """Workers that are this process."""
 
-    died, attempts, count = ChildProcessError, 1, 2
+    died: type[Exception] = ChildProcessError
+    attempts, count = 1, 2
 
     def __init__(self):
         self.calls = []
+
+    def close(self):
+        pass
 
     def submit(self, function, *arguments):
         self.calls.append(arguments[1:])

@@ -191,6 +191,12 @@ def add_to(commands: Commands) -> None:
         help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
     )
     which.add_argument(
+        "--allow-missing",
+        **patterns,
+        help="only note that these files, or files or prims to which these prims refer, are missing; * matches any "
+        "text. Materials, textures and other files that cannot hold geometry may always be missing",
+    )
+    which.add_argument(
         "--validate",
         type=_validate,
         default=0,
@@ -329,6 +335,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
                 frames=arguments.frames,
                 subdivide=arguments.subdivide,
                 strict=arguments.strict,
+                allow_missing=arguments.allow_missing,
                 progress=progress.show,
             )
     except (OSError, ValueError):
@@ -567,7 +574,7 @@ def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, 
     """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
     selection = asdict(scene.selection)
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
-    names = "frames", "subdivide", "strict", "intersections", "ignore_initial", "validate"
+    names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
     options = {name: getattr(arguments, name) for name in names}
     return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}
 

@@ -13,7 +13,12 @@ from .summary import Summary
 
 __all__ = ["Baseline", "NewFinding"]
 
-_WITHOUT_EFFECT = {"intersections", "strict", "validate"}  # on what is compared; the first is looked at by itself
+_WITHOUT_EFFECT = {
+    "intersections",
+    "strict",
+    "allow_missing",
+    "validate",
+}  # on what is compared; the first is looked at by itself
 
 
 class NewFinding(NamedTuple):

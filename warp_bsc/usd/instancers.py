@@ -225,7 +225,8 @@ def find_instances(
         return []
     if lost:
         (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
-        left_out.add(UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}"))
+        error = UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}")
+        left_out.add_missing(error, prim)
     present = sorted({*pairs} - {*lost})
     instancer.count = 1 + max((index for index, _ in present), default=-1)
     return [Instance(instancer, index, number, roots[number]) for index, number in present]

@@ -57,7 +57,7 @@ def find_meshes(
     finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())), None)
     selection.check_patterns(finder.places)
 
-    meshes, invisible, passed_over, warnings = [], [], Counter(), finder.warnings
+    meshes, invisible, empty, passed_over, warnings = [], [], [], Counter(), finder.warnings
     if unmatched := selection.unmatched(finder.places):
         warnings.append(
             f"pairs to ignore that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
@@ -80,7 +80,11 @@ def find_meshes(
         except UnreadableError as error:
             left_out.add(error)
             continue
-        if not any(mesh.states.values()):
+        if mesh.is_empty and _has_clips(place.prim):  # of which a file may be missing
+            left_out.add(UnreadableError(f"{file}: {mesh.name}: its value clips have no faces, edges or points"))
+        elif mesh.is_empty:
+            empty.append(mesh.name)
+        elif not any(mesh.states.values()):
             invisible.append(mesh.name)
         elif mesh.is_nowhere:  # here, as instances may be many
             left_out.add(UnreadableError(f"{file}: {mesh.name}: its transform is not finite"))
@@ -91,6 +95,10 @@ def find_meshes(
             warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
     if invisible:
         warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")
+    if empty:
+        warnings.append(
+            f"prims without faces, edges or points hold nothing to check: {len(empty)}, the first is {empty[0]}"
+        )
     for purpose, count in sorted(passed_over.items()):
         warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
     if finder.other:
@@ -198,6 +206,7 @@ class UsdMesh:
         deforms: Whether anything but its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
+        is_empty: Whether it has no faces, and no edges or points, at any time.
         is_nowhere: Whether its transform is finite at no time.
     """
 
@@ -240,7 +249,13 @@ class UsdMesh:
         self._break_codes = tuple(
             Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
-        self._states = [self._topology_digest(code) if self._is_present(code) else None for code in self._break_codes]
+        has_elements = [not _is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
+        self.is_empty = not any(has_elements)
+        # A mesh may be empty for some time, as where a fluid has not begun to flow.
+        self._states = [
+            self._topology_digest(code) if has and is_shown(prim, self._root, code) else None
+            for code, has in zip(self._break_codes, has_elements, strict=True)
+        ]
         self._deformed_times = frozenset(
             sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
         )
@@ -516,8 +531,6 @@ class UsdMesh:
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
         counts, indices, holes = self._read_topology(code)
-        if counts.size == 0:
-            raise UnreadableError(f"{self._where}: the mesh has no faces")
         if counts.min() < 3:
             face = int(np.argmin(counts))
             raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
@@ -597,19 +610,18 @@ class UsdMesh:
             raise UnreadableError(f"{self._where}: {name} is no list of integers")
         return array.astype(np.int64)
 
-    def _is_present(self, time) -> bool:
-        """Returns whether the prim is visible and not empty, wherever it is placed."""
-        if not is_shown(self._prim, self._root, time):
-            return False
-        # A mesh may be empty for some time, as where a fluid has not begun to flow.
-        values = self._polygons.read_points(time), self._polygons.read_topology(time)[0]
-        return not all(value is not None and _is_empty(value) for value in values)
-
     def _topology_digest(self, time) -> bytes:
         digest = hashlib.blake2b()
         for values in self._read_topology(time):
             digest.update(len(values).to_bytes(8, "little") + values.tobytes())
         return digest.digest()
+
+
+def _has_clips(prim) -> bool:
+    """Returns whether values of a prim may come from value clips."""
+    return any(
+        prim.GetStage().GetPrimAtPath(path).HasAuthoredMetadata("clips") for path in prim.GetPath().GetPrefixes()
+    )
 
 
 def _is_empty(value) -> bool:

@@ -36,9 +36,9 @@ stored ones, in single precision; otherwise all are computed and returned in dou
 
 What cannot be read
 -------------------
-Broken meshes and instances, and files that cannot be opened, are left out from the time on at which they are broken,
-and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
-moves is read at one time.
+Broken meshes and instances, and files that cannot be opened and may hold geometry, are left out from the time on at
+which they are broken, and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene
+in which nothing ever moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that this module does not read (other curves and shapes without polygons,
 unselected meshes) and the changes that it makes to the motion.
@@ -49,7 +49,7 @@ unselected meshes) and the changes that it makes to the motion.
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -170,6 +170,7 @@ class Scene:
         subdivide: int = 1,
         sample_turns: bool = True,
         strict: bool = False,
+        allow_missing: Iterable[str] = (),
         progress: Callable[[int, int], None] | None = None,
     ):
         """Opens the file and finds its meshes.
@@ -182,6 +183,11 @@ class Scene:
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
+            allow_missing: Patterns of files, and of prims, that may be missing: a warning names them, and they neither
+                are in :attr:`left_out` nor an error. ``*`` matches any text. A pattern is matched with the path of a
+                missing file, its end from any folder on, and the path of the prim that refers to it or to a missing
+                prim; it includes the prims below. Files that cannot hold geometry, such as materials and textures,
+                always may be missing.
             progress: Called while vertices are welded, which reads the scene once: with the number of its times that
                 have been compared, and of all.
 
@@ -190,7 +196,9 @@ class Scene:
             ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
                 ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
         """
-        options = _Options(selection, frames, subdivide, sample_turns, strict)
+        if isinstance(allow_missing, str):
+            raise ValueError(f"allow_missing: must be several patterns, such as [{allow_missing!r}]")
+        options = _Options(selection, frames, subdivide, sample_turns, strict, tuple(allow_missing))
         self._open(path, options, _Revealed(), progress)
 
     def _open(
@@ -210,7 +218,7 @@ class Scene:
         self.path = str(path)
         self.selection = options.selection or Selection()
         self._unreadable = usd_stage.UnreadableError
-        self._left_out = usd_stage.LeftOut(path, options.strict)
+        self._left_out = usd_stage.LeftOut(path, options.strict, options.allow_missing)
         self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
         self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
@@ -261,6 +269,9 @@ class Scene:
         if len(self.left_out) > _NAMED:
             warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
         warnings += map(message_warning, self._messages[:_NAMED])
+        warnings += self._left_out.notes[:_NAMED]
+        if len(self._left_out.notes) > _NAMED:
+            warnings.append(f"missing: {len(self._left_out.notes) - _NAMED} more, {len(self._left_out.notes)} in all")
         warnings += self._warnings
         warnings += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
@@ -400,6 +411,7 @@ class Scene:
         reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
         if not self._usd_meshes:
             none_selected = ", or none is selected" * is_selection
+            reason = reason or "".join(f"; {warning}" for warning in self._warnings[:1])
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
@@ -491,6 +503,7 @@ class _Options:
     subdivide: int
     sample_turns: bool
     strict: bool
+    allow_missing: tuple[str, ...]
 
 
 @dataclass(frozen=True)
