@@ -30,13 +30,13 @@ from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
+from .exit_status import ExitStatus, explain_statuses
 from .interrupts import INTERRUPTS, Interrupted
 from .options import (
-    ERROR_STATUS,
-    SIGNAL_STATUS,
     Commands,
     add_command,
     add_detection_options,
+    add_fail_on,
     positive,
     positive_number,
 )
@@ -79,22 +79,10 @@ examples:
       --output-path twist.usd
   warp-bsc replay twist.usd
 
-exit status:
-  0  done, whether or not anything collides
-  1  found what --fail-on names
-{ERROR_STATUS}
-  3  --validate found a wrong answer
-  4  done, but parts of the scene could not be read and were left out; --strict
-     ends with 2 instead
-{SIGNAL_STATUS}
-If several apply, a signal comes before 2, then 3, 1 and 4."""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
 
 _LOG_SECONDS = 10.0
 """Time between two lines on the progress, where there is no terminal."""
-
-_FAILS = 1
-_DISAGREES = 3
-_LEFT_OUT = 4
 
 
 def add_to(commands: Commands) -> None:
@@ -223,13 +211,14 @@ def add_to(commands: Commands) -> None:
         help="compare with the JSON file of an earlier replay, which had the same options: print which meshes collide, "
         "cross, are inside others or, with --min-distance, near each other at times at which they were not",
     )
-    out.add_argument(
-        "--fail-on",
-        type=_reasons,
-        default=frozenset(),
-        metavar="WHAT",
-        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces, "
-        "meshes inside others), collisions, distance (what --min-distance finds), new (what --baseline does not have)",
+    add_fail_on(
+        out,
+        {
+            "intersections": "edges through faces, meshes inside others",
+            "collisions": "",
+            "distance": "what --min-distance finds",
+            "new": "what --baseline does not have",
+        },
     )
     run = command.add_argument_group("running")
     run.add_argument(
@@ -433,7 +422,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:
-        return _DISAGREES
+        return ExitStatus.DISAGREES
     fails = {
         "intersections": any(sample.crossings or sample.inside for sample in summary.intersections),
         "collisions": summary.hits > 0,
@@ -441,8 +430,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         "new": baseline is not None and bool(baseline.new_in(summary)),
     }
     if any(fails[reason] for reason in arguments.fail_on):
-        return _FAILS
-    return _LEFT_OUT if scene.left_out else 0
+        return ExitStatus.FOUND
+    return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
 
 
 def _explain(error: Exception, scene: Scene) -> str:
@@ -577,15 +566,6 @@ def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, 
     names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
     options = {name: getattr(arguments, name) for name in names}
     return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}
-
-
-def _reasons(text: str) -> frozenset[str]:
-    reasons = frozenset(text.split(","))
-    if unknown := reasons - {"intersections", "collisions", "distance", "new"}:
-        raise argparse.ArgumentTypeError(
-            f"must be of intersections, collisions, distance, new, not {', '.join(sorted(unknown))!r}"
-        )
-    return reasons
 
 
 def _read_pairs(path: str) -> list[tuple[str, str]]:
