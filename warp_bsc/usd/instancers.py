@@ -3,11 +3,12 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import math
 import os
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
 
@@ -250,9 +251,11 @@ def are_finite(attributes: Iterable[Usd.Attribute], time: Usd.TimeCode) -> bool:
     """Returns whether the values of attributes of transforms are finite at a time, or missing."""
     for attribute in attributes:
         value = attribute.Get(time)
-        if hasattr(value, "GetImaginary"):  # a quaternion
-            value = *value.GetImaginary(), value.GetReal()
-        if value is not None and not np.isfinite(np.array(value, dtype=np.float64)).all():
+        if hasattr(value, "GetImaginary"):  # a quaternion; many are read
+            finite = math.isfinite(Gf.Quatd(value).GetLength())
+        else:
+            finite = value is None or bool(np.isfinite(np.array(value, dtype=np.float64)).all())
+        if not finite:
             return False
     return True
 
