@@ -6,7 +6,7 @@ number, and a bool is none either.
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -26,6 +26,7 @@ __all__ = [
     "checked_integer",
     "checked_number",
     "checked_shape",
+    "checked_strings",
     "given",
 ]
 
@@ -107,6 +108,21 @@ def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
     return value
+
+
+def checked_strings(values: Any, name: str) -> tuple[str, ...]:
+    """Returns strings as a tuple.
+
+    Raises:
+        TypeError: If they are no sequence of strings; a string alone is none.
+    """
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
+    values = tuple(values)
+    for value in values:
+        if not isinstance(value, str):
+            raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
+    return values
 
 
 def check_instance(value: Any, name: str, types: type | tuple[type, ...], what: str) -> None:

@@ -11,10 +11,15 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["STDOUT", "OutputFile", "naming"]
+__all__ = ["STDOUT", "OutputFile", "naming", "unfinished_path"]
 
 STDOUT = "-"
 """The path of standard output."""
+
+
+def unfinished_path(path: str | os.PathLike) -> Path:
+    """Returns where a file is that :meth:`OutputFile.save` has saved and that is not committed, given its place."""
+    return Path(os.path.realpath(path) + ".part")
 
 
 @contextlib.contextmanager
@@ -65,6 +70,8 @@ class OutputFile:
             raise FileNotFoundError(f"{path}: there is no folder {folder}")
         with naming(path):
             self._file, self._temporary = _open_temporary(self.folder)
+        self._unfinished = unfinished_path(path)
+        self._is_saved = False
 
     def write(self, text: str | bytes) -> None:
         """Writes the whole of a text.
@@ -95,6 +102,21 @@ class OutputFile:
         self._remove_temporary()
         self._file, self._temporary = file, Path(path)
 
+    def save(self) -> None:
+        """Saves the content so far: if this process is killed, it stays at :func:`unfinished_path`.
+
+        What is written after the first call stays as well, unless the whole machine stops before the next call. A file
+        that was there before is replaced. Only for files that are no streams.
+
+        Raises:
+            OSError: If that fails.
+        """
+        os.fsync(self._file.fileno())
+        if not self._is_saved:
+            self._temporary = self._temporary or _give_name(self._file, self.folder)
+            os.replace(self._temporary, self._unfinished)
+            self._temporary, self._is_saved = self._unfinished, True
+
     def commit(self) -> None:
         """Puts the file in its place, with the permissions of the file that was there.
 
@@ -112,6 +134,8 @@ class OutputFile:
             os.fsync(self._file.fileno())
             if self._temporary is None:
                 self._temporary = _give_name(self._file, self.folder)
+            if not self._is_at(self._temporary):
+                raise FileExistsError(f"another process, which writes the same file, has replaced {self._temporary}")
             with contextlib.suppress(FileNotFoundError):
                 os.chmod(self._temporary, stat.S_IMODE(os.stat(self._place).st_mode))
             self._file.close()
@@ -119,15 +143,21 @@ class OutputFile:
         self.discard()
 
     def discard(self) -> None:
-        """Removes the temporary file. A committed file stays."""
+        """Removes the temporary file. A committed file stays, and so does a saved one."""
         if self._stream is not None:
             with contextlib.suppress(OSError):  # commit has raised it already
                 self._stream.close()
         self._remove_temporary()
 
+    def _is_at(self, path) -> bool:
+        """Returns whether the temporary file is at a path."""
+        with contextlib.suppress(FileNotFoundError):
+            return os.path.samestat(os.fstat(self._file.fileno()), os.stat(path))
+        return False
+
     def _remove_temporary(self):
         self._file.close()
-        if self._temporary:
+        if self._temporary and not self._is_saved:
             with contextlib.suppress(FileNotFoundError):
                 self._temporary.unlink()
 

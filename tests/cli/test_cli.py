@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -271,7 +272,30 @@ def test_query_of_edges(capsys, tmp_path):
 
 def test_query_fails_on_collision(capsys, tmp_path):
     path = str(write_queries(tmp_path))
-    assert main(["query", path, "--device", "cpu", "--fail-on-collision"]) == 1
+    assert main(["query", path, "--device", "cpu", "--fail-on", "collisions"]) == 1
+    assert main(["query", path, "--device", "cpu"]) == 0
+    capsys.readouterr()
+    assert "--fail-on: must be of collisions, not 'new'" in fail(capsys, "query", path, "--fail-on", "new")
+
+
+@pytest.mark.parametrize(
+    ("command", "statuses"),
+    [
+        ("", [0, 1, 2, 3, 4]),
+        ("replay", [0, 1, 2, 3, 4]),
+        ("query", [0, 1, 2]),
+        *((f"bench {name}".strip(), [0, 2]) for name in ("", "paper", "detector", "queries", "newton")),
+    ],
+)
+def test_help_lists_the_exit_statuses(capsys, command, statuses):
+    with pytest.raises(SystemExit):
+        main([*command.split(), "--help"])
+    options, text = capsys.readouterr().out.split("exit status:\n")
+    assert [int(line[2]) for line in text.splitlines() if re.match(r"  \d  ", line)] == statuses
+    assert {128 + number for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)} == {129, 130, 143}
+    assert "  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM\n  141  the reader" in text
+    assert ("--fail-on WHAT" in options) == (1 in statuses and bool(command))
+    assert "--fail-on-collision" not in options + text and max(map(len, text.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(

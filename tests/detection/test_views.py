@@ -119,7 +119,7 @@ def test_indexed_arrays_are_refused(device):
     x = wp.zeros(6, dtype=wp.vec3, device=device)
     indexed = wp.indexedarray(x, [wp.array(np.arange(6), dtype=int, device=device)])
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6))
-    with pytest.raises(ValueError, match="x0 must be"):
+    with pytest.raises(TypeError, match="x0 must be"):
         detector.detect(indexed, x)
 
 

@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils
+from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.cli.main import main
@@ -99,14 +99,25 @@ def add_broken_clip(stage):
     api.SetClipTimes([(0, 0), (1, 1)])
 
 
+def add_missing_clips(stage):
+    api = Usd.ClipsAPI(UsdGeom.Mesh.Define(stage, "/World/Odd").GetPrim())
+    api.SetClipAssetPaths(["./gone.usda"])
+    api.SetClipPrimPath("/World/Odd")
+    api.SetClipActive([(0, 0)])
+    api.SetClipTimes([(0, 0), (1, 1)])
+
+
+def add_mesh_without_points(stage):
+    add_mesh(stage, "/World/Odd", FALLING).GetPrim().RemoveProperty("points")
+
+
 BROKEN = {
-    add_bare_mesh: "/World/Odd: the mesh has no points at time 0",
-    add_mesh_without_faces: "/World/Odd: the mesh has no faces",
+    add_mesh_without_points: "/World/Odd: the mesh has no points at time 0",
     add_mesh_with_a_broken_face: "/World/Odd: face 0 refers to vertex 7, but the mesh has 3 points",
     add_points_of_another_type: "/World/Odd: its points are no points, but float",
     add_faces_of_another_type: "/World/Odd: faceVertexCounts is no list of integers",
     add_missing_reference: "gone.usda",
-    add_material: "skin.mtlx",
+    add_missing_clips: "/World/Odd: its value clips have no faces, edges or points",
     add_instancer_without_prototype: "/World/Odd: instance 0 is of prototype 0, which is not there",
     add_instancer_of_itself: "/World/Odd: the point instancer contains itself",
     add_instancer_whose_arrays_do_not_fit: "/World/Odd[1]/Leaf: its instancer has no valid transform for it at time 0",
@@ -138,20 +149,91 @@ def test_nothing_is_left_out_that_must_not_be(stage, capfd, tmp_path, add, reaso
     assert line.startswith(f"warp-bsc: error: {path}: ") and reason in line
 
 
+def add_material_library(stage):
+    """As of an asset whose look is another file, in any format; only a material is below it."""
+    UsdShade.Material.Define(stage, "/World/Odd").GetPrim().GetReferences().AddReference("./gone.usda")
+
+
+def add_textures(stage):
+    shader = UsdShade.Shader.Define(stage, "/World/Looks/Odd/Texture")
+    shader.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("./gone.png")
+    stage.DefinePrim("/World/Odd").GetReferences().AddReference("./gone.PNG")
+
+
+def add_package_of_materials(stage):
+    stage.DefinePrim("/World/Odd").GetPayloads().AddPayload("./gone.usdz[looks/skin.mtlx]")
+
+
+EMPTY = "prims without faces, edges or points hold nothing to check: 1, the first is /World/Odd"
+NOTED = {
+    add_bare_mesh: EMPTY,
+    add_mesh_without_faces: EMPTY,
+    add_material: "missing: Could not open asset",
+    add_material_library: "missing: Could not open asset",
+    add_textures: "missing: Could not open asset",
+    add_package_of_materials: "missing: Could not open asset",
+}
+
+
+@pytest.mark.parametrize(("add", "note"), NOTED.items(), ids=lambda value: getattr(value, "__name__", ""))
+def test_what_holds_no_geometry_is_noted(stage, capfd, add, note):
+    add(stage)
+    found = find(stage, "--strict")
+    assert hits(found) == [HIT] and found["left_out"] == []
+    assert [warning for warning in found["warnings"] if warning.startswith(note)]
+    assert f"note: {note}" in " ".join(capfd.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("pattern", "allowed"),
+    [
+        ("*.usda", True),
+        ("*", True),
+        ("gone.usda", True),
+        ("./props/gone.usda", True),
+        ("props", False),
+        ("props/*", True),
+        ("one.usda", False),
+        ("/World/Odd", True),
+        ("/World", True),
+        ("/World/Od", False),
+        ("/World/O*", True),
+        ("*.usdc", False),
+    ],
+)
+def test_what_may_be_missing(stage, pattern, allowed):
+    stage.DefinePrim("/World/Odd/Prop").GetReferences().AddReference("./props/gone.usda")
+    found = find(stage, "--allow-missing", pattern, status=0 if allowed else 4)
+    assert hits(found) == [HIT] and found["options"]["allow_missing"] == [pattern]
+    assert [len(found["left_out"]), sum("gone.usda" in text for text in found["warnings"])] == [not allowed, 1]
+
+
+def test_several_may_be_missing(stage):
+    add_instancer_without_prototype(stage)
+    stage.DefinePrim("/World/Part").GetReferences().AddInternalReference("/World/Nowhere")
+    stage.GetRootLayer().subLayerPaths.append("gone.usdc")
+    path = save(stage)
+    assert len(Scene(path).left_out) == 3
+    scene = Scene(path, strict=True, allow_missing=["/World/Odd", "/World/Part", "gone.*"])
+    assert scene.left_out == [] and sum(text.startswith("missing: ") for text in scene.warnings) == 3
+    with pytest.raises(ValueError, match="allow_missing: must be several patterns"):
+        Scene(path, allow_missing="gone.*")
+
+
 def test_collisions_come_before_what_is_left_out(stage):
-    add_bare_mesh(stage)
+    add_mesh_with_a_broken_face(stage)
     assert main(["replay", save(stage), "--device", "cpu", "--fail-on", "collisions"]) == 1
 
 
 def test_what_is_not_selected_need_not_be_whole(stage):
-    add_bare_mesh(stage)
+    add_mesh_with_a_broken_face(stage)
     assert find(stage, "--exclude", "/World/Odd", "--strict")["left_out"] == []
     assert find(stage, "--prims", "/World/F*", "--strict")["left_out"] == []
 
 
 def test_many_are_counted(stage):
     for number in range(30):
-        UsdGeom.Mesh.Define(stage, f"/World/Odd{number}")
+        add_mesh(stage, f"/World/Odd{number}", FALLING, [3], [0, 1, 7])
     found = find(stage, status=4)
     assert len(found["left_out"]) == 30
     named = [warning for warning in found["warnings"] if warning.startswith("left out: ")]
@@ -163,13 +245,15 @@ def test_nothing_readable_is_an_error(tmp_path, capsys):
     add_bare_mesh(stage)
     assert main(["replay", save(stage), "--device", "cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "/World/Odd: the mesh has no points" in line
+    assert line.endswith(f"no visible mesh in the scene, or none is selected; {EMPTY}")
     add_floor(stage)
-    stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 0)], 0)
-    stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Set([(0, 0, 1)], 1)
+    odd = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Odd"))
+    for time in (0, 1):
+        odd.CreatePointsAttr().Set([(0, 0, time)], time)
+    odd.CreateFaceVertexCountsAttr([3])
     assert main(["replay", save(stage), "--device", "cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "/World/Odd: the mesh has no faces" in line
+    assert "/World/Odd: faceVertexCounts add up to 3" in line
 
 
 # --- What breaks later ---

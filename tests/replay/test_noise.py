@@ -95,8 +95,13 @@ def test_frame_ranges(tmp_path, capsys):
 
 def test_what_is_new_against_a_baseline(stage, tmp_path, capsys):
     before, options = tmp_path / "before.json", ["--device", "cpu", "--baseline"]
+    falling = stage.GetPrimAtPath(FALLS[1]).GetAttribute("points")
+    through = falling.Get(1)
+    falling.Set(falling.Get(0), 1)
     path = save(stage)
-    assert main(["replay", path, "--device", "cpu", "--ignore", *FALLS, "--json", str(before)]) == 0
+    assert main(["replay", path, "--device", "cpu", "--json", str(before)]) == 0
+    falling.Set(through, 1)
+    save(stage)
     capsys.readouterr()
     assert main(["replay", path, *options, str(before), "--fail-on", "new"]) == 1
     printed = capsys.readouterr().out
@@ -124,6 +129,26 @@ def test_what_is_new_against_a_baseline(stage, tmp_path, capsys):
         before.write_text(text)
         assert main(["replay", path, *options, str(before)]) == 2
         assert "before.json: not a JSON file of this version's replay" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "difference"),
+    [
+        (["--method", "conservative"], "method was exact, and is conservative"),
+        (["--ignore", *FALLS], "ignore was [], and is [['/World/Floor', '/World/Falling']]"),
+        (["--frames", "0:1"], "frames was None, and is {'start': 0.0, 'end': 1.0, 'step': None}"),
+        (["--no-self"], "self_collisions was True, and is False"),
+        (["--ignore-initial"], "ignore_initial was False, and is True"),
+        (["--validate", "1", "--strict"], None),
+    ],
+)
+def test_a_baseline_with_other_options(stage, tmp_path, capsys, options, difference):
+    before, path = str(tmp_path / "before.json"), save(stage)
+    assert main(["replay", path, "--device", "cpu", "--json", before]) == 0
+    capsys.readouterr()
+    status = main(["replay", path, "--device", "cpu", "--baseline", before, "--fail-on", "new", *options])
+    said = f"warp-bsc: error: {before}: its replay was another one, and cannot be compared: {difference}\n"
+    assert (status, capsys.readouterr().err) == ((2, said) if difference else (0, ""))
 
 
 @pytest.mark.parametrize(

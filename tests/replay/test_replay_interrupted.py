@@ -29,7 +29,7 @@ def scene(tmp_path_factory):
     return str(write_scene(tmp_path_factory.mktemp("scene") / "waves.usdc"))
 
 
-def write_scene(path, phase=0.0):
+def write_scene(path, phase=0.0, frames=FRAMES):
     stage = new_stage(path)
     x, y = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(-1, 1, SIDE), indexing="ij")
     corner = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).reshape(-1, 1)
@@ -38,7 +38,7 @@ def write_scene(path, phase=0.0):
         mesh = UsdGeom.Mesh.Define(stage, name)
         mesh.CreateFaceVertexCountsAttr([4] * len(quads))
         mesh.CreateFaceVertexIndicesAttr(quads.reshape(-1).tolist())
-        for frame in range(FRAMES):
+        for frame in range(frames):
             z = 0.2 * np.sin(3 * x + 0.3 * frame + lag + phase)
             points = np.stack([x, y, z], axis=2).reshape(-1, 3).astype(np.float32)
             mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(points), frame)
@@ -93,6 +93,8 @@ def check_stopped(folder, number, moment, scene):
         _, said = process.communicate(timeout=60)
     status = process.returncode
     name = number.name
+    if number == signal.SIGKILL:
+        (folder / "hits.json.part").unlink(missing_ok=True)
     counts = read_left(folder, "interrupted" + (f" by {name}" if number != signal.SIGINT else ""))
     if status == 0:  # it was faster
         assert counts == [FRAMES - 1] * 4

@@ -736,7 +736,8 @@ def test_a_file_that_cannot_be_finished_takes_no_other_with_it(stage, tmp_path, 
     monkeypatch.setattr(OutputFile, "commit", broken)
     replay(stage, status=2)
     assert f"{tmp_path / name}: not written: RuntimeError: broken" in capsys.readouterr().err
-    assert {path.name for path in tmp_path.iterdir()} == {"scene.usda", *OUTPUTS} - {name}
+    left = {"hits.json.part"} if name == "hits.json" else set()  # what --resume can go on from
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.usda", *OUTPUTS} - {name} | left
 
 
 def test_what_was_there_stays_if_no_interval_is_finished(stage, tmp_path, monkeypatch, capsys):

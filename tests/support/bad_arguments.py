@@ -309,6 +309,7 @@ def calls_of_scenes() -> dict[str, Call]:
                 "subdivide": {**NOT_COUNT, "zero": 0},
                 "sample_turns": FLAGS,
                 "strict": FLAGS,
+                "allow_missing": STRINGS,
                 "progress": FUNCTIONS,
             },
             raises=bsc.Scene.__init__,
@@ -569,6 +570,7 @@ TEXTS = {
     "--json",
     "--csv",
     "--baseline",
+    "--allow-missing",
     "--scheduler",
     "--device",
 }

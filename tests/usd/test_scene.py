@@ -285,7 +285,6 @@ def test_topology_that_is_sampled_but_constant(stage):
         (TRIANGLE, [3, 3], [0, 1, 2, 0, -1, 2], "face 1 refers to vertex -1"),
         (TRIANGLE, [3, 3], [0, 1, 2], "faceVertexCounts add up to 6, but there are 3 faceVertexIndices"),
         (TRIANGLE, [3, 2], [0, 1, 2, 0, 1], "face 1 has 2 vertices"),
-        (TRIANGLE, [], [], "the mesh has no faces"),
         ([], [3], [0, 1, 2], "the mesh has no points at time 0"),
     ],
 )

@@ -11,8 +11,8 @@ from ..bench.scenes import default_scenes, load_scene
 from ..bench.timing import count_threads, limited_threads
 from .bench_detector_tables import detector_benchmarks_to_dict, print_detector_benchmarks
 from .device import find_device, load_detector, loading_kernels
+from .exit_status import explain_statuses
 from .options import (
-    BENCH_EXIT_STATUS,
     Commands,
     add_command,
     add_detection_options,
@@ -40,7 +40,7 @@ examples:
   warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
   warp-bsc bench detector --json > times.json
 
-{BENCH_EXIT_STATUS}"""
+{explain_statuses()}"""
 
 
 def add_to(commands: Commands) -> None:

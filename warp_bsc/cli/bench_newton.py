@@ -10,8 +10,9 @@ from .._atomic_file import STDOUT, OutputFile
 from ..bench.newton_examples import MODES, ExampleRun, NewtonExample, find_examples, measure_example
 from .bench_newton_tables import example_runs_to_dict, print_example_runs, print_examples
 from .device import find_device
+from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
-from .options import BENCH_EXIT_STATUS, Commands, add_command, add_device, positive
+from .options import Commands, add_command, add_device, positive
 from .tables import Console, say
 
 __all__ = ["add_to"]
@@ -36,7 +37,7 @@ examples:
   warp-bsc bench newton "cloth_hanging --solver xpbd" --frames 20 --modes stage
   warp-bsc bench newton --json examples.json
 
-{BENCH_EXIT_STATUS}
+{explain_statuses()}
 After a signal, the runs that were complete are printed or written first."""
 
 

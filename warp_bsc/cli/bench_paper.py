@@ -16,7 +16,8 @@ from ..bench.scenes import PAPER_SCENES, BenchmarkScene, load_intervals, paper_s
 from ..bench.timing import limited_threads
 from .bench_paper_tables import paper_benchmarks_to_dict, print_paper_benchmarks
 from .device import find_device
-from .options import BENCH_EXIT_STATUS, Commands, add_command, add_threads
+from .exit_status import explain_statuses
+from .options import Commands, add_command, add_threads
 from .tables import Console
 
 __all__ = ["add_to"]
@@ -37,7 +38,7 @@ examples:
   warp-bsc bench paper twisting crash:100000 --json times.json
   warp-bsc bench paper cloth.usd --device cpu --figure times.png
 
-{BENCH_EXIT_STATUS}"""
+{explain_statuses()}"""
 
 _FIGURES = (".png", ".svg", ".pdf")
 

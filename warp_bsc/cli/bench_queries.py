@@ -8,8 +8,8 @@ from ..bench.timing import count_threads, limited_threads
 from ..detection.settings import PairKind
 from .bench_queries_tables import print_query_benchmarks, query_benchmarks_to_dict
 from .device import find_device, loading_kernels
+from .exit_status import explain_statuses
 from .options import (
-    BENCH_EXIT_STATUS,
     Commands,
     add_command,
     add_device,
@@ -35,7 +35,7 @@ examples:
   warp-bsc bench queries --device cpu --threads 1 --count 1000000
   warp-bsc bench queries --json > rates.json
 
-{BENCH_EXIT_STATUS}"""
+{explain_statuses()}"""
 
 
 def add_to(commands: Commands) -> None:

@@ -9,12 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .._atomic_file import naming
+from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 
 __all__ = ["describe", "run_guarded"]
-
-_BROKEN_PIPE = 141
-"""The exit status that a shell reports after SIGPIPE."""
 
 
 def run_guarded(command: Callable[[], int]) -> int:
@@ -39,9 +37,9 @@ def run_guarded(command: Callable[[], int]) -> int:
             return _explain(str(interrupt) or "interrupted", getattr(interrupt, "status", Interrupted().status))
         except BrokenPipeError:
             _discard(1, 2)
-            return _BROKEN_PIPE
+            return ExitStatus.BROKEN_PIPE
         except Exception as error:
-            return _explain(f"error: {describe(error)}", 2)
+            return _explain(f"error: {describe(error)}", ExitStatus.ERROR)
 
 
 def describe(error: BaseException) -> str:
@@ -79,7 +77,7 @@ def _explain(line: str, status: int) -> int:
     except OSError as error:  # standard error is full or closed as well
         _discard(2)
         if isinstance(error, BrokenPipeError):
-            return _BROKEN_PIPE
+            return ExitStatus.BROKEN_PIPE
     return status
 
 

@@ -7,7 +7,8 @@ from typing import NoReturn
 from .. import __version__
 from . import bench_detector, bench_newton, bench_paper, bench_queries, query, replay
 from .error_boundary import run_guarded
-from .options import BENCH_EXIT_STATUS, EXIT_STATUS, add_command
+from .exit_status import ExitStatus, explain_statuses
+from .options import add_command
 
 __all__ = ["main", "run"]
 
@@ -18,7 +19,7 @@ examples:
   warp-bsc bench detector
   warp-bsc replay --help
 
-{EXIT_STATUS}"""
+{explain_statuses(*ExitStatus)}"""
 
 _BENCH = """\
 Measure how long detection takes. Without the name of a benchmark, warp-bsc
@@ -34,7 +35,7 @@ examples:
   warp-bsc bench newton
   warp-bsc bench detector --help
 
-{BENCH_EXIT_STATUS}"""
+{explain_statuses()}"""
 
 _BENCHMARKS = {"paper": bench_paper, "detector": bench_detector, "queries": bench_queries, "newton": bench_newton}
 

@@ -10,15 +10,11 @@ from .._arguments import LEAST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
-    "BENCH_EXIT_STATUS",
-    "ERROR_STATUS",
-    "EXIT_STATUS",
-    "SIGNAL_STATUS",
     "Commands",
     "add_command",
     "add_detection_options",
     "add_device",
-    "add_fail_on_collision",
+    "add_fail_on",
     "add_json",
     "add_repeat",
     "add_threads",
@@ -30,27 +26,6 @@ __all__ = [
 
 Commands = argparse._SubParsersAction
 """What ``ArgumentParser.add_subparsers`` returns: the commands, to which each module adds its own."""
-
-ERROR_STATUS = """\
-  2  wrong usage, bad input or another error; a line on standard error says what
-     and where"""
-
-SIGNAL_STATUS = """\
-  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM
-  141  the reader of the output has closed it, as head -1 does"""
-
-EXIT_STATUS = f"""\
-exit status:
-  0  done, whether or not anything collides
-  1  collisions found, with --fail-on-collision
-{ERROR_STATUS}
-{SIGNAL_STATUS}"""
-
-BENCH_EXIT_STATUS = f"""\
-exit status:
-  0  done
-{ERROR_STATUS}
-{SIGNAL_STATUS}"""
 
 
 def add_command(
@@ -105,9 +80,30 @@ def add_json(command: argparse.ArgumentParser) -> None:
     command.add_argument("--json", action="store_true", help="print all results as JSON instead of tables")
 
 
-def add_fail_on_collision(command: argparse.ArgumentParser) -> None:
-    """Adds --fail-on-collision."""
-    command.add_argument("--fail-on-collision", action="store_true", help="exit with status 1 if anything collides")
+def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> None:
+    """Adds --fail-on, whose value is a set of reasons.
+
+    Args:
+        group: The command, or a group of its options.
+        reasons: What may be found, and an explanation of each, which may be empty.
+    """
+
+    def parse(text: str) -> frozenset[str]:
+        named = frozenset(text.split(","))
+        if unknown := named - reasons.keys():
+            wanted = ", ".join(reasons)
+            raise argparse.ArgumentTypeError(f"must be of {wanted}, not {', '.join(sorted(unknown))!r}")
+        return named
+
+    explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
+    several = " of these, separated by commas" if len(reasons) > 1 else ""
+    group.add_argument(
+        "--fail-on",
+        type=parse,
+        default=frozenset(),
+        metavar="WHAT",
+        help=f"exit with status 1 if there is any{several}: {explained}",
+    )
 
 
 def add_repeat(command: argparse.ArgumentParser, *, default: int) -> None:

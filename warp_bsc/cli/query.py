@@ -10,12 +10,12 @@ import numpy as np
 
 from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
+from .exit_status import ExitStatus, explain_statuses
 from .options import (
-    EXIT_STATUS,
     Commands,
     add_command,
     add_detection_options,
-    add_fail_on_collision,
+    add_fail_on,
     add_json,
     distance,
 )
@@ -38,7 +38,7 @@ examples:
   warp-bsc query pairs.csv --kind edge-edge --json > answers.json
   warp-bsc query 227vf.csv --min-distance 0.001
 
-{EXIT_STATUS}"""
+{explain_statuses(ExitStatus.FOUND)}"""
 
 _QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
 
@@ -66,7 +66,7 @@ def add_to(commands: Commands) -> None:
     )
     add_detection_options(command, method="exact")
     add_json(command)
-    add_fail_on_collision(command)
+    add_fail_on(command, {"collisions": ""})
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -89,4 +89,4 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(queries_to_dict(answers, **said)))
     else:
         print_queries(Console(), answers, **said)
-    return 1 if arguments.fail_on_collision and any(answer.hits for answer in answers) else 0
+    return ExitStatus.FOUND if arguments.fail_on and any(answer.hits for answer in answers) else ExitStatus.DONE

@@ -14,9 +14,9 @@ from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .._atomic_file import STDOUT, naming
+from .._atomic_file import STDOUT, naming, unfinished_path
 from ..replay.baseline import Baseline
-from ..replay.earlier import EarlierReplay
+from ..replay.earlier import EarlierReplay, find_earlier
 from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
@@ -30,13 +30,13 @@ from ..usd.scene import FrameRange, Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
+from .exit_status import ExitStatus, explain_statuses
 from .interrupts import INTERRUPTS, Interrupted
 from .options import (
-    ERROR_STATUS,
-    SIGNAL_STATUS,
     Commands,
     add_command,
     add_detection_options,
+    add_fail_on,
     distance,
     naming_options,
     positive,
@@ -58,7 +58,8 @@ meshes that are wholly inside closed ones, obstacles and linear curves included;
 where nothing moves, this is done at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
 A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
-finished intervals, marked partial."""
+finished intervals, marked partial; one that is killed leaves, with --json, what
+--resume needs."""
 
 _EPILOG = f"""\
 examples:
@@ -79,22 +80,10 @@ examples:
       --output-path twist.usd
   warp-bsc replay twist.usd
 
-exit status:
-  0  done, whether or not anything collides
-  1  found what --fail-on names
-{ERROR_STATUS}
-  3  --validate found a wrong answer
-  4  done, but parts of the scene could not be read and were left out; --strict
-     ends with 2 instead
-{SIGNAL_STATUS}
-If several apply, a signal comes before 2, then 3, 1 and 4."""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
 
 _LOG_SECONDS = 10.0
 """Time between two lines on the progress, where there is no terminal."""
-
-_FAILS = 1
-_DISAGREES = 3
-_LEFT_OUT = 4
 
 
 def add_to(commands: Commands) -> None:
@@ -191,6 +180,12 @@ def add_to(commands: Commands) -> None:
         help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
     )
     which.add_argument(
+        "--allow-missing",
+        **patterns,
+        help="only note that these files, or files or prims to which these prims refer, are missing; * matches any "
+        "text. Materials, textures and other files that cannot hold geometry may always be missing",
+    )
+    which.add_argument(
         "--validate",
         type=_validate,
         default=0,
@@ -214,16 +209,17 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--baseline",
         metavar="FILE",
-        help="compare with the JSON file of an earlier replay: print which meshes collide, cross, are inside others "
-        "or, with --min-distance, near each other at times at which they were not",
+        help="compare with the JSON file of an earlier replay, which had the same options: print which meshes collide, "
+        "cross, are inside others or, with --min-distance, near each other at times at which they were not",
     )
-    out.add_argument(
-        "--fail-on",
-        type=_reasons,
-        default=frozenset(),
-        metavar="WHAT",
-        help="exit with status 1 if there is any of these, separated by commas: intersections (edges through faces, "
-        "meshes inside others), collisions, distance (what --min-distance finds), new (what --baseline does not have)",
+    add_fail_on(
+        out,
+        {
+            "intersections": "edges through faces, meshes inside others",
+            "collisions": "",
+            "distance": "what --min-distance finds",
+            "new": "what --baseline does not have",
+        },
     )
     run = command.add_argument_group("running")
     run.add_argument(
@@ -243,8 +239,8 @@ def add_to(commands: Commands) -> None:
     run.add_argument(
         "--resume",
         action="store_true",
-        help="take what the file of --json has of an earlier run with the same options and files, which was stopped, "
-        "and check the rest; without that file, check all",
+        help="take what the file of --json, or that file with .part appended, has of an earlier run with the same "
+        "options and files, which was stopped or killed, and check the rest; without these files, check all",
     )
     add_detection_options(command, method="exact")
 
@@ -253,7 +249,12 @@ def _run(arguments: argparse.Namespace) -> int:
     scene = open_scene(arguments)
     baseline = None
     if arguments.baseline:
-        baseline = Baseline(arguments.baseline, arguments.min_distance, intersections=arguments.intersections)
+        baseline = Baseline(
+            arguments.baseline,
+            method=arguments.method,
+            min_distance=arguments.min_distance,
+            options=_describe_options(scene, arguments),
+        )
     if arguments.scheduler:
         try:
             return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device), baseline)
@@ -286,6 +287,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
             setattr(arguments, option, STDOUT)
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
+    is_saved = arguments.json not in (None, STDOUT)
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
@@ -293,13 +295,14 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--fail-on distance needs --min-distance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
         raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
-    if arguments.resume and arguments.json in (None, STDOUT):
+    if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
     if arguments.scheduler and arguments.workers > 1:
         raise ValueError("--workers, --scheduler: either processes on this machine, or those of a cluster")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
-    places = [os.path.realpath(file) for file in [arguments.scene, *outputs] if file != STDOUT]
+    written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
+    places = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
     for place in places:
         if places.count(place) > 1:
             raise ValueError(f"{place}: named twice, as two files of a replay")
@@ -323,13 +326,14 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
                 frames=arguments.frames,
                 subdivide=arguments.subdivide,
                 strict=arguments.strict,
+                allow_missing=arguments.allow_missing,
                 progress=progress.show,
             )
     except (OSError, ValueError):
         raise
     except Exception as error:
         raise ValueError(f"{arguments.scene}: {describe(error)}") from error
-    for file in outputs:
+    for file in written:
         if file in scene.files:
             raise ValueError(f"{file}: the scene is read from this file; write to another one")
     return scene
@@ -351,10 +355,12 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
     settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
     with contextlib.ExitStack() as stack:
-        earlier = None
-        if arguments.resume and os.path.exists(arguments.json):
-            earlier = stack.enter_context(contextlib.closing(EarlierReplay(arguments.json, facts)))
-        outputs = _open_outputs(stack, scene, arguments, facts)
+        earlier = find_earlier(arguments.json, facts) if arguments.resume else None
+        earlier_count = 0
+        if earlier:
+            stack.enter_context(contextlib.closing(earlier))
+            earlier_count = earlier.count
+        outputs = _open_outputs(stack, scene, arguments, facts, earlier_count)
         intervals, interrupt, problems = [], None, []
         works, writing = [], 0.0
 
@@ -390,6 +396,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
+            if len(intervals) < earlier_count:  # or a shorter one, from which a later run can go on
+                finished = [output for output in finished if not isinstance(output, HitsJson)]
             # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
             problems += _finish([output for output in finished if not output.file.is_stream], summary)
             try:
@@ -416,7 +424,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
     if interrupt:
         raise interrupt
     if summary.validation and summary.validation.disagreements:
-        return _DISAGREES
+        return ExitStatus.DISAGREES
     fails = {
         "intersections": any(sample.crossings or sample.inside for sample in summary.intersections),
         "collisions": summary.hits > 0,
@@ -424,8 +432,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         "new": baseline is not None and bool(baseline.new_in(summary)),
     }
     if any(fails[reason] for reason in arguments.fail_on):
-        return _FAILS
-    return _LEFT_OUT if scene.left_out else 0
+        return ExitStatus.FOUND
+    return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
 
 
 def _explain(error: Exception, scene: Scene) -> str:
@@ -470,11 +478,18 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
 
 
 def _open_outputs(
-    stack: contextlib.ExitStack, scene: Scene, arguments: argparse.Namespace, facts: dict[str, Any]
+    stack: contextlib.ExitStack,
+    scene: Scene,
+    arguments: argparse.Namespace,
+    facts: dict[str, Any],
+    earlier_count: int,
 ) -> list[ReplayOutput]:
     """Opens the files to write; the stack discards those that are not finished."""
     makers = (
-        (arguments.json, lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands)),
+        (
+            arguments.json,
+            lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands, earlier_count=earlier_count),
+        ),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
@@ -550,18 +565,9 @@ def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, 
     """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
     selection = asdict(scene.selection)
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
-    names = "frames", "subdivide", "strict", "intersections", "ignore_initial", "validate"
+    names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
     options = {name: getattr(arguments, name) for name in names}
     return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}
-
-
-def _reasons(text: str) -> frozenset[str]:
-    reasons = frozenset(text.split(","))
-    if unknown := reasons - {"intersections", "collisions", "distance", "new"}:
-        raise argparse.ArgumentTypeError(
-            f"must be of intersections, collisions, distance, new, not {', '.join(sorted(unknown))!r}"
-        )
-    return reasons
 
 
 def _read_pairs(path: str) -> list[tuple[str, str]]:

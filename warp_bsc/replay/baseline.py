@@ -1,15 +1,24 @@
 """What an earlier replay of a scene has found, and what is new since."""
 
+import json
 import os
 from collections import defaultdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import orjson
 
 from .._atomic_file import naming
+from .earlier import describe_difference
 from .summary import Summary
 
 __all__ = ["Baseline", "NewFinding"]
+
+_WITHOUT_EFFECT = {
+    "intersections",
+    "strict",
+    "allow_missing",
+    "validate",
+}  # on what is compared; the first is looked at by itself
 
 
 class NewFinding(NamedTuple):
@@ -31,18 +40,19 @@ class NewFinding(NamedTuple):
 class Baseline:
     """The times at which meshes collided, intersected and were near each other in an earlier replay."""
 
-    def __init__(self, path: str | os.PathLike, min_distance: float | None = None, *, intersections: bool = True):
+    def __init__(self, path: str | os.PathLike, *, method: str, min_distance: float | None, options: dict[str, Any]):
         """Reads the JSON file of an earlier replay.
 
         Args:
             path: The file.
-            min_distance: As of :class:`Summary`, of the replays that will be compared with it.
-            intersections: Whether these look for intersections.
+            method: Method of detection of the replays that will be compared with it.
+            min_distance: As of :class:`Summary`, of these.
+            options: All other options of these, as of :func:`~warp_bsc.replay.hit_files.replay_facts`.
 
         Raises:
             OSError: If it cannot be read.
-            ValueError: If it is not such a file, or its replay was stopped, or did not look for intersections or
-                distances as large.
+            ValueError: If it is not such a file, or its replay was stopped, had other options, or did not look for
+                intersections or distances as large.
         """
         self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
             what: defaultdict(list) for what in ("collides", "crosses", "is inside", "is near")
@@ -51,7 +61,7 @@ class Baseline:
             with naming(path):
                 found = _read(path)
             distance, is_complete = found["min_distance"], found["complete"]
-            had_intersections = found["options"]["intersections"]
+            had = {"method": found["method"], **found["options"]}
             for span in found["collision_spans"]:
                 self._add("collides", span)
             for span in found["intersections"]:
@@ -65,11 +75,16 @@ class Baseline:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
             raise ValueError(f"{path}: its replay was stopped, and does not say what there is later")
-        if intersections and not had_intersections:
+        if options["intersections"] and not had["intersections"]:
             raise ValueError(f"{path}: its replay had --no-intersections, and does not say what crossed")
         if min_distance is not None and (distance is None or distance < min_distance):
-            had = "no --min-distance" if distance is None else f"--min-distance {distance:g}"
-            raise ValueError(f"{path}: its replay had {had}, and does not say what was near at {min_distance:g}")
+            own = "no --min-distance" if distance is None else f"--min-distance {distance:g}"
+            raise ValueError(f"{path}: its replay had {own}, and does not say what was near at {min_distance:g}")
+        wanted = json.loads(json.dumps({"method": method, **options}))
+        for name in wanted:
+            if name not in _WITHOUT_EFFECT and had.get(name) != wanted[name]:
+                difference = describe_difference(name, had, wanted)
+                raise ValueError(f"{path}: its replay was another one, and cannot be compared: {difference}")
 
     def new_in(self, summary: Summary) -> list[NewFinding]:
         """Returns what meshes do in a replay and did not do in the earlier one at that time.

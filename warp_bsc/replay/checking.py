@@ -3,6 +3,7 @@
 One interval is read while the one before is detected, and on a CPU the one before that is named.
 """
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -64,17 +65,18 @@ class IntervalChecker:
         self._worker = worker
         self._of_segment: tuple[_SegmentDetector, _SegmentNamer] | None = None
 
-    def check(self, first: int, stop: int) -> Iterator[IntervalResult]:
+    def check(self, first: int, stop: int, seconds: float = math.inf) -> Iterator[IntervalResult]:
         """Finds the collisions in some intervals, in order. Threads read, and detect on a CPU, the next ones meanwhile.
 
         Args:
             first: Number of the first interval.
             stop: Number of the interval after the last one.
+            seconds: Time [s] after which no other interval is read; those that have been read are checked.
 
         Raises:
             ValueError: If the positions at some time are broken, or there is no such method.
         """
-        detections = self._detect(first, stop)
+        detections = self._detect(first, stop, time.monotonic() + seconds)
         if is_cpu(self._checks.device):
             detections = read_ahead(detections)
         for work, namer, detection in detections:
@@ -96,9 +98,9 @@ class IntervalChecker:
             ignored_inside=selection.ignored_inside | found.inside.keys(),
         )
 
-    def _detect(self, first: int, stop: int) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
+    def _detect(self, first: int, stop: int, deadline: float) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
         """Yields what is detected in some intervals, and what names it, with the work until then."""
-        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop))):
+        for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop), deadline)):
             started = time.perf_counter()
             detector, namer = self._at(interval)
             detection = detector.detect(interval)
@@ -359,9 +361,11 @@ class _StrandChecker:
         return Intersections(np.concatenate([own, more.pairs]), np.concatenate([found.crosses, more.crosses]))
 
 
-def _timed(intervals: Iterable[Interval]) -> Iterator[tuple[float, Interval]]:
-    """Yields intervals with the time to read each [s]."""
+def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:
+    """Yields intervals, of which the first is read in any case, with the time to read each [s] until a deadline."""
     started = time.perf_counter()
     for interval in intervals:
         yield time.perf_counter() - started, interval
+        if time.monotonic() > deadline:
+            return
         started = time.perf_counter()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import orjson
 
+from .._atomic_file import unfinished_path
 from ..detection.collisions import DetectionStats, StageCounts
 from ..detection.settings import DistanceKind
 from ..usd.interval import Interval
@@ -20,13 +21,44 @@ from .scene_proximities import SceneProximities
 from .threads import read_ahead
 from .validation import Validation
 
-__all__ = ["EarlierReplay"]
+__all__ = ["EarlierReplay", "describe_difference", "find_earlier"]
 
 _END_OF_LINE = b"],\r\n"
 
 
+def find_earlier(path: str | os.PathLike, facts: dict[str, Any]) -> "EarlierReplay | None":
+    """Returns the earlier replay with the most intervals whose JSON file was to be at a path; None if there is none.
+
+    A replay that was killed has left its intervals at :func:`~warp_bsc._atomic_file.unfinished_path`.
+
+    Args:
+        path: The file.
+        facts: As of :class:`EarlierReplay`.
+
+    Raises:
+        OSError: As of :class:`EarlierReplay`.
+        ValueError: As of :class:`EarlierReplay`, if no file there is of a replay that could go on.
+    """
+    found, refusals = [], []
+    for place in filter(os.path.exists, (unfinished_path(path), path)):
+        try:
+            found.append(EarlierReplay(place, facts))
+        except ValueError as error:
+            refusals.append(error)
+    if refusals and not found:
+        raise refusals[0]
+    found.sort(key=lambda earlier: earlier.count)
+    for shorter in found[:-1]:
+        shorter.close()
+    return found[-1] if found else None
+
+
 class EarlierReplay:
-    """The intervals that a stopped replay has finished."""
+    """The intervals that a stopped replay has finished.
+
+    Attributes:
+        count: Number of these intervals in its file. The last one may be incomplete.
+    """
 
     def __init__(self, path: str | os.PathLike, facts: dict[str, Any]):
         """Opens the JSON file of the stopped replay.
@@ -40,6 +72,7 @@ class EarlierReplay:
             ValueError: If it is not such a file, or its replay was another one: of other files, with other options.
         """
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close)
+        self._may_be_torn = str(path).endswith(".part")
         try:
             own = orjson.loads(self._file.readline().rstrip() + b"]}")
             wanted = json.loads(json.dumps(facts))
@@ -52,14 +85,17 @@ class EarlierReplay:
             if fact != "device" and own.get(fact) != wanted[fact]:
                 self._file.close()
                 raise ValueError(
-                    f"{path}: its replay was another one, and cannot go on: {_difference(fact, own, wanted)}"
+                    f"{path}: its replay was another one, and cannot go on: {describe_difference(fact, own, wanted)}"
                 )
+        start = self._file.tell()
+        self.count = sum(line.startswith(b'{"index":') for line in self._file)
+        self._file.seek(start)
 
     def results(self, scene: Scene) -> Iterator[IntervalResult]:
         """Yields the results of its intervals, in order, as if they had just been found.
 
         Positions are read from the scene. The last interval of the file is missing if the file does not say what
-        intersects at its end.
+        intersects at its end, or the replay was killed while it wrote that interval.
 
         Args:
             scene: The scene, of which no interval has been read.
@@ -85,7 +121,13 @@ class EarlierReplay:
         for line in self._file:
             if line.startswith(b'"complete":'):
                 return
-            yield orjson.loads(line.rstrip(_END_OF_LINE))
+            try:
+                record = orjson.loads(line.rstrip(_END_OF_LINE))
+            except ValueError:
+                if self._may_be_torn:
+                    return
+                raise
+            yield record
 
 
 def _needs_following(record: dict) -> bool:
@@ -193,8 +235,8 @@ def _rebuild_pairs(interval: Interval, rows: list[dict]) -> dict[str, Any]:
     }
 
 
-def _difference(fact: str, own: dict, wanted: dict) -> str:
-    """Returns in words how a fact of two replays differs."""
+def describe_difference(fact: str, own: dict, wanted: dict) -> str:
+    """Returns in words how a fact of two replays differs, given both their facts."""
     before, now = own.get(fact), wanted[fact]
     if isinstance(before, dict) and isinstance(now, dict):
         name = next(name for name in now if before.get(name) != now[name])

@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import math
 import os
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any, TypeVar
@@ -23,6 +25,8 @@ from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["HitsCsv", "HitsJson", "replay_facts"]
+
+_SAVE_SECONDS = 20.0
 
 
 def replay_facts(
@@ -64,23 +68,37 @@ class HitsJson(RecordFile):
     elsewhere, or there is none, at its end as well. Every interval is in a line of its own.
 
     The file holds no measured times, so that it is the same whoever has found the results.
-    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it.
+    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it, and what is left of it at
+    :func:`~warp_bsc._atomic_file.unfinished_path` if the process is killed.
     """
 
-    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], has_strands: bool):
+    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], has_strands: bool, earlier_count: int = 0):
         """Opens the file.
 
         Args:
             path: The file's place.
             facts: What :func:`replay_facts` returns.
             has_strands: Whether the scene has curves or points.
+            earlier_count: Number of intervals in the file of an earlier replay, which this one must not replace as long
+                as it has fewer.
 
         Raises:
             OSError: If it cannot be written.
         """
         super().__init__(path)
         self._facts = facts
+        self._earlier_count = earlier_count
+        self._saved_at = -math.inf
         self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
+
+    def add(self, result: IntervalResult) -> None:
+        """Appends an interval, and saves the file at the first interval, and then every some seconds."""
+        super().add(result)
+        if self.file.is_stream or self.record_count < self._earlier_count:
+            return
+        if time.monotonic() - self._saved_at >= _SAVE_SECONDS:
+            self.file.save()
+            self._saved_at = time.monotonic()
 
     def head(self) -> str:
         """Returns the text before the first interval."""

@@ -11,6 +11,7 @@ that yet: their results are dropped, and the chunks are checked again.
 import contextlib
 import io
 import itertools
+import logging
 import multiprocessing
 import os
 import pickle
@@ -51,6 +52,7 @@ __all__ = [
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
 _MOST_INTERVALS = 16  # in a chunk; the first of a chunk costs reading and checking a time more
+_CHUNK_SECONDS = 15.0  # after which a chunk ends: two wait for each worker, and what is not written yet can be lost
 _CHUNKS_EACH = 4  # the fewest for each worker, so that all end at about the same time
 _CONNECT_SECONDS = 10.0
 
@@ -73,6 +75,10 @@ class Workers(Protocol):
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Returns a future of the function's result in one of the processes."""
+        ...
+
+    def result(self, future: Any) -> Any:
+        """Returns the result of such a future when it is there, or raises what the function has raised."""
         ...
 
     def close(self) -> None:
@@ -106,6 +112,10 @@ class LocalWorkers:
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future:
         """Returns a future of the function's result in one of the processes."""
         return self._threads.submit(self._call, function, arguments)
+
+    def result(self, future: Future) -> Any:
+        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        return future.result()
 
     def close(self) -> None:
         """Ends all processes at once."""
@@ -169,9 +179,14 @@ class Cluster:
         """
         try:
             from distributed import Client, KilledWorker  # noqa: PLC0415 (optional)
+            from distributed.comm.core import CommClosedError  # noqa: PLC0415
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError("a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
         self.died: type[Exception] = KilledWorker
+        self._address = address
+        self._disconnected = CancelledError, CommClosedError
+        # What it writes on standard error when the scheduler is lost is raised here as well.
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             self._client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -180,16 +195,31 @@ class Cluster:
     @property
     def count(self) -> int:
         """Number of workers at the moment, at least 1."""
-        threads: Any = self._client.nthreads()  # by worker; a coroutine for asynchronous clients only
+        with self._connected(Exception):  # of several types, and nothing else is done here
+            threads: Any = self._client.nthreads()  # by worker; a coroutine for asynchronous clients only
         return max(1, len(threads))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Returns a future of the function's result in one of the workers."""
-        return self._client.submit(function, *arguments, pure=False)
+        with self._connected(Exception):
+            return self._client.submit(function, *arguments, pure=False)
+
+    def result(self, future: Any) -> Any:
+        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        with self._connected(*self._disconnected):  # no future is cancelled of which a result is wanted
+            return future.result()
 
     def close(self) -> None:
         """Disconnects from the cluster, which drops the work that is waiting."""
         self._client.close()
+
+    @contextlib.contextmanager
+    def _connected(self, *errors: type[Exception]) -> Iterator[None]:
+        """Turns errors into a ConnectionError that names the scheduler."""
+        try:
+            yield
+        except errors as error:
+            raise ConnectionError(f"{self._address}: the scheduler of the Dask cluster answers no more") from error
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
@@ -217,17 +247,21 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
     """
     job = _pack(scene, checks)
     calls = deque(
-        _Call(f"checked time {scene.times[start]:g} to {scene.times[stop]:g}", _check_chunk, (job, start, stop))
+        _Call(_name_chunk(scene, start, stop), _check_chunk, (job, start, stop))
         for start, stop in _cut(scene, first, workers.count)
     )
     for found in _in_order(workers, calls):
         left_out = len(scene.left_out)
-        yield from _unpack(scene, found)
+        for result in _unpack(scene, found):
+            yield result
+            first = result.summary.index + 1
         if len(scene.left_out) > left_out:
             job = _pack(scene, checks)
             for call in calls:
                 call.withdraw()
                 call.arguments = (job, *call.arguments[1:])
+        if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk took long
+            calls.appendleft(_Call(_name_chunk(scene, first, stop), _check_chunk, (job, first, stop)))
 
 
 def device_of_cluster(address: str, name: str | None) -> str:
@@ -244,7 +278,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
     """
     cluster = Cluster(address)
     try:
-        return cluster.submit(_name_device, name).result()
+        return cluster.result(cluster.submit(_name_device, name))
     finally:
         cluster.close()
 
@@ -293,24 +327,27 @@ def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
     Args:
         workers: The workers.
         calls: The calls, which are removed when their result is there. Between two results, those that remain may be
-            withdrawn and changed.
+            withdrawn and changed, and others put before them.
     """
     while calls:
         for call in islice(calls, 2 * workers.count):
             call.future = call.future or workers.submit(call.function, *call.arguments)
         call = calls[0]
         try:
-            result = call.future.result()
+            result = workers.result(call.future)
         except workers.died as error:
             call.future = None
             call.deaths += 1
             if call.deaths == workers.attempts:
                 raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
             continue
-        except CancelledError as error:  # not by this module, which forgets the futures that it cancels
-            raise ConnectionError("the connection to the scheduler of the cluster was lost") from error
         calls.popleft()
         yield result
+
+
+def _name_chunk(scene: Scene, first: int, stop: int) -> str:
+    """Returns what is done to a chunk, in words."""
+    return f"checked time {scene.times[first]:g} to {scene.times[stop]:g}"
 
 
 def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int]]:
@@ -358,7 +395,10 @@ def _end_with_parent() -> None:
 
 
 def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
-    """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them."""
+    """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them.
+
+    The last intervals are missing, but not the first one, if all take too long.
+    """
     global _opened  # noqa: PLW0603
     stream = io.BytesIO()
     pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
@@ -367,7 +407,7 @@ def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
         try:
             checker = _open(job)
             with cores(_core_count()):
-                for result in checker.check(first, stop):
+                for result in checker.check(first, stop, _CHUNK_SECONDS):
                     checker.scene.files.check()
                     pickler.index = result.summary.index
                     pickler.dump((pickler.index, result.contacts.interval.notes))

@@ -137,7 +137,7 @@ class CouplingHooks(CouplingInterface):
         self._harvest(hook, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
 
     def _harvest(self, hook, name, proxy, forces, options):
-        if self._inner_contacts is not None:
+        if self._inner_contacts is not None and options["contacts"] is not None:
             options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
         if self._coupled is not None and not _is_default(self.solver, hook):  # that sees the changed velocities

@@ -190,10 +190,10 @@ class InnerContacts:
         wp.launch(_pack, contacts.soft_contact_max, inputs=inputs, outputs=outputs, device=self._device)
         return packed
 
-    def packed(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
+    def packed(self, contacts: newton.Contacts) -> newton.Contacts:
         """Returns the contacts that the inner solver got in the last step instead of those of the program."""
-        buffers = None if contacts is None else self._buffers.get(_key(contacts))
-        if contacts is None or buffers is None:
+        buffers = self._buffers.get(_key(contacts))
+        if buffers is None:
             return contacts
         packed = copy.copy(contacts)
         for name, attribute in _FIELDS.items():

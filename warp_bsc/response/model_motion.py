@@ -195,9 +195,10 @@ def _write_end(
 
 def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
-    if not model.joint_count or (model.joint_type.numpy() == newton.JointType.FREE).all():
+    if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
         return np.empty(0, dtype=int)
     state = model.state()
+    assert model.joint_q is not None and model.joint_qd is not None and model.body_q is not None and state.body_q
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
     placed, given = state.body_q.numpy(), model.body_q.numpy()
     given[(placed[:, 3:] * given[:, 3:]).sum(axis=1) < 0.0, 3:] *= -1.0  # the same rotation

@@ -681,8 +681,10 @@ class SolverCCD(SolverBase, CouplingHooks):
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver."""
         inner = self._inner_contacts
-        self.solver.update_contacts(contacts if inner is None else inner.packed(contacts), state)
-        if inner is not None:
+        if inner is None:
+            self.solver.update_contacts(contacts, state)
+        else:
+            self.solver.update_contacts(inner.packed(contacts), state)
             inner.unpack(contacts.force, contacts)
 
     def __deepcopy__(self, memo):

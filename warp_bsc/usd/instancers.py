@@ -3,19 +3,22 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom
 
 from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
 
 __all__ = [
     "Instance",
     "Instancer",
+    "are_finite",
     "find_instances",
     "is_shown",
+    "masking_attributes",
     "transform_attributes",
     "transform_times",
     "visibility_times",
@@ -60,8 +63,8 @@ class Instance:
 
         None where the instance is not there, or the lengths of the instancer's arrays differ.
         """
-        transform = self.instancer.transforms(prim, self.root, time)[self.index]
-        return None if np.isnan(transform[0, 0]) else transform
+        transforms, are_there = self.instancer.transforms(prim, self.root, time)
+        return transforms[self.index] if are_there[self.index] else None
 
     def contains(self, prim: Usd.Prim) -> bool:
         """Returns whether an instancer made this instance or one around it: an instancer may not contain itself."""
@@ -91,9 +94,11 @@ class Instancer:
         self.name = parent.name_of(prim.GetPath()) if parent else str(prim.GetPath())
         self._instancer = instancer = UsdGeom.PointInstancer(prim)
         self._last_placed: tuple[Usd.TimeCode | None, np.ndarray] = None, np.zeros((0, 4, 4))
-        self._last_transforms: dict[Sdf.Path, tuple[Usd.TimeCode, np.ndarray]] = {}
+        self._last_transforms: dict[Sdf.Path, tuple[Usd.TimeCode, tuple[np.ndarray, np.ndarray]]] = {}
         self._last_prototypes: tuple[tuple, np.ndarray] = (), np.zeros((0, 0), dtype=int)
         root = parent.root if parent else None
+        self._masking = () if parent else masking_attributes(prim)  # a parent takes its own into account
+        self._masking_of: dict[Sdf.Path, tuple[Usd.Attribute, ...]] = {}  # by prim of a prototype
         placing = (
             instancer.GetPositionsAttr(),
             instancer.GetOrientationsAttr(),
@@ -110,7 +115,7 @@ class Instancer:
             self.break_times |= parent.instancer.break_times
             self.may_jump |= parent.instancer.may_jump
 
-    def transforms(self, prim: Usd.Prim, root: Usd.Prim, time: Usd.TimeCode) -> np.ndarray:
+    def transforms(self, prim: Usd.Prim, root: Usd.Prim, time: Usd.TimeCode) -> tuple[np.ndarray, np.ndarray]:
         """Returns the matrices that take points of a prim of a prototype, as rows, to world space, by all instances.
 
         Args:
@@ -119,7 +124,8 @@ class Instancer:
             time: Time code.
 
         Returns:
-            Matrices, shape [count, 4, 4]; NaN where an instance has none.
+            Matrices, shape [count, 4, 4], as the file has them, finite or not; and which instances are there, shape
+            [count]: the others have the identity.
         """
         last = self._last_transforms.get(prim.GetPath())
         if last and last[0] == time:
@@ -129,12 +135,18 @@ class Instancer:
         local, _ = cache.ComputeRelativeTransform(prim, root)
         if xformable := UsdGeom.Xformable(root):
             local *= xformable.GetLocalTransformation(time)
-        transforms = np.full((self.count, 4, 4), np.nan)
+        if prim.GetPath() not in self._masking_of:
+            self._masking_of[prim.GetPath()] = (*self._masking, *masking_attributes(prim, root))
+        transforms = np.tile(np.eye(4), (self.count, 1, 1))
+        are_there = np.zeros(self.count, dtype=bool)
         if above is not None:
             placed = self._read_placed(time)[: self.count]
             transforms[: len(placed)] = np.array(local) @ placed @ np.array(above)
-        self._last_transforms[prim.GetPath()] = time, transforms
-        return transforms
+            are_there[: len(placed)] = True
+            if not are_finite(self._masking_of[prim.GetPath()], time):
+                transforms[are_there] = np.nan
+        self._last_transforms[prim.GetPath()] = time, (transforms, are_there)
+        return transforms, are_there
 
     def prototypes(self, times: tuple[Usd.TimeCode, ...]) -> np.ndarray:
         """Returns the prototype of each instance at each time, shape [len(times), count]; -1 where none is visible."""
@@ -214,7 +226,8 @@ def find_instances(
         return []
     if lost:
         (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
-        left_out.add(UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}"))
+        error = UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}")
+        left_out.add_missing(error, prim)
     present = sorted({*pairs} - {*lost})
     instancer.count = 1 + max((index for index, _ in present), default=-1)
     return [Instance(instancer, index, number, roots[number]) for index, number in present]
@@ -222,9 +235,35 @@ def find_instances(
 
 def transform_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[Usd.Attribute]:
     """Yields the attributes of the transforms from a prim to the world, or up to a root, its own included."""
+    return (op.GetAttr() for op in _transform_ops(prim, root))
+
+
+def masking_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> tuple[Usd.Attribute, ...]:
+    """Returns those of them from which OpenUSD makes a finite matrix although their value is not finite.
+
+    A quaternion that is not a number becomes the identity, and the inverse of an infinite scale 0.
+    """
+    ops = _transform_ops(prim, root)
+    return tuple(op.GetAttr() for op in ops if op.GetOpType() == UsdGeom.XformOp.TypeOrient or op.IsInverseOp())
+
+
+def are_finite(attributes: Iterable[Usd.Attribute], time: Usd.TimeCode) -> bool:
+    """Returns whether the values of attributes of transforms are finite at a time, or missing."""
+    for attribute in attributes:
+        value = attribute.Get(time)
+        if hasattr(value, "GetImaginary"):  # a quaternion; many are read
+            finite = math.isfinite(Gf.Quatd(value).GetLength())
+        else:
+            finite = value is None or bool(np.isfinite(np.array(value, dtype=np.float64)).all())
+        if not finite:
+            return False
+    return True
+
+
+def _transform_ops(prim, root) -> Iterator[UsdGeom.XformOp]:
     while prim:
         if xformable := UsdGeom.Xformable(prim):
-            yield from (op.GetAttr() for op in xformable.GetOrderedXformOps())
+            yield from xformable.GetOrderedXformOps()
             if xformable.GetResetXformStack():
                 break
         if prim == root:

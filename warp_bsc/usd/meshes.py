@@ -16,8 +16,10 @@ from pxr import Usd, UsdGeom, UsdSkel, Vt
 
 from .instancers import (
     Instance,
+    are_finite,
     find_instances,
     is_shown,
+    masking_attributes,
     transform_attributes,
     transform_times,
     visibility_times,
@@ -55,7 +57,7 @@ def find_meshes(
     finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())), None)
     selection.check_patterns(finder.places)
 
-    meshes, invisible, passed_over, warnings = [], [], Counter(), finder.warnings
+    meshes, invisible, empty, passed_over, warnings = [], [], [], Counter(), finder.warnings
     if unmatched := selection.unmatched(finder.places):
         warnings.append(
             f"pairs to ignore that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
@@ -78,14 +80,25 @@ def find_meshes(
         except UnreadableError as error:
             left_out.add(error)
             continue
-        if any(mesh.states.values()):
-            meshes.append(mesh)
-        else:
+        if mesh.is_empty and _has_clips(place.prim):  # of which a file may be missing
+            left_out.add(UnreadableError(f"{file}: {mesh.name}: its value clips have no faces, edges or points"))
+        elif mesh.is_empty:
+            empty.append(mesh.name)
+        elif not any(mesh.states.values()):
             invisible.append(mesh.name)
+        elif mesh.is_nowhere:  # here, as instances may be many
+            left_out.add(UnreadableError(f"{file}: {mesh.name}: its transform is not finite"))
+            continue
+        else:
+            meshes.append(mesh)
         if place.is_bound_in_vain:
             warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
     if invisible:
         warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")
+    if empty:
+        warnings.append(
+            f"prims without faces, edges or points hold nothing to check: {len(empty)}, the first is {empty[0]}"
+        )
     for purpose, count in sorted(passed_over.items()):
         warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
     if finder.other:
@@ -193,6 +206,8 @@ class UsdMesh:
         deforms: Whether anything but its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
+        is_empty: Whether it has no faces, and no edges or points, at any time.
+        is_nowhere: Whether its transform is finite at no time.
     """
 
     def __init__(self, place: _Place, file: str | os.PathLike):
@@ -220,6 +235,7 @@ class UsdMesh:
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
+        self._masking = () if instance else masking_attributes(self._frame)
         self._where = f"{file}: {place.name}"
         instancer = instance.instancer if instance else None
         self.group = (id(instancer), self.path) if instancer else ()
@@ -233,7 +249,13 @@ class UsdMesh:
         self._break_codes = tuple(
             Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
-        self._states = [self._topology_digest(code) if self._is_present(code) else None for code in self._break_codes]
+        has_elements = [not _is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
+        self.is_empty = not any(has_elements)
+        # A mesh may be empty for some time, as where a fluid has not begun to flow.
+        self._states = [
+            self._topology_digest(code) if has and is_shown(prim, self._root, code) else None
+            for code, has in zip(self._break_codes, has_elements, strict=True)
+        ]
         self._deformed_times = frozenset(
             sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
         )
@@ -251,16 +273,18 @@ class UsdMesh:
         # Between samples as well, because a whole turn ends where it began.
         between = [start + _BETWEEN * (end - start) for start, end in pairwise(self._transform_times)]
         codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*self._transform_times, *between]))]
-        first = self._read_transforms(instance, codes[0]).copy()
+        first, were_there = (values.copy() for values in self._read_transforms(instance, codes[0]))
         # Some writers sample a transform at every time although it never changes.
         self._moved = np.zeros(len(first), dtype=bool)
         for code in codes[1:]:
-            transforms = self._read_transforms(instance, code)
-            there = ~np.isnan(transforms[:, 0, 0])  # other instances are not there
-            seen = ~np.isnan(first[:, 0, 0])
-            self._moved |= there & seen & (transforms != first).any(axis=(1, 2))
-            first[there & ~seen] = transforms[there & ~seen]
-        self._stays = np.isnan(first[:, 0, 0]) | (first == np.eye(4)).all(axis=(1, 2))
+            transforms, are_there = self._read_transforms(instance, code)
+            differs = (transforms != first) & ~(np.isnan(transforms) & np.isnan(first))
+            self._moved |= are_there & were_there & differs.any(axis=(1, 2))
+            appears = are_there & ~were_there
+            first[appears] = transforms[appears]
+            were_there |= are_there
+        self._stays: np.ndarray = (first == np.eye(4)).all(axis=(1, 2))
+        self._is_finite: np.ndarray = np.isfinite(first).all(axis=(1, 2))
         self._bent: dict[tuple[float, float], np.ndarray] = {}
         self._place(place)
 
@@ -286,6 +310,7 @@ class UsdMesh:
             if state != last:
                 self.states[time] = last = state
         self.is_placed = bool(self._stays[self.index]) and not self._moved[self.index]
+        self.is_nowhere = not (self._is_finite[self.index] or self._moved[self.index])
         self._placed_times = self._transform_times if self._moved[self.index] else []
         self.times = self._deformed_times | set(self._placed_times)
         self.turns = bool(self._placed_times) or bool(self._skin and self._skin.times)
@@ -408,23 +433,30 @@ class UsdMesh:
                 )
             return positions
 
-    def read_instances(self, time: float, instances: np.ndarray, *, before: bool = False) -> np.ndarray:
+    def read_instances(
+        self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
+    ) -> np.ndarray | None:
         """Reads the positions of all points in several instances of the same :attr:`group` in world space, float64.
 
         Args:
             time: Time code.
             instances: Numbers of the instances, shape [n].
+            point_count: As of :meth:`read_positions`.
             before: As of :meth:`read_positions`.
 
         Returns:
-            Positions, shape [n, point_count, 3]; not finite where an instance is broken or not there.
+            Positions, shape [n, point_count, 3]; None if any instance is broken, which :meth:`read_positions` of that
+            one then says.
 
         Raises:
             UnreadableError: If the points cannot be read.
         """
         points = self.read_points(time, before=before).astype(np.float64)
         with reading(self._where, self, time):
-            transforms = self._read_transforms(self._instance, self._time_code(time, before))[instances]
+            transforms, are_there = self._read_transforms(self._instance, self._time_code(time, before))
+            transforms = transforms[instances]
+            if len(points) != point_count or not are_there[instances].all() or not np.isfinite(transforms).all():
+                return None
             return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
 
     @property
@@ -490,13 +522,15 @@ class UsdMesh:
     def _scales(self, times: list[float]) -> list[float]:
         """Returns the largest factor by which the transform lengthens at each time, to nine digits; 1 for no times."""
         found = [self._find_transform(self._time_code(time, False)) for time in times if not self.is_placed]
-        scales = [np.linalg.norm(transform[:3, :3], 2) for transform in found if transform is not None]
+        scales = [
+            np.linalg.norm(transform[:3, :3], 2)
+            for transform in found
+            if transform is not None and np.isfinite(transform).all()  # reading positions reports the others
+        ]
         return [float(f"{scale:.9g}") for scale in scales] or [1.0]
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
         counts, indices, holes = self._read_topology(code)
-        if counts.size == 0:
-            raise UnreadableError(f"{self._where}: the mesh has no faces")
         if counts.min() < 3:
             face = int(np.argmin(counts))
             raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
@@ -533,30 +567,36 @@ class UsdMesh:
         transform = self._find_transform(self._time_code(time, before))
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
+        if not np.isfinite(transform).all():
+            raise UnreadableError(f"{self._where}: its transform is not finite at time {time:g}")
         return transform
 
     def _bends(self, start, end) -> bool:
         """Returns whether the transform leaves the straight way from one sample to the next."""
         if (start, end) not in self._bent:
             codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
-            first, between, last = (self._read_transforms(self._instance, code) for code in codes)
+            (first, *_), (between, *_), (last, *_) = found = [self._read_transforms(self._instance, c) for c in codes]
             off = np.abs(between - (first + _BETWEEN * (last - first)))
             size = np.maximum(np.abs(first), np.abs(last))
             self._bent[start, end] = np.zeros(len(first), dtype=bool)
             for rows in (slice(0, 3), slice(3, 4)):
                 self._bent[start, end] |= off[:, rows].max(axis=(1, 2)) > _ROUNDING * size[:, rows].max(axis=(1, 2))
+            self._bent[start, end] &= np.all([are_there for _, are_there in found], axis=0)
         return bool(self._bent[start, end][self.index])
 
     def _find_transform(self, time) -> np.ndarray | None:
         if not self._instance:
-            return self._read_transforms(None, time)[0]
+            return self._read_transforms(None, time)[0][0]
         return self._instance.transform(self._frame, time)
 
-    def _read_transforms(self, instance, time) -> np.ndarray:
-        """Returns the matrices of all instances that one instancer places, or of the only mesh, shape [n, 4, 4]."""
+    def _read_transforms(self, instance, time) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what :meth:`Instancer.transforms` does of all instances, or one matrix for a mesh that is none."""
         if instance:
             return instance.instancer.transforms(self._frame, instance.root, time)
-        return np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))[None]
+        transform = np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
+        if not are_finite(self._masking, time):
+            transform[:] = np.nan
+        return transform[None], np.ones(1, dtype=bool)
 
     def _read_topology(self, time) -> list[np.ndarray]:
         """Reads counts, indices and holes at a time."""
@@ -570,19 +610,18 @@ class UsdMesh:
             raise UnreadableError(f"{self._where}: {name} is no list of integers")
         return array.astype(np.int64)
 
-    def _is_present(self, time) -> bool:
-        """Returns whether the prim is visible and not empty, wherever it is placed."""
-        if not is_shown(self._prim, self._root, time):
-            return False
-        # A mesh may be empty for some time, as where a fluid has not begun to flow.
-        values = self._polygons.read_points(time), self._polygons.read_topology(time)[0]
-        return not all(value is not None and _is_empty(value) for value in values)
-
     def _topology_digest(self, time) -> bytes:
         digest = hashlib.blake2b()
         for values in self._read_topology(time):
             digest.update(len(values).to_bytes(8, "little") + values.tobytes())
         return digest.digest()
+
+
+def _has_clips(prim) -> bool:
+    """Returns whether values of a prim may come from value clips."""
+    return any(
+        prim.GetStage().GetPrimAtPath(path).HasAuthoredMetadata("clips") for path in prim.GetPath().GetPrefixes()
+    )
 
 
 def _is_empty(value) -> bool:

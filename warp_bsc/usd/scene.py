@@ -36,9 +36,9 @@ stored ones, in single precision; otherwise all are computed and returned in dou
 
 What cannot be read
 -------------------
-Broken meshes and instances, and files that cannot be opened, are left out from the time on at which they are broken,
-and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene in which nothing ever
-moves is read at one time.
+Broken meshes and instances, and files that cannot be opened and may hold geometry, are left out from the time on at
+which they are broken, and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene
+in which nothing ever moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that this module does not read (other curves and shapes without polygons,
 unselected meshes) and the changes that it makes to the motion.
@@ -50,14 +50,14 @@ unselected meshes) and the changes that it makes to the motion.
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from numbers import Integral
 
 import numpy as np
 
-from .._arguments import check_instance, checked_flag, checked_integer, checked_number, given
+from .._arguments import check_instance, checked_flag, checked_integer, checked_number, checked_strings, given
 from .._one_thread import one_at_a_time
 from .files import SceneFiles
 from .interval import (
@@ -190,6 +190,7 @@ class Scene:
         subdivide: int = 1,
         sample_turns: bool = True,
         strict: bool = False,
+        allow_missing: Iterable[str] = (),
         progress: Callable[[int, int], None] | None = None,
     ):
         """Opens the file and finds its meshes.
@@ -202,6 +203,11 @@ class Scene:
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
+            allow_missing: Patterns of files, and of prims, that may be missing: a warning names them, and they neither
+                are in :attr:`left_out` nor an error. ``*`` matches any text. A pattern is matched with the path of a
+                missing file, its end from any folder on, and the path of the prim that refers to it or to a missing
+                prim; it includes the prims below. Files that cannot hold geometry, such as materials and textures,
+                always may be missing.
             progress: Called while vertices are welded, which reads the scene once: with the number of its times that
                 have been compared, and of all.
 
@@ -224,6 +230,7 @@ class Scene:
             checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
             checked_flag(sample_turns, "sample_turns"),
             checked_flag(strict, "strict"),
+            checked_strings(allow_missing, "allow_missing"),
         )
         self._open(path, options, _Revealed(), progress)
 
@@ -245,7 +252,7 @@ class Scene:
         self.path = str(path)
         self.selection = options.selection or Selection()
         self._unreadable = usd_stage.UnreadableError
-        self._left_out = usd_stage.LeftOut(path, options.strict)
+        self._left_out = usd_stage.LeftOut(path, options.strict, options.allow_missing)
         self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
         self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
@@ -296,6 +303,9 @@ class Scene:
         if len(self.left_out) > _NAMED:
             warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
         warnings += map(message_warning, self._messages[:_NAMED])
+        warnings += self._left_out.notes[:_NAMED]
+        if len(self._left_out.notes) > _NAMED:
+            warnings.append(f"missing: {len(self._left_out.notes) - _NAMED} more, {len(self._left_out.notes)} in all")
         warnings += self._warnings
         warnings += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
@@ -454,6 +464,7 @@ class Scene:
         reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
         if not self._usd_meshes:
             none_selected = ", or none is selected" * is_selection
+            reason = reason or "".join(f"; {warning}" for warning in self._warnings[:1])
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
@@ -490,7 +501,7 @@ class Scene:
         since = max(index, self.times.index(error.time) - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
         self._apply(LeftOutMesh(error.mesh.name, since, self.left_out[-1]))
-        if not any(mesh.times and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
+        if not any((mesh.times or self.is_still) and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
             raise error
 
     def _apply(self, part: LeftOutMesh) -> None:
@@ -545,6 +556,7 @@ class _Options:
     subdivide: int
     sample_turns: bool
     strict: bool
+    allow_missing: tuple[str, ...]
 
 
 @dataclass(frozen=True)

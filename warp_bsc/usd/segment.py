@@ -486,9 +486,9 @@ class _Reader:
         singles = list(self._single)
         for members, instances, rows, taken in self._groups:
             first, count, *_ = members[0]
-            together = first.read_instances(time, instances, before=before)
-            found = together.reshape(-1, 3)[taken] if together.shape[1] == count else np.full((1, 3), np.nan)
-            if np.isfinite(found).all():
+            together = first.read_instances(time, instances, count, before=before)
+            found = None if together is None else together.reshape(-1, 3)[taken]
+            if found is not None and np.isfinite(found).all():
                 positions[rows] = found
             else:
                 singles += members  # one of them is broken, and says so

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .._arguments import checked_choice, checked_flag, given
+from .._arguments import checked_choice, checked_flag, checked_strings, given
 
 __all__ = ["PURPOSES", "NamedMesh", "Selection"]
 
@@ -62,8 +62,8 @@ class Selection:
         """Checks the attributes, and makes tuples and sets of them."""
         checked: dict[str, object] = {}
         for name in ("prims", "exclude", "purposes"):
-            checked[name] = _checked_strings(getattr(self, name), name)
-        for purpose in _checked_strings(self.purposes, "purposes"):
+            checked[name] = checked_strings(getattr(self, name), name)
+        for purpose in checked_strings(self.purposes, "purposes"):
             checked_choice(purpose, "purposes", PURPOSES)
         checked["self_collisions"] = checked_flag(self.self_collisions, "self_collisions")
         if self.between is not None:
@@ -136,18 +136,8 @@ class Selection:
         return counted
 
 
-def _checked_strings(values, name) -> tuple[str, ...]:
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
-    values = tuple(values)
-    for value in values:
-        if not isinstance(value, str):
-            raise TypeError(f"{name} must be a tuple of strings, not {given(values)}")
-    return values
-
-
 def _checked_pair(values, name) -> tuple[str, str]:
-    pair = _checked_strings(values, name)
+    pair = checked_strings(values, name)
     if len(pair) != 2:
         raise ValueError(f"{name} must have two strings a pair, not {given(pair)}")
     return pair[0], pair[1]

@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import numpy as np
 from pxr import Sdf, Usd, UsdSkel, Vt
 
 from .stage import UnreadableError, may_jump, sample_times
@@ -34,9 +35,13 @@ class Skin:
         prim = skinning.GetPrim()
         self._blend_shapes: UsdSkel.BlendShapeQuery | None = None
         if skinning.HasBlendShapes() and self._animation:
-            self._blend_shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
+            self._blend_shapes = query = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
+            inbetweens = filter(None, map(query.GetInbetween, range(query.GetNumSubShapes())))
+            if not np.isfinite([shape.GetWeight() or 0.0 for shape in inbetweens]).all():  # OpenUSD skips these
+                raise UnreadableError(f"{where}: the weight of an in-between of its blend shapes is not finite")
         # The query's own prim is that of the prototype if the skeleton is in an instance.
         self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
+        self._broken_joints = _find_broken_joints(skeleton_query) if self.skeleton else []
         self.times = set()
         animated = list(self._animation.GetPrim().GetAttributes()) if self._animation else []
         if self._animation:
@@ -60,9 +65,20 @@ class Skin:
         if self._blend_shapes:
             self._apply_blend_shapes(self._blend_shapes, points, time)
         if self.skeleton:
+            self._check_joints(time)
             transforms = self._query.ComputeSkinningTransforms(time)
             if not transforms or not self._skinning.ComputeSkinnedPoints(transforms, points, time):
                 raise UnreadableError(f"{self._where}: the binding to {self.skeleton.GetPath()} is broken")
+
+    def _check_joints(self, time):
+        """Raises an UnreadableError if the points follow a joint with a broken bind transform."""
+        if self._broken_joints:
+            indices, weights = map(np.array, self._skinning.ComputeJointInfluences(time))
+            order = self._skinning.GetJointOrder() or self._query.GetJointOrder()
+            used = {order[index] for index in indices[weights != 0.0].tolist() if 0 <= index < len(order)}
+            for joint in self._broken_joints:
+                if joint in used:
+                    raise UnreadableError(f"{self._where}: the bind transform of joint {joint} has no inverse")
 
     def _apply_blend_shapes(self, query, points, time):
         weights = self._animation.ComputeBlendShapeWeights(time)
@@ -78,6 +94,16 @@ class Skin:
     def _add_times(self, times):
         if len(times) > 1:
             self.times.update(times)
+
+
+def _find_broken_joints(query: UsdSkel.SkeletonQuery) -> list[str]:
+    """Returns the joints whose bind transforms have no inverse, for which OpenUSD takes an arbitrary large matrix."""
+    joints, transforms = query.GetJointOrder(), query.GetJointWorldBindTransforms()
+    return [
+        joint
+        for joint, transform in zip(joints, transforms, strict=False)  # numbers that differ break the binding anyway
+        if transform.GetDeterminant() == 0.0 or not np.isfinite(np.array(transform)).all()
+    ]
 
 
 def find_bindings(root: Usd.Prim) -> dict[Sdf.Path, tuple]:

@@ -6,13 +6,15 @@
 import contextlib
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pxr import Ar, Gf, Tf, Ts, Usd, UsdUtils
+from pxr import Ar, Gf, Tf, Ts, Usd, UsdShade, UsdUtils
 
 if TYPE_CHECKING:
     from .meshes import UsdMesh
@@ -29,6 +31,23 @@ __all__ = [
 ]
 
 _DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
+# What OpenUSD says of a missing file or prim; its classes do not tell Python.
+_MISSING = re.compile(
+    r"(Could not open asset|Could not load sublayer|Unresolved \w+ prim path) @(?P<asset>.+?)@"
+    r"(.* introduced by @.*@<(?P<prim>.+?)>)?",
+    re.DOTALL,
+)
+_NO_GEOMETRY = frozenset(
+    f".{extension}"
+    for kinds in (
+        "mtlx osl oso glsl glslfx hlsl mdl sl args",  # materials
+        "png jpg jpeg tif tiff exr hdr tga bmp gif tx tex rat dds ktx ktx2 webp avif heic psd pic rgb svg",
+        "ies ocio cube lut icc spi1d spi3d",  # lights and colours
+        "wav mp3 m4a aac aif aiff ogg flac mp4 mov avi",
+        "txt md json html pdf",
+    )
+    for extension in kinds.split()
+)
 _STILL = (Ts.ExtrapHeld, Ts.ExtrapValueBlock)
 _PROBES = 8  # parts of a piece of a spline; at their ends the spline is compared with the straight line
 _BEND = 0.01  # largest distance of a piece from the straight line, as a share of the spline's range of values
@@ -56,13 +75,22 @@ class LeftOut:
     Attributes:
         is_strict: Whether leaving out is forbidden.
         reasons: The parts left out and why, a sentence each.
+        notes: What is missing and need not be there, a sentence each.
     """
 
-    def __init__(self, file: str | os.PathLike, is_strict: bool):
-        """Starts with nothing left out; sentences do not repeat the file's name."""
+    def __init__(self, file: str | os.PathLike, is_strict: bool, allow_missing: tuple[str, ...] = ()):
+        """Starts with nothing left out; sentences do not repeat the file's name.
+
+        Args:
+            file: The file.
+            is_strict: Whether leaving out is forbidden.
+            allow_missing: As of :class:`~warp_bsc.usd.scene.Scene`.
+        """
         self._prefix = f"{file}: "
+        self._allow_missing = allow_missing
         self.is_strict = is_strict
         self.reasons: list[str] = []
+        self.notes: list[str] = []
 
     def add(self, error: UnreadableError, since: str = "") -> None:
         """Leaves out the part that an error is about.
@@ -77,6 +105,23 @@ class LeftOut:
         if self.is_strict:
             raise error
         self.reasons.append(since + str(error).removeprefix(self._prefix))
+
+    def add_missing(self, error: UnreadableError, prim: Usd.Prim, asset: str = "") -> None:
+        """Leaves out what a missing file or prim would hold; only notes it where that is no geometry, or is allowed.
+
+        Args:
+            error: The error.
+            prim: The prim that refers to it; it may be invalid.
+            asset: The path of the file, empty if a prim is missing.
+
+        Raises:
+            UnreadableError: As of :meth:`add`.
+        """
+        names = [asset, str(prim.GetPath())] if prim else [asset]
+        if _is_no_geometry(asset, prim) or any(_may_be_missing(name, self._allow_missing) for name in names if name):
+            self.notes.append(f"missing: {str(error).removeprefix(self._prefix)}")
+        else:
+            self.add(error)
 
 
 @contextlib.contextmanager
@@ -149,8 +194,33 @@ def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
             if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD would search for samples for ever
                 raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
     for error in stage.GetCompositionErrors():
-        left_out.add(UnreadableError(f"{path}: {_one_line(str(error))}"))
+        unreadable = UnreadableError(f"{path}: {_one_line(str(error))}")
+        if missing := _MISSING.search(str(error)):
+            prim = stage.GetPrimAtPath(missing["prim"]) if missing["prim"] else Usd.Prim()
+            left_out.add_missing(unreadable, prim, missing["asset"].split(":SDF_FORMAT_ARGS:")[0])
+        else:
+            left_out.add(unreadable)
     return stage
+
+
+def _is_no_geometry(asset: str, prim: Usd.Prim) -> bool:
+    """Returns whether a missing file cannot hold geometry: by its name, or as a prim of a material refers to it."""
+    inner = asset.rstrip("]").rpartition("[")[2]  # of a package
+    if os.path.splitext(inner)[1].lower() in _NO_GEOMETRY:
+        return True
+    while prim:
+        if prim.IsA(UsdShade.NodeGraph) or prim.IsA(UsdShade.Shader):  # materials are node graphs
+            return True
+        prim = prim.GetParent()
+    return False
+
+
+def _may_be_missing(name: str, patterns: tuple[str, ...]) -> bool:
+    """Returns whether the name of a file, its end from a folder on, the path of a prim, or of one above it, matches."""
+    forms = (
+        form for pattern in patterns for form in (pattern, f"{pattern.rstrip('/')}/*", f"*/{pattern.lstrip('./')}")
+    )
+    return any(fnmatchcase(name, form) for form in forms)
 
 
 def sample_times(*attributes: Usd.Attribute) -> set[float]:

@@ -1,0 +1,44 @@
+"""The exit statuses of all commands, and the part of their help texts on these. Imports little."""
+
+import textwrap
+from enum import IntEnum
+
+__all__ = ["ExitStatus", "explain_statuses"]
+
+
+class ExitStatus(IntEnum):
+    """An exit status. After a signal it is 128 plus the number of the signal."""
+
+    DONE = 0
+    FOUND = 1
+    ERROR = 2
+    DISAGREES = 3
+    LEFT_OUT = 4
+    BROKEN_PIPE = 141
+
+
+_TEXTS = {
+    ExitStatus.DONE: "done",
+    ExitStatus.FOUND: "done, and found what --fail-on names",
+    ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error says what and where",
+    ExitStatus.DISAGREES: "replay --validate found a wrong answer",
+    ExitStatus.LEFT_OUT: "replay is done, but parts of the scene that may hold geometry could not be read and were "
+    "left out; replay --strict ends with 2 instead",
+    ExitStatus.BROKEN_PIPE: "the reader of the output has closed it, as head -1 does",
+}
+_SIGNALS = "  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM"
+
+
+def explain_statuses(*statuses: ExitStatus) -> str:
+    """Returns the part of a help text on the exit statuses: the given ones, and those that every command has."""
+    lines = ["exit status:"]
+    for status in sorted({ExitStatus.DONE, ExitStatus.ERROR, *statuses} - {ExitStatus.BROKEN_PIPE}):
+        lines += _wrap(status)
+    lines += [_SIGNALS, *_wrap(ExitStatus.BROKEN_PIPE)]
+    if ExitStatus.LEFT_OUT in statuses:
+        lines.append("If several apply, a signal comes before 2, then 3, 1 and 4.")
+    return "\n".join(lines)
+
+
+def _wrap(status: ExitStatus) -> list[str]:
+    return textwrap.wrap(f"{status:d}  {_TEXTS[status]}", 80, initial_indent="  ", subsequent_indent="     ")
