@@ -10,6 +10,7 @@ from newton.solvers.experimental.coupled import CouplingInterface
 from .bodies import inertia_at
 from .buffers import Motion, Vertices
 from .constraints import to_double, to_single
+from .model_motion import ModelMotion, continues
 
 __all__ = ["CouplingHooks"]
 
@@ -19,17 +20,22 @@ _KERNEL = {"enable_backward": False}
 @wp.kernel(**_KERNEL)
 def _find_starts(
     # in
+    motion: Motion,
     ends: wp.array[Any],
+    world: wp.array[int],
     flags: wp.array[int],
     proxy: int,
     places: wp.array[Any],
     # out
     starts: wp.array[Any],
 ):
-    """Writes where bodies or particles start: proxies where the last step ended, others where they are."""
+    """Writes where bodies or particles start: proxies where the last step ended, others where they are.
+
+    So are proxies in a world in which no step has ended yet, or that was reset.
+    """
     i = wp.tid()
     starts[i] = places[i]
-    if flags[i] & proxy != 0:
+    if flags[i] & proxy != 0 and continues(motion, world[i]):
         starts[i] = ends[i]
 
 
@@ -95,6 +101,7 @@ class CouplingHooks(CouplingInterface):
 
     solver: SolverBase
 
+    _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
 
     def _hook(self, name):
@@ -103,26 +110,14 @@ class CouplingHooks(CouplingInterface):
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation."""
         self._hook("coupling_notify_iteration_restarts")(enabled)
-        self._coupled = _Coupled(self.model)
+        self._coupled = _Coupled(self.model, self._motion, restarts=enabled)
 
     def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
         """Delegates to the inner solver; in a step, makes proxies move from where they were at the end of the last."""
         options = {"iteration_restart": iteration_restart, "dt": dt}
         self._hook("coupling_notify_input_state_update")(state, flags, **options)
         if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
-            self._coupled.update_input(state, **options)
-
-    def coupling_rewind_proxy_body(self, *arguments, **options) -> None:
-        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
-        self._hook("coupling_rewind_proxy_body")(*arguments, **options)
-        if self._coupled is not None:
-            self._coupled.body_impulses.zero_()
-
-    def coupling_rewind_proxy_particle(self, *arguments, **options) -> None:
-        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
-        self._hook("coupling_rewind_proxy_particle")(*arguments, **options)
-        if self._coupled is not None:
-            self._coupled.particle_impulses.zero_()
+            self._coupled.update_input(**options)
 
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
@@ -159,22 +154,34 @@ for _name in dir(CouplingInterface):
 
 
 class _Coupled:
-    """What a stage keeps for a coupler: where proxies were, and the impulses on them."""
+    """What a stage keeps for a coupler: where proxies were, where a step began, and the impulses on proxies."""
 
-    def __init__(self, model):
-        self._model, device = model, model.device
+    def __init__(self, model, motion, *, restarts):
+        self._model, self._motion, device = model, motion, model.device
         self._last, self._first, self._start = model.state(), model.state(), model.state()
         self._continues = False
+        starts = motion.starts() if restarts else []
+        self._starts = [(start, wp.clone(start)) for start in starts]
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
-    def update_input(self, state, *, iteration_restart, dt):
-        """Notes that a coupler has set positions: for a step of length ``dt``, or at a reset where that is 0."""
-        if dt <= 0.0:
-            _copy_positions(self._last, state)
-        elif not iteration_restart and not self._continues:
+    def update_input(self, *, iteration_restart, dt):
+        """Notes that a coupler has set positions for a pass over a step of length ``dt``; 0 where it has for a reset.
+
+        Each pass begins where the first one did, also where that is not where the positions are.
+        """
+        if dt <= 0.0:  # ``reset`` interrupts the motion
+            return
+        if iteration_restart:
+            for start, kept in self._starts:
+                wp.copy(start, kept)
+        elif not self._continues:
             _copy_positions(self._first, self._last)
-        self._continues = dt > 0.0
+            for start, kept in self._starts:
+                wp.copy(kept, start)
+        self._continues = True
+        self.body_impulses.zero_()  # those of an earlier pass
+        self.particle_impulses.zero_()
 
     def start_of(self, state):
         """Returns the state that a step starts from, as far as positions go, given that which it is called with."""
@@ -182,11 +189,13 @@ class _Coupled:
             return state
         self._continues = False
         model, first, start = self._model, self._first, self._start
-        bodies = first.body_q, model.body_flags, int(BodyFlags.PROXY), state.body_q, start.body_q
-        particles = first.particle_q, model.particle_flags, int(ParticleFlags.PROXY), state.particle_q, start.particle_q
-        for count, inputs in ((model.body_count, bodies), (model.particle_count, particles)):
-            if count:
-                wp.launch(_find_starts, count, inputs=inputs, device=model.device)
+        bodies = first.body_q, model.body_world, model.body_flags, int(BodyFlags.PROXY), state.body_q
+        particles = first.particle_q, model.particle_world, model.particle_flags, int(ParticleFlags.PROXY)
+        particles += (state.particle_q,)
+        for arrays, starts in ((bodies, start.body_q), (particles, start.particle_q)):
+            if starts is not None:
+                inputs = [self._motion.vertices, *arrays]
+                wp.launch(_find_starts, len(starts), inputs=inputs, outputs=[starts], device=model.device)
         return start
 
     def finish(self, state, motion, vertices):
