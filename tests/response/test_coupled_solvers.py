@@ -155,6 +155,35 @@ def test_each_pass_over_a_step_sweeps_the_way_of_an_animated_body(iterations, de
     assert start.particle_q.numpy()[:, 2].max() > 0.04
 
 
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
+    """Each entry sees the other at its start: two patches swap sides in a step, and both are pushed back in the next."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.03, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 5.0))
+    add_patch(builder, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -5.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    parts = np.split(np.arange(model.particle_count), 2)
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    own = [SolverCoupled.Entry(name=str(i), solver=make, particles=parts[i].tolist()) for i in range(2)]
+    solver = SolverCoupledADMM(model, own, SolverCoupledADMM.Config(iterations=iterations))
+    start, end = model.state(), model.state()
+    gaps = []
+    for _ in range(8):
+        start.clear_forces()
+        solver.step(start, end, None, None, DT)
+        start, end = end, start
+        lower, upper = (start.particle_q.numpy()[part, 2].mean() for part in parts)
+        gaps.append(upper - lower)
+    assert gaps[2] < -0.01 and min(gaps[3:]) > 0.01
+    assert all(stage.report.uncertified_steps == 0 and stage.report.crossings == 0 for stage in stages)
+
+
 @pytest.mark.parametrize("resets", [False, True])
 def test_proxies_start_where_a_program_sets_them_first(resets, device):
     """A ball that begins, or is put by a reset, below a sheet has not passed it on its way from anywhere else."""

@@ -101,9 +101,9 @@ class StageTotals:
     """Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`.
 
     A stage behind an entry of a coupled solver takes a step for each substep of the entry and each pass of the coupler.
-    It certifies the motion in the view of its entry: that of the entry's own particles and of proxies. Particles of
-    other entries, where they have no proxies, are in the view if their faces are, at the start of the step, and so are
-    the shapes that the entry sees.
+    It certifies the motion in the view of its entry, which has the entry's own particles, proxies, the shapes that the
+    entry sees, and where they were at the start of the step, other entries' particles; crossings are counted in the
+    whole model.
 
     Attributes:
         steps: Steps.

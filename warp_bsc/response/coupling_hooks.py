@@ -85,15 +85,23 @@ class CouplingHooks(CouplingInterface):
 
     Hooks are those of the inner solver, or those that the interface derives from the model if it has none, with two
     additions. A proxy, which the coupler sets to the pose of its source before a step, moves from where it was at the
-    end of the last step: so nothing is passed where the two differ. And what the response changes of the momentum of a
-    proxy is fed back to its source, also by inner solvers that harvest only the forces of their own contacts.
+    end of the last step: so nothing is passed where the two differ. Each pass of a coupler over a step begins where the
+    first one did. And what the response changes of the momentum of a proxy is fed back to its source, also by inner
+    solvers that harvest only the forces of their own contacts.
 
-    The source feels these impulses a step late. If a contact stops a proxy outright, as one of a finger and cloth on
+    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, as one of a finger and cloth on
     another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the source along
     the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may be more:
     choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in each step
     behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy to its
     source for a velocity: the two bounce apart.
+
+    The stage resolves and certifies the motion in the view of its entry: that of the entry's own particles, of proxies,
+    and of the shapes that the entry sees. Particles of another entry without proxies are obstacles if the view has
+    their faces. They take the way of the last step in the present one: two entries may pass through each other in one
+    step, and are pushed back in the next. The report counts a step for each substep of the entry and each pass.
+    ``SolverCoupledADMM`` takes hard attachments of bodies to particles for those of one entry only if its solver is
+    ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
 
     Attributes:
         solver: The inner solver.
