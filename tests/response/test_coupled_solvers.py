@@ -157,7 +157,7 @@ def test_each_pass_over_a_step_sweeps_the_way_of_an_animated_body(iterations, de
 
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
-    """Each entry sees the other at its start: two patches swap sides in a step, and both are pushed back in the next."""
+    """Each entry sees the other at its start: two patches swap sides in a step, and are pushed back in the next."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(builder, 8, 0.03, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 5.0))
     add_patch(builder, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -5.0))

@@ -89,12 +89,12 @@ class CouplingHooks(CouplingInterface):
     first one did. And what the response changes of the momentum of a proxy is fed back to its source, also by inner
     solvers that harvest only the forces of their own contacts.
 
-    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, as one of a finger and cloth on
-    another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the source along
-    the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may be more:
-    choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in each step
-    behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy to its
-    source for a velocity: the two bounce apart.
+    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, as one of a finger and
+    cloth on another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the
+    source along the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may
+    be more: choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in
+    each step behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy
+    to its source for a velocity: the two bounce apart.
 
     The stage resolves and certifies the motion in the view of its entry: that of the entry's own particles, of proxies,
     and of the shapes that the entry sees. Particles of another entry without proxies are obstacles if the view has
