@@ -155,6 +155,47 @@ def test_each_pass_over_a_step_sweeps_the_way_of_an_animated_body(iterations, de
     assert start.particle_q.numpy()[:, 2].max() > 0.04
 
 
+def test_a_captured_graph_steps_as_the_solver_does(device):
+    """A box that turns: its proxy's rotation, too, starts where the last step ended."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    pose, inertia = wp.transform(wp.vec3(0.013, 0.007, 0.06), wp.quat_identity()), wp.mat33(5e-4 * np.eye(3))
+    body = builder.add_body(xform=pose, mass=0.5, inertia=inertia, lock_inertia=True)
+    builder.add_shape_box(body, hx=0.05, hy=0.05, hz=0.05, cfg=newton.ModelBuilder.ShapeConfig(density=0.0))
+    add_patch(builder, 8, 0.03, (0.0, 0.0, 0.0), fixed=True)
+    builder.color()
+    ends = []
+    for captured in (False, True):
+        model = builder.finalize(device=device)
+        model.body_qd.assign(np.float32([[0.0, 0.0, -1.0, 2.0, 1.0, 0.0]]))
+        stages = []
+
+        def make(view, stages=stages):
+            stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+            return stages[-1]
+
+        proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[body])]
+        solver = SolverCoupledProxy(
+            model, entries(model, newton.solvers.SolverSemiImplicit, make), SolverCoupledProxy.Config(proxies=proxies)
+        )
+        states, control = (model.state(), model.state()), model.control()
+
+        def step_twice(solver=solver, states=states, control=control):
+            for start, end in (states, states[::-1]):
+                start.clear_forces()
+                solver.step(start, end, control, None, DT)
+
+        if captured:
+            with wp.ScopedCapture(device) as capture:
+                step_twice()
+        for _ in range(6):
+            wp.capture_launch(capture.graph) if captured else step_twice()
+        report = stages[0].report
+        assert (report.steps, report.uncertified_steps, report.crossings) == (12, 0, 0)
+        ends.append(np.concatenate([states[0].body_q.numpy().ravel(), states[0].particle_q.numpy().ravel()]))
+    assert ends[0][2] < 0.04
+    np.testing.assert_array_equal(*ends)
+
+
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
     """Each entry sees the other at its start: two patches swap sides in a step, and are pushed back in the next."""

@@ -1,7 +1,5 @@
 """The hooks of Newton's coupled solvers for a stage behind another solver: that solver's, and what the stage adds."""
 
-from typing import Any
-
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers import SolverBase
@@ -17,26 +15,34 @@ __all__ = ["CouplingHooks"]
 _KERNEL = {"enable_backward": False}
 
 
-@wp.kernel(**_KERNEL)
-def _find_starts(
-    # in
-    motion: Motion,
-    ends: wp.array[Any],
-    world: wp.array[int],
-    flags: wp.array[int],
-    proxy: int,
-    places: wp.array[Any],
-    # out
-    starts: wp.array[Any],
-):
-    """Writes where bodies or particles start: proxies where the last step ended, others where they are.
+def _make_find_starts(kind: type) -> wp.Kernel:
+    """Returns the kernel below for poses or positions: of a generic one, a graph on the CPU runs the wrong overload."""
 
-    So are proxies in a world in which no step has ended yet, or that was reset.
-    """
-    i = wp.tid()
-    starts[i] = places[i]
-    if flags[i] & proxy != 0 and continues(motion, world[i]):
-        starts[i] = ends[i]
+    @wp.kernel(**_KERNEL, module="unique")
+    def find_starts(
+        # in
+        motion: Motion,
+        ends: wp.array[kind],
+        world: wp.array[int],
+        flags: wp.array[int],
+        proxy: int,
+        places: wp.array[kind],
+        # out
+        starts: wp.array[kind],
+    ):
+        """Writes where bodies or particles start: proxies where the last step ended, others where they are.
+
+        So are proxies in a world in which no step has ended yet, or that was reset.
+        """
+        i = wp.tid()
+        starts[i] = places[i]
+        if flags[i] & proxy != 0 and continues(motion, world[i]):
+            starts[i] = ends[i]
+
+    return find_starts
+
+
+_find_starts_of_bodies, _find_starts_of_particles = _make_find_starts(wp.transform), _make_find_starts(wp.vec3)
 
 
 @wp.kernel(**_KERNEL)
@@ -60,19 +66,27 @@ def _add_impulses(
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 
 
-@wp.kernel(**_KERNEL)
-def _add_forces(
-    # in
-    impulses: wp.array[Any],
-    proxy: wp.array[int],
-    dt: float,
-    # out
-    forces: wp.array[Any],
-):
-    """Adds the forces that make impulses on bodies or particles in a step, to the places of their proxies."""
-    i = wp.tid()
-    if proxy[i] >= 0:
-        wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+def _make_add_forces(kind: type) -> wp.Kernel:
+    """Returns the kernel below for wrenches or forces, see :func:`_make_find_starts`."""
+
+    @wp.kernel(**_KERNEL, module="unique")
+    def add_forces(
+        # in
+        impulses: wp.array[kind],
+        proxy: wp.array[int],
+        dt: float,
+        # out
+        forces: wp.array[kind],
+    ):
+        """Adds the forces that make impulses on bodies or particles in a step, to the places of their proxies."""
+        i = wp.tid()
+        if proxy[i] >= 0:
+            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+
+    return add_forces
+
+
+_add_wrenches, _add_forces = _make_add_forces(wp.spatial_vector), _make_add_forces(wp.vec3)
 
 
 def _is_default(solver, hook):
@@ -130,19 +144,19 @@ class CouplingHooks(CouplingInterface):
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
         hook = "coupling_harvest_proxy_wrenches"
-        self._harvest(hook, "body_impulses", body_local_to_proxy_global, out_body_f, options)
+        self._harvest(hook, _add_wrenches, "body_impulses", body_local_to_proxy_global, out_body_f, options)
 
     def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
         hook = "coupling_harvest_proxy_particle_forces"
-        self._harvest(hook, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
+        self._harvest(hook, _add_forces, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
 
-    def _harvest(self, hook, name, proxy, forces, options):
+    def _harvest(self, hook, kernel, name, proxy, forces, options):
         self._hook(hook)(proxy, forces, **options)
         if self._coupled is not None and not _is_default(self.solver, hook):  # that sees the changed velocities
             impulses = getattr(self._coupled, name)
             inputs = [impulses, proxy, options["dt"]]
-            wp.launch(_add_forces, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
+            wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
 
 
 def _delegate(name):
@@ -200,10 +214,13 @@ class _Coupled:
         bodies = first.body_q, model.body_world, model.body_flags, int(BodyFlags.PROXY), state.body_q
         particles = first.particle_q, model.particle_world, model.particle_flags, int(ParticleFlags.PROXY)
         particles += (state.particle_q,)
-        for arrays, starts in ((bodies, start.body_q), (particles, start.particle_q)):
+        for kernel, arrays, starts in (
+            (_find_starts_of_bodies, bodies, start.body_q),
+            (_find_starts_of_particles, particles, start.particle_q),
+        ):
             if starts is not None:
                 inputs = [self._motion.vertices, *arrays]
-                wp.launch(_find_starts, len(starts), inputs=inputs, outputs=[starts], device=model.device)
+                wp.launch(kernel, len(starts), inputs=inputs, outputs=[starts], device=model.device)
         return start
 
     def finish(self, state, motion, vertices):
