@@ -9,7 +9,6 @@ import newton.examples
 import newton.utils
 import pytest
 import warp as wp
-from newton.solvers.experimental.coupled import SolverCoupled
 
 from warp_bsc.bench import newton_examples
 from warp_bsc.bench.newton_examples import WARM_UP, NewtonExample, describe_needs, find_examples, measure_example
@@ -24,6 +23,7 @@ FALLING_TRIANGLE = """
     import newton.examples
     import warp as wp
     from newton.solvers import SolverXPBD
+    from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledADMM
 
 
     class Derived(SolverXPBD):
@@ -44,8 +44,14 @@ FALLING_TRIANGLE = """
             for corners in ((0, 1, 2), (0, 2, 3), (4, 5, 6)):
                 builder.add_triangle(*corners)
             self.model = builder.finalize()
-            self.solver = (Derived if args.derived else SolverXPBD)(self.model, iterations=1)
-            assert isinstance(self.solver, SolverXPBD) and not isinstance(self.model, SolverXPBD)
+            if args.coupled:  # the sheet and the triangle by a solver each, in two passes a step
+                make = lambda view: SolverXPBD(view, iterations=1)
+                parts = {"sheet": [0, 1, 2, 3], "triangle": [4, 5, 6]}
+                entries = [SolverCoupled.Entry(name=name, solver=make, particles=parts[name]) for name in parts]
+                self.solver = SolverCoupledADMM(self.model, entries, SolverCoupledADMM.Config(iterations=2))
+            else:
+                self.solver = (Derived if args.derived else SolverXPBD)(self.model, iterations=1)
+                assert isinstance(self.solver, SolverXPBD) and not isinstance(self.model, SolverXPBD)
             self.state_0, self.state_1 = self.model.state(), self.model.state()
             self.frames = 0
 
@@ -70,6 +76,7 @@ FALLING_TRIANGLE = """
         parser.add_argument("--height", type=float, default=0.055)
         parser.add_argument("--speed", type=float, default=1.0)
         parser.add_argument("--derived", action="store_true")
+        parser.add_argument("--coupled", action="store_true")
         parser.add_argument("--note")
         parser.set_defaults(num_frames=8)
         viewer, args = newton.examples.init(parser)
@@ -97,7 +104,6 @@ def in_this_process(monkeypatch, tmp_path):
         (newton.examples, "run"),
         (newton.examples, "download_external_git_folder"),
         (newton.utils, "download_asset"),
-        (SolverCoupled, "__init__"),
         (sys, "argv"),
         *((newton.solvers, name) for name in newton_examples._SOLVERS),
     ):
@@ -167,6 +173,11 @@ def test_what_an_example_lacks_is_known_before_it_runs():
     [
         ("raise RuntimeError('the string broke\\nat its end')", "failed: RuntimeError: the string broke"),
         ("import nowhere_to_be_found", "needs the package nowhere_to_be_found"),
+        (
+            "try:\n    import nowhere_to_be_found\nexcept ImportError as error:\n"
+            "    raise ImportError('no backend') from error",
+            "needs the package nowhere_to_be_found",
+        ),
         ("import newton.utils as u; getattr(u, 'download' + '_asset')('shirt')", "needs a download: shirt"),
         ("print('{}')", "not applicable: it does not call newton.examples.run"),
         (
@@ -175,7 +186,7 @@ def test_what_an_example_lacks_is_known_before_it_runs():
             "not applicable: it has neither cloth nor soft bodies",
         ),
     ],
-    ids=["error", "package", "download", "no frames", "no cloth"],
+    ids=["error", "package", "backend", "download", "no frames", "no cloth"],
 )
 def test_an_example_that_fails_is_a_row(write_example, in_this_process, device, source, problem):
     assert fail(write_example(source), device=device) == problem
@@ -197,18 +208,20 @@ def test_a_process_that_ends_is_a_row(write_example, device, source, problem):
     assert fail(write_example(source), device=device) == problem
 
 
-@pytest.mark.slow
-def test_a_part_of_a_coupled_solver_is_not_applicable(in_this_process, device):
+def test_entries_of_a_coupled_example(in_this_process, device):
+    """Newton's own: a cloth of one solver that particles of another fall on, each with a stage."""
     (example,) = find_examples(["xpbd_vbd_coupled_solver"])
-    problem = fail(example, "stage", device=device)
-    assert problem == "not applicable: SolverCCD cannot be a part of SolverCoupledProxy"
+    found = measure(example, "stage", device=device, frames=3)
+    assert (found.particles, found.triangles, found.crossings_at_start, found.most_crossings) == (300, 392, 0, 0)
+    assert (found.stage.steps, found.stage.uncertified_steps) == (3 * 8 * 2, 0)  # eight steps a frame, two entries
+    assert found.test_final == "ok"
 
 
 def test_without_a_solver_the_stage_is_not_applicable(write_example, in_this_process, device):
     example = write_example(FALLING_TRIANGLE.replace("from newton.solvers import", "from newton._src.solvers import"))
     problem = fail(example, "stage", device=device)
     assert problem is not None
-    assert problem.startswith("not applicable: no solver is one of SolverVBD,")
+    assert problem.startswith("not applicable: no solver with particles is one of SolverVBD,")
 
 
 @pytest.mark.slow
@@ -231,15 +244,21 @@ def test_measures_a_triangle_that_falls_through_a_sheet(write_example, in_this_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("derived", [False, True])
-def test_measures_the_stage_that_stops_it(write_example, device, derived, request):
-    if derived:
+@pytest.mark.parametrize("option", ["", "--derived", "--coupled"])
+def test_measures_the_stage_that_stops_it(write_example, device, option, request):
+    if option:
         request.getfixturevalue("in_this_process")
-    options = ["--derived"] if derived else []
-    found = measure(write_example(FALLING_TRIANGLE, *options), "stage", device=device, check_every=1)
+    found = measure(write_example(FALLING_TRIANGLE, *filter(None, [option])), "stage", device=device, check_every=1)
     assert (found.crossings_at_start, found.most_crossings, found.first_frame_with_crossings) == (0, 0, None)
-    assert (found.stage.steps, found.stage.uncertified_steps) == (8, 0)
-    assert (type(newton.solvers.SolverXPBD) is type) != derived  # replaced only in that process
+    stages_and_passes = 2 * 2 if option == "--coupled" else 1
+    assert (found.stage.steps, found.stage.uncertified_steps) == (8 * stages_and_passes, 0)
+    assert (type(newton.solvers.SolverXPBD) is type) != bool(option)  # replaced only in that process
+
+
+@pytest.mark.slow
+def test_a_coupled_triangle_falls_without_the_stage(write_example, in_this_process, device):
+    found = measure(write_example(FALLING_TRIANGLE, "--coupled"), device=device, check_every=1)
+    assert (found.most_crossings, found.first_frame_with_crossings) == (2, 5)
 
 
 @pytest.mark.slow

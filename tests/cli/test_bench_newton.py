@@ -35,7 +35,7 @@ RUNS = {
     ("cloth_hanging --width 9", "plain"): measurement(
         test_final="particles are low [red]", test_post_step="deep", first_frame_not_finite=4
     ),
-    ("cloth_hanging --width 9", "stage"): "not applicable: SolverCCD cannot be a part of SolverCoupledProxy",
+    ("cloth_hanging --width 9", "stage"): "not applicable: no solver with particles is one of SolverVBD",
 }
 
 
@@ -79,7 +79,7 @@ def test_tables(capsys, monkeypatch, measured):
         "cloth_hanging --width 9, plain: test_post_step: deep",
         "cloth_hanging --width 9, plain: test_final: particles are low [red]",
         "cloth_hanging --width 9, plain: positions are not finite at the end of frame 4",
-        "cloth_hanging --width 9, stage: not applicable: SolverCCD cannot be a part of SolverCoupledProxy",
+        "cloth_hanging --width 9, stage: not applicable: no solver with particles is one of SolverVBD",
     ]
     assert not any("Interrupted" in line for line in lines)
 

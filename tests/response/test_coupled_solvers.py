@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledADMM, SolverCoupledProxy
-from newton_scenes import DT, SOLVERS, add_patch
+from newton_scenes import DT, SOLVERS, add_patch, bullet
 
 import warp_bsc as bsc
 
@@ -102,6 +102,158 @@ def test_a_body_hangs_on_cloth_over_a_sphere(device):
     assert np.linalg.norm(q - np.array(at), axis=1).min() > 0.098  # the sphere's surface is an inscribed mesh
     free_fall = -0.02 - 0.5 * 9.81 * (64 * DT) ** 2
     assert np.linalg.norm(q[corner] - pose[:3]) < 0.06 and pose[2] > 0.7 * free_fall
+
+
+def test_particles_feel_the_impulses_of_a_pass_once(device):
+    """A coupler in staggered mode rewinds no particles: what a contact has fed back is not fed back again."""
+    model = bullet(30.0, device=device)
+    stage = bsc.SolverCCD(SOLVERS["vbd"](model))
+    stage.coupling_notify_iteration_restarts(False)
+    proxies = wp.array(np.arange(model.particle_count), dtype=int, device=device)
+    fed_back = []
+    for speed in (1.0, 0.0):
+        start, end = model.state(), model.state()
+        start.particle_qd.assign(speed * model.particle_qd.numpy())
+        before = wp.clone(start.particle_qd)
+        stage.coupling_notify_input_state_update(start, newton.StateFlags.PARTICLE, dt=DT)
+        stage.step(start, end, None, None, DT)
+        forces = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
+        options = {"particle_qd_before": before, "state": start, "state_out": end, "contacts": None, "dt": DT}
+        stage.coupling_harvest_proxy_particle_forces(proxies, forces, **options)
+        fed_back.append(np.abs(forces.numpy()).max())
+    assert fed_back[0] > 1.0 and fed_back[1] == 0.0
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_each_pass_over_a_step_sweeps_the_way_of_an_animated_body(iterations, device):
+    """A program moves a kinematic plate through a sheet between two steps: the sheet leaves ahead of it in any pass."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_body(xform=wp.transform(wp.vec3(0.01, 0.02, -0.03), wp.quat_identity()), is_kinematic=True)
+    builder.add_shape_box(body, hx=0.05, hy=0.05, hz=0.01)
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    particles, joints = list(range(model.particle_count)), list(range(model.joint_count))
+    entry = SolverCoupled.Entry(name="cloth", solver=make, bodies=[body], joints=joints, particles=particles)
+    solver = SolverCoupledADMM(model, [entry], SolverCoupledADMM.Config(iterations=iterations))
+    start, end = model.state(), model.state()
+    for height in (-0.03, -0.03, 0.03, 0.03):
+        pose = start.body_q.numpy()
+        pose[0, 2] = height
+        start.body_q.assign(pose)
+        start.clear_forces()
+        solver.step(start, end, None, None, DT)
+        start, end = end, start
+        report = stages[0].report
+        assert report.certified and (report.crossings, report.excluded) == (0, 0)
+    assert start.particle_q.numpy()[:, 2].max() > 0.04
+
+
+def test_a_captured_graph_steps_as_the_solver_does(device):
+    """A box that turns: its proxy's rotation, too, starts where the last step ended."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    pose, inertia = wp.transform(wp.vec3(0.013, 0.007, 0.06), wp.quat_identity()), wp.mat33(5e-4 * np.eye(3))
+    body = builder.add_body(xform=pose, mass=0.5, inertia=inertia, lock_inertia=True)
+    builder.add_shape_box(body, hx=0.05, hy=0.05, hz=0.05, cfg=newton.ModelBuilder.ShapeConfig(density=0.0))
+    add_patch(builder, 8, 0.03, (0.0, 0.0, 0.0), fixed=True)
+    builder.color()
+    ends = []
+    for captured in (False, True):
+        model = builder.finalize(device=device)
+        model.body_qd.assign(np.float32([[0.0, 0.0, -1.0, 2.0, 1.0, 0.0]]))
+        stages = []
+
+        def make(view, stages=stages):
+            stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+            return stages[-1]
+
+        proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[body])]
+        solver = SolverCoupledProxy(
+            model, entries(model, newton.solvers.SolverSemiImplicit, make), SolverCoupledProxy.Config(proxies=proxies)
+        )
+        states, control = (model.state(), model.state()), model.control()
+
+        def step_twice(solver=solver, states=states, control=control):
+            for start, end in (states, states[::-1]):
+                start.clear_forces()
+                solver.step(start, end, control, None, DT)
+
+        if captured:
+            with wp.ScopedCapture(device) as capture:
+                step_twice()
+        for _ in range(6):
+            wp.capture_launch(capture.graph) if captured else step_twice()
+        report = stages[0].report
+        assert (report.steps, report.uncertified_steps, report.crossings) == (12, 0, 0)
+        ends.append(np.concatenate([states[0].body_q.numpy().ravel(), states[0].particle_q.numpy().ravel()]))
+    assert ends[0][2] < 0.04
+    np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.parametrize("iterations", [1, 2])
+def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations, device):
+    """Each entry sees the other at its start: two patches swap sides in a step, and are pushed back in the next."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 8, 0.03, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 5.0))
+    add_patch(builder, 8, 0.03, (0.011, 0.017, 0.1), velocity=(0.0, 0.0, -5.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    parts = np.split(np.arange(model.particle_count), 2)
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    own = [SolverCoupled.Entry(name=str(i), solver=make, particles=parts[i].tolist()) for i in range(2)]
+    solver = SolverCoupledADMM(model, own, SolverCoupledADMM.Config(iterations=iterations))
+    start, end = model.state(), model.state()
+    gaps = []
+    for _ in range(8):
+        start.clear_forces()
+        solver.step(start, end, None, None, DT)
+        start, end = end, start
+        lower, upper = (start.particle_q.numpy()[part, 2].mean() for part in parts)
+        gaps.append(upper - lower)
+    assert gaps[2] < -0.01 and min(gaps[3:]) > 0.01
+    assert all(stage.report.uncertified_steps == 0 and stage.report.crossings == 0 for stage in stages)
+
+
+@pytest.mark.parametrize("resets", [False, True])
+def test_proxies_start_where_a_program_sets_them_first(resets, device):
+    """A ball that begins, or is put by a reset, below a sheet has not passed it on its way from anywhere else."""
+    model, stages = ball_over_sheet(device), []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0])]
+    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
+    solver = SolverCoupledProxy(model, entries(model, rigid, make), SolverCoupledProxy.Config(proxies=proxies))
+    start, end = model.state(), model.state()
+    if resets:
+        solver.step(start, end, None, None, 0.1 * DT)
+        start, end = end, start
+    for name in ("body_q", "body_qd", "joint_q", "joint_qd", "particle_q", "particle_qd"):
+        getattr(start, name).assign(getattr(model, name))
+    pose = start.body_q.numpy()
+    pose[0, 2] = -0.1
+    start.body_q.assign(pose)
+    newton.eval_ik(model, start, start.joint_q, start.joint_qd)
+    if resets:
+        solver.reset(start, flags=newton.StateFlags.NONE)
+    start.clear_forces()
+    solver.step(start, end, None, None, DT)
+    report = stages[0].report
+    assert report.certified and report.hits == 0
+    np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
 
 
 def test_hooks_are_those_of_the_inner_solver(device):

@@ -46,7 +46,10 @@ FOLDERS = ("cloth", "softbody", "multiphysics")
 """The folders of Newton's examples that are measured by default."""
 
 MODES = ("plain", "stage")
-"""The modes: the example as it is, and with :class:`warp_bsc.SolverCCD` behind its solver."""
+"""The modes: the example as it is, and with :class:`warp_bsc.SolverCCD` behind its solver.
+
+Of a coupled solver, these are the entries that have particles, each with a stage of its own.
+"""
 
 WARM_UP = 2
 """Frames at the start whose times are left out: kernels are compiled and buffers grow in them."""
@@ -96,6 +99,11 @@ class NewtonExample:
 @dataclass(frozen=True)
 class StageTotals:
     """Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`.
+
+    A stage behind an entry of a coupled solver takes a step for each substep of the entry and each pass of the coupler.
+    It certifies the motion in the view of its entry, which has the entry's own particles, proxies, the shapes that the
+    entry sees, and where they were at the start of the step, other entries' particles; crossings are counted in the
+    whole model.
 
     Attributes:
         steps: Steps.
@@ -391,10 +399,12 @@ def _serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> 
         reply({"problem": f"not applicable: {reason}"})
     except _NeedsDownload as reason:
         reply({"problem": _describe_download(str(reason))})
-    except ModuleNotFoundError as error:
-        reply({"problem": f"needs the package {error.name}"})
     except Exception as error:
-        reply({"problem": f"failed: {_describe_error(error)}"})
+        missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
+        if isinstance(missing, ModuleNotFoundError):  # Newton raises an error of its own from that for a backend
+            reply({"problem": f"needs the package {missing.name}"})
+        else:
+            reply({"problem": f"failed: {_describe_error(error)}"})
     else:
         reply({"measured": asdict(measured)})
 
@@ -414,7 +424,7 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
             frames = arguments.num_frames if own else FRAMES
             frames = min(frames, CPU_FRAMES) if wp.get_device().is_cpu else frames
         if request["mode"] == "stage" and not stages:
-            raise _NotApplicable(f"no solver is one of {', '.join(_SOLVERS)}")
+            raise _NotApplicable(f"no solver with particles is one of {', '.join(_SOLVERS)}")
         measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
 
     newton.examples.run = run
@@ -446,10 +456,13 @@ class _StagedType(type):
     stages: list[Any]
 
     def __call__(cls, *arguments, **options):
-        """Makes a solver and returns the stage behind it."""
+        """Makes a solver and returns the stage behind it, or the solver if it has no particles."""
         from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
-        stage = SolverCCD(super().__call__(*arguments, **options))
+        solver = super().__call__(*arguments, **options)
+        if not solver.model.particle_count:
+            return solver
+        stage = SolverCCD(solver)
         cls.stages.append(stage)
         return stage
 
@@ -466,17 +479,11 @@ def _stage_solvers(stages: list[Any]) -> None:
     This must come before the example is imported: it may import the classes by name.
     """
     import newton.solvers  # noqa: PLC0415 (slow)
-    from newton.solvers.experimental.coupled import SolverCoupled  # noqa: PLC0415 (slow)
 
     for name in _SOLVERS:
         solver = getattr(newton.solvers, name)
         names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages}
         setattr(newton.solvers, name, _StagedType(name, (solver,), names))
-
-    def refuse(self, *arguments, **options):
-        raise _NotApplicable(f"SolverCCD cannot be a part of {type(self).__name__}")
-
-    SolverCoupled.__init__ = refuse
 
 
 def _measure_frames(

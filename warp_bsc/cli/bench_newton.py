@@ -19,7 +19,8 @@ __all__ = ["add_to"]
 
 _DESCRIPTION = """\
 Run Newton's own examples, unchanged, and measure them: plain, and with
-SolverCCD put behind their solver. Each run is a process of its own, in which
+SolverCCD put behind their solver, or behind each entry of a coupled solver that
+has particles. Each run is a process of its own, in which
 the example captures its own CUDA graph and runs its own tests. Reported are the
 times of frames, without drawing and without the first two; the edges of cloth
 or soft bodies that cross faces at the start, and the most at frame ends, found

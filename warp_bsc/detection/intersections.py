@@ -21,7 +21,7 @@ from .launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections", "vertices_on_faces"]
+__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections", "points_on_faces"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -132,29 +132,31 @@ def _decided(
     return status.numpy()[:count]
 
 
-def vertices_on_faces(mesh: CollisionMesh, x: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Returns which vertices are on which faces, exactly, pair by pair.
+def points_on_faces(mesh: CollisionMesh, x: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Returns which points are on which faces, exactly, pair by pair.
 
     Args:
         mesh: The mesh.
         x: Positions, finite, any unit of length, shape [vertex_count, 3], float32 or float64.
-        vertices: The vertices, integers, shape [n].
+        points: The points, finite, of the same type, shape [n, 3].
         faces: The faces, integers, shape [n].
 
     Returns:
         Bool array of shape [n].
     """
-    device, n = mesh.device, len(vertices)
-    points, row = np.unique(vertices, return_inverse=True)
-    edges = wp.array(np.stack([points, points], axis=1), dtype=int, device=device)  # whose ends are one vertex
-    pairs = wp.array(np.stack([row.reshape(-1), faces], axis=1), dtype=wp.vec2i, device=device)
+    device, n = mesh.device, len(points)
+    dtype = wp.vec3 if x.dtype == np.float32 else wp.vec3d
+    positions = wp.array(np.concatenate([x, points]), dtype=dtype, device=device)
+    rows = np.arange(n)
+    edges = wp.array(np.repeat(len(x) + rows[:, None], 2, axis=1), dtype=int, device=device)  # both ends at one point
+    pairs = wp.array(np.stack([rows, faces], axis=1), dtype=wp.vec2i, device=device)
     status = wp.full(n, int(UNSURE), dtype=wp.int8, device=device)
     # what passes through a face does not matter, nor do the faces' neighbours
-    status = _decided(mesh, mesh.device_positions(x, "x"), edges, mesh.device_faces, pairs, status, n)
+    status = _decided(mesh, positions, edges, mesh.device_faces, pairs, status, n)
     on_face = status != FREE
     (unsure,) = np.nonzero(status == UNSURE)
     if len(unsure):
-        ends = np.repeat(x[vertices[unsure], None], 2, axis=1)
+        ends = np.repeat(points[unsure, None], 2, axis=1)
         on_face[unsure] = checker.edge_face_crossings(ends, x[mesh.faces[faces[unsure]]])
     return on_face
 

@@ -1,7 +1,5 @@
 """The hooks of Newton's coupled solvers for a stage behind another solver: that solver's, and what the stage adds."""
 
-from typing import Any
-
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers import SolverBase
@@ -11,27 +9,41 @@ from .bodies import inertia_at
 from .buffers import Motion, Vertices
 from .constraints import to_double, to_single
 from .inner_contacts import InnerContacts
+from .model_motion import ModelMotion, continues
 
 __all__ = ["CouplingHooks"]
 
 _KERNEL = {"enable_backward": False}
 
 
-@wp.kernel(**_KERNEL)
-def _find_starts(
-    # in
-    ends: wp.array[Any],
-    flags: wp.array[int],
-    proxy: int,
-    places: wp.array[Any],
-    # out
-    starts: wp.array[Any],
-):
-    """Writes where bodies or particles start: proxies where the last step ended, others where they are."""
-    i = wp.tid()
-    starts[i] = places[i]
-    if flags[i] & proxy != 0:
-        starts[i] = ends[i]
+def _make_find_starts(kind: type) -> wp.Kernel:
+    """Returns the kernel below for poses or positions: of a generic one, a graph on the CPU runs the wrong overload."""
+
+    @wp.kernel(**_KERNEL, module="unique")
+    def find_starts(
+        # in
+        motion: Motion,
+        ends: wp.array[kind],
+        world: wp.array[int],
+        flags: wp.array[int],
+        proxy: int,
+        places: wp.array[kind],
+        # out
+        starts: wp.array[kind],
+    ):
+        """Writes where bodies or particles start: proxies where the last step ended, others where they are.
+
+        So are proxies in a world in which no step has ended yet, or that was reset.
+        """
+        i = wp.tid()
+        starts[i] = places[i]
+        if flags[i] & proxy != 0 and continues(motion, world[i]):
+            starts[i] = ends[i]
+
+    return find_starts
+
+
+_find_starts_of_bodies, _find_starts_of_particles = _make_find_starts(wp.transform), _make_find_starts(wp.vec3)
 
 
 @wp.kernel(**_KERNEL)
@@ -55,19 +67,27 @@ def _add_impulses(
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 
 
-@wp.kernel(**_KERNEL)
-def _add_forces(
-    # in
-    impulses: wp.array[Any],
-    proxy: wp.array[int],
-    dt: float,
-    # out
-    forces: wp.array[Any],
-):
-    """Adds the forces that make impulses on bodies or particles in a step, to the places of their proxies."""
-    i = wp.tid()
-    if proxy[i] >= 0:
-        wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+def _make_add_forces(kind: type) -> wp.Kernel:
+    """Returns the kernel below for wrenches or forces, see :func:`_make_find_starts`."""
+
+    @wp.kernel(**_KERNEL, module="unique")
+    def add_forces(
+        # in
+        impulses: wp.array[kind],
+        proxy: wp.array[int],
+        dt: float,
+        # out
+        forces: wp.array[kind],
+    ):
+        """Adds the forces that make impulses on bodies or particles in a step, to the places of their proxies."""
+        i = wp.tid()
+        if proxy[i] >= 0:
+            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+
+    return add_forces
+
+
+_add_wrenches, _add_forces = _make_add_forces(wp.spatial_vector), _make_add_forces(wp.vec3)
 
 
 def _is_default(solver, hook):
@@ -80,15 +100,23 @@ class CouplingHooks(CouplingInterface):
 
     Hooks are those of the inner solver, or those that the interface derives from the model if it has none, with two
     additions. A proxy, which the coupler sets to the pose of its source before a step, moves from where it was at the
-    end of the last step: so nothing is passed where the two differ. And what the response changes of the momentum of a
-    proxy is fed back to its source, also by inner solvers that harvest only the forces of their own contacts.
+    end of the last step: so nothing is passed where the two differ. Each pass of a coupler over a step begins where the
+    first one did. And what the response changes of the momentum of a proxy is fed back to its source, also by inner
+    solvers that harvest only the forces of their own contacts.
 
-    The source feels these impulses a step late. If a contact stops a proxy outright, as one of a finger and cloth on
-    another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the source along
-    the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may be more:
-    choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in each step
-    behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy to its
-    source for a velocity: the two bounce apart.
+    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, as one of a finger and
+    cloth on another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the
+    source along the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may
+    be more: choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in
+    each step behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy
+    to its source for a velocity: the two bounce apart.
+
+    The stage resolves and certifies the motion in the view of its entry: that of the entry's own particles, of proxies,
+    and of the shapes that the entry sees. Particles of another entry without proxies are obstacles if the view has
+    their faces. They take the way of the last step in the present one: two entries may pass through each other in one
+    step, and are pushed back in the next. The report counts a step for each substep of the entry and each pass.
+    ``SolverCoupledADMM`` takes hard attachments of bodies to particles for those of one entry only if its solver is
+    ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
 
     Attributes:
         solver: The inner solver.
@@ -96,6 +124,7 @@ class CouplingHooks(CouplingInterface):
 
     solver: SolverBase
 
+    _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
     _inner_contacts: InnerContacts | None = None  # None where the inner solver gets all contacts
 
@@ -103,47 +132,39 @@ class CouplingHooks(CouplingInterface):
         return getattr(self.solver if isinstance(self.solver, CouplingInterface) else super(), name)
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
-        """Delegates to the inner solver, and prepares for a coupled simulation."""
+        """Delegates to the inner solver, and prepares for a coupled simulation.
+
+        Its first step begins where its state is: joints that the view of the entry lacks may place proxies.
+        """
         self._hook("coupling_notify_iteration_restarts")(enabled)
-        self._coupled = _Coupled(self.model)
+        self._motion.interrupt()
+        self._coupled = _Coupled(self.model, self._motion, restarts=enabled)
 
     def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
         """Delegates to the inner solver; in a step, makes proxies move from where they were at the end of the last."""
         options = {"iteration_restart": iteration_restart, "dt": dt}
         self._hook("coupling_notify_input_state_update")(state, flags, **options)
         if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
-            self._coupled.update_input(state, **options)
-
-    def coupling_rewind_proxy_body(self, *arguments, **options) -> None:
-        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
-        self._hook("coupling_rewind_proxy_body")(*arguments, **options)
-        if self._coupled is not None:
-            self._coupled.body_impulses.zero_()
-
-    def coupling_rewind_proxy_particle(self, *arguments, **options) -> None:
-        """Delegates to the inner solver, and forgets what the response did in an earlier pass."""
-        self._hook("coupling_rewind_proxy_particle")(*arguments, **options)
-        if self._coupled is not None:
-            self._coupled.particle_impulses.zero_()
+            self._coupled.update_input(**options)
 
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
         hook = "coupling_harvest_proxy_wrenches"
-        self._harvest(hook, "body_impulses", body_local_to_proxy_global, out_body_f, options)
+        self._harvest(hook, _add_wrenches, "body_impulses", body_local_to_proxy_global, out_body_f, options)
 
     def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
         hook = "coupling_harvest_proxy_particle_forces"
-        self._harvest(hook, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
+        self._harvest(hook, _add_forces, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
 
-    def _harvest(self, hook, name, proxy, forces, options):
+    def _harvest(self, hook, kernel, name, proxy, forces, options):
         if self._inner_contacts is not None and options["contacts"] is not None:
             options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
         if self._coupled is not None and not _is_default(self.solver, hook):  # that sees the changed velocities
             impulses = getattr(self._coupled, name)
             inputs = [impulses, proxy, options["dt"]]
-            wp.launch(_add_forces, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
+            wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
 
 
 def _delegate(name):
@@ -163,22 +184,34 @@ for _name in dir(CouplingInterface):
 
 
 class _Coupled:
-    """What a stage keeps for a coupler: where proxies were, and the impulses on them."""
+    """What a stage keeps for a coupler: where proxies were, where a step began, and the impulses on proxies."""
 
-    def __init__(self, model):
-        self._model, device = model, model.device
+    def __init__(self, model, motion, *, restarts):
+        self._model, self._motion, device = model, motion, model.device
         self._last, self._first, self._start = model.state(), model.state(), model.state()
         self._continues = False
+        starts = motion.starts() if restarts else []
+        self._starts = [(start, wp.clone(start)) for start in starts]
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
-    def update_input(self, state, *, iteration_restart, dt):
-        """Notes that a coupler has set positions: for a step of length ``dt``, or at a reset where that is 0."""
-        if dt <= 0.0:
-            _copy_positions(self._last, state)
-        elif not iteration_restart and not self._continues:
+    def update_input(self, *, iteration_restart, dt):
+        """Notes that a coupler has set positions for a pass over a step of length ``dt``; 0 where it has for a reset.
+
+        Each pass begins where the first one did, also where that is not where the positions are.
+        """
+        if dt <= 0.0:  # ``reset`` interrupts the motion
+            return
+        if iteration_restart:
+            for start, kept in self._starts:
+                wp.copy(start, kept)
+        elif not self._continues:
             _copy_positions(self._first, self._last)
-        self._continues = dt > 0.0
+            for start, kept in self._starts:
+                wp.copy(kept, start)
+        self._continues = True
+        self.body_impulses.zero_()  # those of an earlier pass
+        self.particle_impulses.zero_()
 
     def start_of(self, state):
         """Returns the state that a step starts from, as far as positions go, given that which it is called with."""
@@ -186,11 +219,16 @@ class _Coupled:
             return state
         self._continues = False
         model, first, start = self._model, self._first, self._start
-        bodies = first.body_q, model.body_flags, int(BodyFlags.PROXY), state.body_q, start.body_q
-        particles = first.particle_q, model.particle_flags, int(ParticleFlags.PROXY), state.particle_q, start.particle_q
-        for count, inputs in ((model.body_count, bodies), (model.particle_count, particles)):
-            if count:
-                wp.launch(_find_starts, count, inputs=inputs, device=model.device)
+        bodies = first.body_q, model.body_world, model.body_flags, int(BodyFlags.PROXY), state.body_q
+        particles = first.particle_q, model.particle_world, model.particle_flags, int(ParticleFlags.PROXY)
+        particles += (state.particle_q,)
+        for kernel, arrays, starts in (
+            (_find_starts_of_bodies, bodies, start.body_q),
+            (_find_starts_of_particles, particles, start.particle_q),
+        ):
+            if starts is not None:
+                inputs = [self._motion.vertices, *arrays]
+                wp.launch(kernel, len(starts), inputs=inputs, outputs=[starts], device=model.device)
         return start
 
     def finish(self, state, motion, vertices):

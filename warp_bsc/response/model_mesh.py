@@ -10,7 +10,7 @@ from .._arguments import checked_distance, checked_distances
 from ..detection.approach_phase import MinDistances, make_min_distances
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "vertex_position"]
+__all__ = ["Incidence", "ModelMesh", "Planes", "ShapeVertices", "sides_of", "vertex_position"]
 
 _SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
@@ -300,11 +300,16 @@ def _soft_faces(model):
     triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
     if model.tet_indices is None:
         return triangles
-    sides = model.tet_indices.numpy()[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    sides = sides_of(model.tet_indices.numpy())
     # an inner side belongs to two tetrahedra; with the triangles counted twice, the missing sides occur once
     corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
     return np.concatenate([triangles, sides[first[count == 1]]])
+
+
+def sides_of(tetrahedra: np.ndarray) -> np.ndarray:
+    """Returns the sides of tetrahedra, shape [n, 4], counterclockwise from outside, shape [4 n, 3]."""
+    return tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
 
 
 def _strands(model, faces):

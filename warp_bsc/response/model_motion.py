@@ -12,7 +12,7 @@ from .friction import Friction
 from .model_mesh import ModelMesh, vertex_position
 from .planes import MovingPlanes, transformed_plane
 
-__all__ = ["ModelMotion", "moves_with_body", "wanted_velocity"]
+__all__ = ["ModelMotion", "continues", "moves_with_body", "wanted_velocity"]
 
 _SAME_POSE = 1e-5
 """Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
@@ -76,7 +76,7 @@ def wanted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def _continues(motion: Motion, world: int) -> bool:
+def continues(motion: Motion, world: int) -> bool:
     """Returns whether a step begins where the last one ended, as far as movable particles of a world go."""
     last = motion.interrupted.shape[0] - 1
     return motion.interrupted[wp.where(world < 0, last, world)] == 0
@@ -172,13 +172,13 @@ def _write_end(
     """
     i = wp.tid()
     if last and i < plane_ends.shape[0] and not _is_movable(motion, placement.plane_body[i]):
-        if _continues(motion, plane_world[i]) and wp.isfinite(plane_ends[i]):
+        if continues(motion, plane_world[i]) and wp.isfinite(plane_ends[i]):
             plane_starts[i] = plane_ends[i]
     _place_plane(placement, i, plane_ends)
     if i >= motion.x1.shape[0]:
         return
     if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
-        if _continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
+        if continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
             motion.x0[i] = last[i]
     x0 = motion.x0[i]
     x1 = _position(placement, i)
@@ -311,6 +311,11 @@ class ModelMotion:
         else:
             inputs, outputs = [world_mask], [interrupted]
             wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
+
+    def starts(self) -> list[wp.array]:
+        """Returns the arrays that say where the next step begins: to repeat a step, set them to what they were."""
+        arrays: list[wp.array] = [self.vertices.interrupted]
+        return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""

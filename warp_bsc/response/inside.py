@@ -1,0 +1,191 @@
+"""The particles that are inside solids in one configuration: rigid shapes, soft bodies and the solids of planes."""
+
+import functools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+from newton import BodyFlags, ParticleFlags
+
+from ..detection.body_parts import connect_cells
+from ..detection.containment import ContainmentFinder
+from ..detection.mesh import CollisionMesh
+from .model_mesh import ModelMesh, sides_of
+
+__all__ = ["Inside", "InsideFinder"]
+
+_ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in ``planes.signed_distance``
+
+
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """The particles that are inside solids: arrays with a row for each particle and solid, sorted.
+
+    Attributes:
+        particles: The particles, int32, shape [n]. One that is inside several solids has a row for each.
+        shapes: The shape that holds each particle, -1 where a soft body does, int32, shape [n].
+        soft_bodies: The soft body that holds it, as the first of that body's particles, -1 where a shape does, int32,
+            shape [n].
+    """
+
+    particles: np.ndarray
+    shapes: np.ndarray
+    soft_bodies: np.ndarray
+
+    def __len__(self) -> int:
+        """Returns the number of rows."""
+        return len(self.particles)
+
+
+class _Solids(NamedTuple):
+    """The bodies that enclose space: soft bodies, then shapes, those that are in all worlds once for each.
+
+    Attributes:
+        finder: Finds what is inside them.
+        faces: Vertices of their faces, shape [face_count, 3].
+        of_face: Body of each face, shape [face_count].
+        shape: Shape of each body, -1 for a soft body, shape [n].
+        soft_body: First particle of each body, -1 for a shape, shape [n].
+        body: Rigid body of each shape, -1 for none, shape [n].
+        world: World of each body, shape [n].
+        soft_body_of: First particle of the soft body of each particle, -1 for none, shape [particle_count].
+    """
+
+    finder: ContainmentFinder
+    faces: np.ndarray
+    of_face: np.ndarray
+    shape: np.ndarray
+    soft_body: np.ndarray
+    body: np.ndarray
+    world: np.ndarray
+    soft_body_of: np.ndarray
+
+
+class InsideFinder:
+    """Finds the particles of a model that are inside solids, in one configuration after another, on the host.
+
+    Solids are the shapes that collide with particles, as they are in the mesh of the model, the soft bodies, and the
+    solids of infinite planes. A soft body is what tetrahedra with common particles make up. Shapes whose triangles do
+    not close (a finite plane, an open mesh) and cloth enclose nothing, closed cloth neither. A particle is inside if it
+    is strictly inside, by itself: all of a sheet that is wholly inside, and of another one the part that is.
+
+    Not looked for are particles in the soft body that they belong to, in solids of another world, pairs of which the
+    response can move neither (a pinned particle in a static shape), particles that are not active, and positions that
+    are not finite. A soft body or shape with such a position holds nothing.
+
+    No floating-point error can change the answer for soft bodies and shapes. A particle is inside the solid of a plane
+    if its distance is certainly negative, as for the response.
+    """
+
+    def __init__(self, mesh: ModelMesh):
+        """Takes the mesh of a model; finds its solids when they are needed first."""
+        self._mesh = mesh
+
+    def find(self, x: np.ndarray | wp.array, planes: np.ndarray | wp.array) -> Inside:
+        """Returns which particles are inside solids. Synchronizes with the device where arrays are on one.
+
+        Args:
+            x: Positions of all vertices of the mesh [m], float32, shape [vertex_count, 3], or an array of vec3.
+            planes: The planes of the mesh, each as the unit normal out of its solid and its offset [m], float64, shape
+                [plane_count, 4], or an array of vec4d, as in :class:`.planes.MovingPlanes`.
+
+        Raises:
+            ValueError: If an array has another shape.
+        """
+        mesh, model = self._mesh, self._mesh.model
+        x = _checked(x, (mesh.vertex_count, 3), "x")
+        planes = _checked(planes, (len(mesh.planes.shape), 4), "planes")
+        flags = _read(model.particle_flags, model.particle_count)
+        finite = np.isfinite(x).all(axis=1)
+        (particles,) = np.nonzero(finite[: model.particle_count] & ((flags & int(ParticleFlags.ACTIVE)) != 0))
+        movable = mesh.inverse_masses.numpy() > 0.0
+        flags, inverse_mass = _read(model.body_flags, model.body_count), _read(model.body_inv_mass, model.body_count)
+        moves = np.append((inverse_mass > 0.0) & ((flags & int(BodyFlags.KINEMATIC)) == 0), False)  # -1 is no body
+        rows = np.concatenate(
+            [
+                self._find_in_bodies(x, particles, finite, movable, moves),
+                self._find_behind_planes(x[particles].astype(np.float64), particles, planes, movable, moves),
+            ]
+        )
+        rows = rows[np.lexsort(rows.T[::-1])].astype(np.int32)
+        return Inside(*np.ascontiguousarray(rows.T))
+
+    def _find_in_bodies(self, x, particles, finite, movable, moves):
+        """Returns rows of a particle, a shape and a soft body."""
+        solids, world = self._solids, self._world
+        bad_faces = solids.of_face[~finite[solids.faces].all(axis=1)]
+        holds = np.bincount(bad_faces, minlength=len(solids.shape)) == 0
+        soft = solids.soft_body_of
+        has_movable = np.bincount(soft[(soft >= 0) & movable[: len(soft)]], minlength=len(soft)) > 0
+        is_movable = np.where(solids.shape < 0, np.append(has_movable, False)[solids.soft_body], moves[solids.body])
+
+        def are_wanted(pairs):
+            particle, body = particles[pairs[:, 0]], pairs[:, 1]
+            wanted = holds[body] & (world[particle] == solids.world[body])
+            wanted &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
+            return wanted & (movable[particle] | is_movable[body])
+
+        x = np.where(finite[:, None], x, 0.0)
+        found = solids.finder.find_points(x, x[particles], are_wanted)
+        return np.stack([particles[found[:, 0]], solids.shape[found[:, 1]], solids.soft_body[found[:, 1]]], axis=1)
+
+    def _find_behind_planes(self, x, particles, planes, movable, moves):
+        """Returns rows of a particle, a shape and no soft body, given the positions of the particles in float64."""
+        rows = [np.zeros((0, 3), dtype=np.int64)]
+        of_planes, world = self._mesh.planes, self._world[particles]
+        for i, (*normal, offset) in enumerate(planes):
+            terms = np.column_stack([np.full(len(x), -offset), x * normal])
+            deep = terms.sum(axis=1) < -(_ROUNDOFF * np.abs(terms).sum(axis=1) + _TINY)
+            deep &= (of_planes.world[i] < 0) | (of_planes.world[i] == world)
+            inside = particles[deep & (movable[particles] | moves[of_planes.body[i]])]
+            rows.append(np.column_stack([inside, np.full_like(inside, of_planes.shape[i]), np.full_like(inside, -1)]))
+        return np.concatenate(rows)
+
+    @functools.cached_property
+    def _world(self) -> np.ndarray:
+        """World of each vertex, shape [vertex_count]."""
+        return self._mesh.device_world.numpy()
+
+    @functools.cached_property
+    def _solids(self) -> _Solids:
+        mesh, count, world = self._mesh, self._mesh.model.particle_count, self._world
+        tetrahedra = mesh.model.tet_indices
+        tetrahedra = np.zeros((0, 4), dtype=np.int32) if tetrahedra is None else tetrahedra.numpy().reshape(-1, 4)
+        first = connect_cells(tetrahedra, count)
+        soft_body_of = np.full(count, -1)
+        soft_body_of[tetrahedra] = first[tetrahedra]
+        sides = sides_of(tetrahedra)
+        _, places, numbers = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
+        soft_faces = sides[places[numbers == 1]]  # an inner side belongs to two tetrahedra
+        soft_bodies, of_soft_face = np.unique(soft_body_of[soft_faces[:, 0]], return_inverse=True)
+        shape_faces = mesh.faces[mesh.faces[:, 0] >= count]
+        corners = shape_faces[:, 0]
+        keys = np.column_stack([mesh.shape_vertices.shape[corners - count], world[corners]])
+        copies, places, of_shape_face = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        faces = np.concatenate([soft_faces, shape_faces])
+        of_face = np.concatenate([of_soft_face, len(soft_bodies) + of_shape_face.reshape(-1)])
+        none, no_shape = np.full(len(soft_bodies), -1), np.full(len(copies), -1)
+        return _Solids(
+            ContainmentFinder(CollisionMesh(faces, mesh.vertex_count, device="cpu"), of_face),
+            faces,
+            of_face,
+            shape=np.concatenate([none, copies[:, 0]]),
+            soft_body=np.concatenate([soft_bodies, no_shape]),
+            body=np.concatenate([none, mesh.shape_vertices.body[corners[places] - count]]),
+            world=np.concatenate([world[soft_bodies], copies[:, 1]]),
+            soft_body_of=soft_body_of,
+        )
+
+
+def _read(values: wp.array | None, count: int) -> np.ndarray:
+    """Returns an array of a model on the host, zeros if the model has none."""
+    return np.zeros(count, dtype=np.int32) if values is None else values.numpy()
+
+
+def _checked(values: np.ndarray | wp.array, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Returns an argument on the host; raises ValueError if it has another shape."""
+    values = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+    if values.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {values.shape}")
+    return values
