@@ -4,8 +4,9 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_patch
+from newton_scenes import DT, Changed, Rollout, add_patch, add_plates, place_plates
 
+import warp_bsc as bsc
 from warp_bsc.response.inside import InsideFinder
 from warp_bsc.response.model_mesh import ModelMesh
 
@@ -233,3 +234,24 @@ def test_wrong_shapes(device):
         finder.find(np.zeros((2, 3)), np.zeros((0, 4)))
     with pytest.raises(ValueError, match=r"planes must have shape \(0, 4\), not \(1, 4\)"):
         finder.find(np.zeros((1, 3)), np.zeros((1, 4)))
+
+
+def test_the_report_names_what_solids_have_swallowed(device):
+    """Plates that close on cloth take it in: one step is not certified, the later ones are, and cross nothing."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_plates(builder, 0.03)
+    builder.color()
+    model = builder.finalize(device=device)
+    gaps = iter([0.03, -0.04, -0.04, -0.04])
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, next(gaps)))))
+    report = rollout.solver.report
+    certified, inside = [], []
+    for _ in range(4):
+        rollout.step(DT)
+        certified.append(report.certified)
+        inside.append(set(report.inside.particles.tolist()))
+    everything = set(range(model.particle_count))
+    assert certified == [True, False, True, True] and report.uncertified_steps == 1
+    assert inside == [set(), everything, everything, everything] and report.crossings == 0
+    assert report.total_remaining > 0 and f"{report.total_remaining} remained" in str(report)
+    assert set(report.inside.shapes.tolist()) == {0, 1} and (report.inside.soft_bodies == -1).all()

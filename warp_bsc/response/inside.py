@@ -97,7 +97,7 @@ class InsideFinder:
         x = _checked(x, (mesh.vertex_count, 3), "x")
         planes = _checked(planes, (len(mesh.planes.shape), 4), "planes")
         flags = _read(model.particle_flags, model.particle_count)
-        finite = np.isfinite(x).all(axis=1)
+        finite = np.isfinite(x).all(axis=1).reshape(-1)
         (particles,) = np.nonzero(finite[: model.particle_count] & ((flags & int(ParticleFlags.ACTIVE)) != 0))
         movable = mesh.inverse_masses.numpy() > 0.0
         flags, inverse_mass = _read(model.body_flags, model.body_count), _read(model.body_inv_mass, model.body_count)

@@ -1,10 +1,13 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
+import functools
+
 import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
 from .buffers import FROZEN, TRUNCATED
+from .inside import Inside, InsideFinder
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .response import Response
@@ -198,6 +201,20 @@ class SolverReport:
         pairs = find_intersections(mesh, self._motion.vertices.x0)
         of_particles = [elements.min(axis=1) < particles for elements in (mesh.edges, mesh.faces)]
         return pairs[of_particles[0][pairs[:, 0]] | of_particles[1][pairs[:, 1]]]
+
+    @property
+    def inside(self) -> Inside:
+        """Particles inside rigid shapes, soft bodies or the solids of infinite planes at the end of the last step.
+
+        What has passed a surface wholly, in a step that was not certified or in a start that a program has set, crosses
+        nothing any more: later steps are certified, and leave it where it is. See :class:`.inside.InsideFinder` for
+        what counts. Computed on each access, on the host.
+        """
+        return self._inside_finder.find(self._response.vertices.x1, self._motion.planes.end)
+
+    @functools.cached_property
+    def _inside_finder(self):
+        return InsideFinder(self._mesh)
 
     @property
     def milliseconds(self) -> float | None:
