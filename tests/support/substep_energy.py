@@ -179,7 +179,8 @@ class Scene:
             case "vbd":
                 solver = newton.solvers.SolverVBD(model, iterations=10)
             case "xpbd":
-                solver = newton.solvers.SolverXPBD(model, iterations=10)
+                # with the default relaxation, 0.9, XPBD bursts soft bodies by itself
+                solver = newton.solvers.SolverXPBD(model, iterations=10, soft_body_relaxation=0.2)
             case _:
                 config = newton.solvers.SolverStyle3D.Config(iterations=5)
                 solver = newton.solvers.SolverStyle3D(model, config=config)
