@@ -216,7 +216,7 @@ def test_several_may_be_missing(stage):
     assert len(Scene(path).left_out) == 3
     scene = Scene(path, strict=True, allow_missing=["/World/Odd", "/World/Part", "gone.*"])
     assert scene.left_out == [] and sum(text.startswith("missing: ") for text in scene.warnings) == 3
-    with pytest.raises(ValueError, match="allow_missing: must be several patterns"):
+    with pytest.raises(TypeError, match="allow_missing must be a tuple of strings"):
         Scene(path, allow_missing="gone.*")
 
 

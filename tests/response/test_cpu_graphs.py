@@ -199,17 +199,17 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
 def _run_out_of_room(
     replays: wp.array[int],
     particle_q: wp.array[wp.vec3],
-    undetected_steps: wp.array[int],
-    lost_gradients: wp.array[int],
+    undetected_steps: wp.array[wp.int64],
+    lost_gradients: wp.array[wp.int64],
 ):
     replay = replays[0]
     replays[0] = replay + 1
     if replay == 2 or replay == 4:
         particle_q[0] = wp.vec3(1.0, 2.0, 3.0)
     if replay == 2:
-        undetected_steps[0] = undetected_steps[0] + 1
+        undetected_steps[0] += wp.int64(1)
     if replay == 4:
-        lost_gradients[0] = lost_gradients[0] + 1
+        lost_gradients[0] += wp.int64(1)
 
 
 class CapturedOnCpu(bsc.CapturedSteps):

@@ -15,6 +15,7 @@ import warp_bsc as bsc
         Settings(1, "pile", "vbd", True, "auto", 60),
         Settings(2, "bodies", "vbd", True, 4, 60),
         Settings(3, "drape", "xpbd", True, 2, 60),
+        Settings(25, "pile", "style3d", False, "auto", 60),
     ],
     ids=str,
 )

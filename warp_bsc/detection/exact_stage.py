@@ -159,12 +159,12 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
             timed,
         )
         if status == FREE:
-            contacts.decided[k] = wp.int8(FREE)
+            contacts.decided[k] = wp.int8(status)
             stages.keys[k] = stages.last_key
             take_slot(stages.counts, _REFUTED)
         elif status == HIT:
             # coordinates and normal are those at the time of impact already
-            contacts.decided[k] = wp.int8(HIT)
+            contacts.decided[k] = wp.int8(status)
             contacts.within_tolerance[k] = timed
         elif wp.static(is_last):
             take_slot(stages.counts, _TOO_WIDE)

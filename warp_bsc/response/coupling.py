@@ -430,8 +430,9 @@ class Coupling:
         ``SolverStyle3D`` themselves are known not to allocate; every other solver and derived class counts as one that
         does. Python attributes that the inner solver changes in place, and not by assignment, are not restored.
 
-        An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or between
-        particles, resolves them beside the stage: a whole step may leave stretch that substeps release.
+        An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or by VBD's
+        self-contact, resolves them beside the stage: a whole step may leave stretch that substeps release. Contacts
+        that Style3D finds between cloth and cloth are taken out.
 
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken again.

@@ -7,16 +7,19 @@ asks for substeps. The first step in substeps would start from this stretch, and
 the two resolves a contact, in whole steps and in substeps alike, and where it can, that is the stage.
 """
 
+import contextlib
 import copy
+from collections.abc import Iterator
 
 import newton
 import numpy as np
 import warp as wp
 from newton import BodyFlags, GeoType
+from newton.solvers import SolverBase, SolverStyle3D
 
 from .model_mesh import ModelMesh
 
-__all__ = ["InnerContacts"]
+__all__ = ["InnerContacts", "without_own_contacts"]
 
 _SAGITTA = 0.01
 """Depth of faces of a round shape below its surface, as a share of its radius, at most; see ``model_mesh``."""
@@ -136,6 +139,23 @@ def _unpack(
     i = wp.tid()
     if i < packed_count[0]:
         forces[first + places[i]] = packed[i]
+
+
+@contextlib.contextmanager
+def without_own_contacts(solver: SolverBase) -> Iterator[None]:
+    """Keeps Style3D from resolving contacts of cloth with itself while it steps: the stage resolves them.
+
+    Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between
+    both, layers that the stage has moved together are thrown apart. Has no effect on other solvers.
+    """
+    if not isinstance(solver, SolverStyle3D):
+        yield
+        return
+    own, solver.collision = solver.collision, None
+    try:
+        yield
+    finally:
+        solver.collision = own
 
 
 class InnerContacts:

@@ -27,7 +27,7 @@ from .contact_layer import ContactLayer
 from .coupling import SUBSTEPS, Coupling
 from .coupling_hooks import CouplingHooks
 from .friction import Friction
-from .inner_contacts import InnerContacts
+from .inner_contacts import InnerContacts, without_own_contacts
 from .model_mesh import ModelMesh
 from .model_motion import ModelMotion
 from .report import SolverReport, StepTotals
@@ -509,7 +509,11 @@ class SolverCCD(SolverBase, CouplingHooks):
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
-        with without_speed_limit(self._limited) if self._limited else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if self._limited:
+                stack.enter_context(without_speed_limit(self._limited))
+            if self._inner_contacts is not None:
+                stack.enter_context(without_own_contacts(self.solver))
             self.solver.step(*arguments, **options)
 
     @one_at_a_time
