@@ -1,10 +1,16 @@
-"""Random single steps of the collision stage, most of them degenerate, judged by exact detection.
+"""Random steps of the collision stage, judged by exact detection.
+
+Half of them are single steps from random positions to random ones, most of them degenerate. The others are those of
+simulations: the scenes of ``substep_energy.py``, with VBD, XPBD and Style3D, in whole steps and in substeps, with
+contacts passed on and not.
 
 ``python tests/support/stage_stress.py --steps 10000`` prints a line for each kind of scene, and the seed of each step
 that a certificate was wrong about. The exit status is then 1.
 """
 
 import argparse
+import contextlib
+import io
 import sys
 from dataclasses import dataclass
 
@@ -14,6 +20,8 @@ import warp as wp
 from newton_scenes import DT, DistanceRollout, Rollout
 from rich.console import Console
 from rich.table import Table
+from substep_energy import KINDS, Settings
+from substep_energy import Scene as Simulation
 
 import warp_bsc as bsc
 
@@ -85,7 +93,7 @@ class Judged:
     Attributes:
         steps: All steps.
         touching: Steps that excluded contacts, or at whose start something crossed.
-        changed: Steps in which a vertex was cut or left standing.
+        changed: Steps in which the path of a vertex was cut or a vertex was frozen.
         uncertified: Steps that were not certified.
         wrong: Collisions of pairs that neither touched nor crossed at the start, and of which the report names no
             vertex; in certified steps also pairs that came nearer than they may.
@@ -96,6 +104,18 @@ class Judged:
     changed: int = 0
     uncertified: int = 0
     wrong: int = 0
+
+    def add(self, rollout: Rollout, approaches: int = 0) -> int:
+        """Judges the last step of a rollout, in which pairs came nearer than they may; returns what was wrong."""
+        report = rollout.solver.report
+        named = set(report.uncertified_vertices.tolist())
+        wrong = sum(named.isdisjoint(corners) for corners in rollout.new_collisions) + approaches * report.certified
+        self.steps += 1
+        self.touching += report.excluded > 0 or report.crossings > 0
+        self.changed += report.truncated > 0 or report.frozen > 0
+        self.uncertified += not report.certified
+        self.wrong += wrong
+        return wrong
 
 
 class Stress:
@@ -183,17 +203,31 @@ class Stress:
         state.particle_q.assign(start)
         rollout.solver.reset(state)
         rollout.step(DT)
-        report = rollout.solver.report
-        named = set(report.uncertified_vertices.tolist())
-        wrong = sum(named.isdisjoint(corners) for corners in rollout.new_collisions)
-        if report.certified:
-            wrong += getattr(rollout, "approaches", 0) - approaches
-        judged.steps += 1
-        judged.touching += report.excluded > 0 or report.crossings > 0
-        judged.changed += report.truncated > 0 or report.frozen > 0
-        judged.uncertified += not report.certified
-        judged.wrong += wrong
-        return not wrong
+        return not judged.add(rollout, getattr(rollout, "approaches", 0) - approaches)
+
+
+def simulate(seed: int, judged: dict[str, Judged], most: int, device) -> bool:
+    """Judges the steps of a simulation, and returns whether all certificates were right.
+
+    Args:
+        seed: Seed of the simulation; every third one is of whole steps.
+        judged: Counts of steps so far, by kind of scene.
+        most: Most steps.
+        device: Warp device.
+    """
+    settings = Settings.draw(seed)
+    simulation, counts = Simulation(settings, device), judged[settings.kind]
+    with contextlib.redirect_stdout(io.StringIO()):  # Style3D prints how long it prepared
+        solver = simulation.make_solver(coupling=settings.coupling if seed % 3 else None)
+    rollout, pipeline = Rollout(simulation.model, solver), newton.CollisionPipeline(simulation.model)
+    contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
+    wrong = 0
+    for _ in range(min(most, settings.rate // 3)):
+        if settings.contacts:
+            pipeline.collide(rollout.states[0], contacts)
+        rollout.step(1.0 / settings.rate, contacts)
+        wrong += counts.add(rollout)
+    return not wrong
 
 
 def _rotation(rng):
@@ -209,9 +243,9 @@ def main() -> int:
     parser.add_argument("--device", help="Warp device")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
-    table = Table("scene", "steps", "touching", "cut or frozen", "uncertified", "wrong")
+    table = Table("scene", "steps", "touching", "cut", "uncertified", "wrong")
     wrong = 0
-    each = -(-options.steps // len(SCENES))
+    each = -(-options.steps // (2 * len(SCENES)))
     for name, scene in SCENES.items():
         stress = None
         for i in range(each):
@@ -224,6 +258,15 @@ def main() -> int:
                 print(f"wrong: {name}, --seed {seed}, step {i % 100}", flush=True)
         table.add_row(name, *(str(count) for count in vars(stress.judged).values()))
         wrong += stress.judged.wrong
+    simulated = {kind: Judged() for kind in KINDS}
+    seed = options.seed
+    while (left := options.steps // 2 - sum(judged.steps for judged in simulated.values())) > 0:
+        if not simulate(seed, simulated, left, options.device):
+            print(f"wrong: simulation, seed {seed} ({Settings.draw(seed)})", flush=True)
+        seed += 1
+    for kind, judged in simulated.items():
+        table.add_row(f"simulation: {kind}", *(str(count) for count in vars(judged).values()))
+        wrong += judged.wrong
     Console().print(table)
     return int(wrong > 0)
 

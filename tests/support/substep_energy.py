@@ -172,7 +172,7 @@ class Scene:
         height = 0.01 + self._radius if on_top else low + size + 2.0 * self._radius
         self._add_cloth((-0.3, -0.3, height), 0.6, int(rng.integers(4, 7)))
 
-    def _solver(self, stage, coupling):
+    def make_solver(self, *, stage=True, coupling=None):
         """Returns the inner solver, behind the stage if asked."""
         settings, model = self._settings, self.model
         match settings.inner:
@@ -238,7 +238,7 @@ class Scene:
             duration: How long [s].
         """
         model, settings = self.model, self._settings
-        solver = self._solver(stage, coupling)
+        solver = self.make_solver(stage=stage, coupling=coupling)
         pipeline = newton.CollisionPipeline(model)
         # Style3D needs contacts, if only none
         contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
