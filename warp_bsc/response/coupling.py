@@ -43,6 +43,8 @@ change of the length of an edge in a soft body, as a share of that length."""
 _ALLOCATION_FREE = (SolverVBD, SolverStyle3D)
 """Solvers whose steps allocate no memory, which the body of a condition in a CUDA graph cannot; others may."""
 _STRAIN = wp.constant(STRAIN)
+_COMPRESSION = wp.constant(0.25)
+"""What compression of cloth counts, as a share of the same elongation."""
 _UNCOUPLED = wp.constant(-2)
 """Iteration of the last contact of a world without constraints, so that no projection moves its vertices."""
 _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
@@ -69,14 +71,15 @@ def _measure_strain(
 ):
     """Finds the largest strain of an edge, in each world, between wanted positions and ``x1``.
 
-    Cloth that is compressed buckles and hardly resists, so that only what is longer than at rest counts.
+    Cloth that is compressed buckles, and resists less than cloth that is stretched: a quarter of its compression
+    counts.
     """
     i = wp.tid()
     a = edges[i][0]
     b = edges[i][1]
     wanted = wp.length(motion.x1[a] - motion.x1[b])
     length = wp.length(x1[a] - x1[b])
-    change = length - wp.max(wanted, lengths[i])
+    change = wp.max(length - wp.max(wanted, lengths[i]), _COMPRESSION * (wp.min(wanted, lengths[i]) - length))
     if is_solid[i]:
         change = wp.abs(length - wanted)
     if change > 0.0:
