@@ -131,8 +131,8 @@ def check_instance(value: Any, name: str, types: type | tuple[type, ...], what: 
         raise TypeError(f"{name} must be {what}, not {given(value)}")
 
 
-def as_numpy(array: ArrayLike, name: str) -> np.ndarray:
-    """Returns an array of numbers as NumPy, in this machine's order of bytes.
+def as_numpy(array: ArrayLike, name: str, what: str = "an array of numbers") -> np.ndarray:
+    """Returns an array of numbers, or ``what`` errors call it, as NumPy, in this machine's order of bytes.
 
     Raises:
         TypeError: If its entries are no numbers.
@@ -145,7 +145,7 @@ def as_numpy(array: ArrayLike, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be an array with rows of the same length: {error}") from None
     if values.dtype.kind not in "biufc":
-        raise TypeError(f"{name} must be an array of numbers, not {given(array)}")
+        raise TypeError(f"{name} must be {what}, not {given(array)}")
     return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
 
 
@@ -208,9 +208,10 @@ def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
         ValueError: If they have another shape, are masked, negative or not finite, or are less than
             :data:`LEAST_DISTANCE` and not 0.
     """
-    values = as_numpy(distances, name)
+    what = "one number or an array of numbers"
+    values = as_numpy(distances, name, what)
     if values.dtype.kind not in "iuf":
-        raise TypeError(f"{name} must be one number or an array of numbers, not {given(distances)}")
+        raise TypeError(f"{name} must be {what}, not {given(distances)}")
     if values.shape not in ((), (count,)):
         raise ValueError(f"{name} must be one number or have shape ({count},), not {values.shape}")
     converted = np.ascontiguousarray(_as_double(values)).reshape(values.shape)
@@ -230,7 +231,7 @@ def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
 
 def checked_distance(distance: Any, name: str, *, zero: bool = True) -> float:
     """Returns one distance in double precision, more than 0 unless ``zero``; errors as :func:`checked_distances`."""
-    if isinstance(distance, np.ndarray | list | tuple):
+    if not isinstance(distance, Real) or isinstance(distance, bool):
         raise TypeError(f"{name} must be a number, not {given(distance)}")
     checked = checked_distances(distance, name, 0)
     if not zero and checked == 0.0:
