@@ -243,4 +243,5 @@ def test_scene_that_changes_meanwhile(tmp_path, monkeypatch, capfd, change):
     assert replay_with(monkeypatch, str(path), folder, happens) == 2
     message = f"{path}: the file has changed since it was opened"
     assert capfd.readouterr().err.splitlines()[-1] == f"warp-bsc: error: {message}"
-    assert read_left(folder, f"stopped by an error: {message}") == [3] * 4
+    left = read_left(folder, f"stopped by an error: {message}")
+    assert left in ([3] * 4, [2] * 4)  # nothing is written any more, also where the third is just about to be
