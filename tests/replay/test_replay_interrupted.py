@@ -202,7 +202,12 @@ def test_signal_that_the_program_was_told_to_ignore(tmp_path, monkeypatch, scene
     assert read_left(tmp_path, "") == [FRAMES - 1] * 4
 
 
-def test_replay_in_another_thread(tmp_path, scene):
+def test_replay_in_another_thread(tmp_path, monkeypatch, scene):
+    """A signal that has stopped an earlier replay of the process does not stop it."""
+    (tmp_path / "stopped").mkdir()
+    with monkeypatch.context() as patch:
+        number = signal.SIGTERM
+        assert replay_with(patch, scene, tmp_path / "stopped", lambda: os.kill(os.getpid(), number)) == 128 + number
     status = []
     thread = threading.Thread(target=lambda: status.append(main(["replay", scene, *options(tmp_path)])))
     thread.start()

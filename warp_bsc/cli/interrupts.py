@@ -44,7 +44,7 @@ class _Interrupts:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        self.came, self._raises = None, False
+        self._raises = False
         try:
             for number in _NUMBERS:
                 # None is a handler that was not set from Python; it could not be restored.
@@ -54,6 +54,7 @@ class _Interrupts:
         finally:
             while self._handlers:
                 signal.signal(*self._handlers.popitem())
+            self.came = None  # a later run in another thread would take it for its own
 
     @contextlib.contextmanager
     def raised(self, raises: bool = True) -> Iterator[None]:
