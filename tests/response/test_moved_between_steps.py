@@ -95,7 +95,11 @@ def arm_over_sheet(device, angle):
 def test_joints_may_place_bodies_before_the_first_step(placed, turned, passes, device):
     """An arm that joint coordinates put elsewhere than ``body_q`` begins there; one at its ``body_q`` comes from it."""
     model = arm_over_sheet(device, placed)
+    given = model.body_q.numpy().copy()
+    given[:, 3:] *= -1.0  # the same rotation
+    model.body_q.assign(given)
     rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    assert model.body_q.numpy().tobytes() == given.tobytes()  # the model keeps what it is
     model.joint_q.fill_(turned)
     newton.eval_fk(model, model.joint_q, model.joint_qd, rollout.states[0])
     rollout.step()

@@ -198,9 +198,10 @@ def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
         return np.empty(0, dtype=int)
     state = model.state()
-    assert model.joint_q is not None and model.joint_qd is not None and model.body_q is not None and state.body_q
+    assert model.joint_q is not None and model.joint_qd is not None and model.body_q is not None
+    assert state.body_q is not None
     newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-    placed, given = state.body_q.numpy(), model.body_q.numpy()
+    placed, given = state.body_q.numpy(), model.body_q.numpy().copy()  # of the CPU, it is the model's own memory
     given[(placed[:, 3:] * given[:, 3:]).sum(axis=1) < 0.0, 3:] *= -1.0  # the same rotation
     return np.flatnonzero(np.abs(placed - given).max(axis=1) > _SAME_POSE)
 
@@ -291,7 +292,7 @@ class ModelMotion:
             last: Positions of the vertices at the end of the last step, which the response keeps.
         """
         self._last = last
-        positions, planes = self.vertices.x0.numpy(), self.planes.end.numpy()
+        positions, planes = self.vertices.x0.numpy().copy(), self.planes.end.numpy().copy()
         misplaced = _find_misplaced_bodies(self.mesh.model)
         first = self.mesh.model.particle_count
         positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
