@@ -18,11 +18,10 @@ from newton_scenes import (
     add_plates,
     bullet,
     place_plates,
-    status,
 )
 
 import warp_bsc as bsc
-from warp_bsc.response.buffers import DIVIDED, PROJECTED
+from warp_bsc.response.state.structs import DIVIDED, PROJECTED
 
 
 def check_rest(rollout, dt, steps):
@@ -103,7 +102,7 @@ def test_a_wanted_position_that_is_not_finite(value, what, device):
         start = rollout.positions
         rollout.step()
         assert rollout.solver.report.certified and not rollout.solver.report.undetected
-        assert status(rollout.solver, "lost") == 1
+        assert rollout.solver.report.not_finite == 1
         hits += rollout.solver.report.hits
         assert rollout.positions[lost].tobytes() == start[lost].tobytes()
         assert (rollout.velocities[lost] == 0.0).all()
@@ -114,7 +113,7 @@ def test_a_wanted_position_that_is_not_finite(value, what, device):
     assert rollout.solver.report.frozen_steps == 0
     rollout.solver.solver.change = None
     rollout.step()
-    assert status(rollout.solver, "lost") == 0 and rollout.solver.report.certified
+    assert rollout.solver.report.not_finite == 0 and rollout.solver.report.certified
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -173,7 +172,7 @@ def test_any_positions_that_are_not_finite(shot, share, seed):
         start = shot.positions
         shot.step()
         assert shot.solver.report.certified
-        assert status(shot.solver, "lost") == len(lost)
+        assert shot.solver.report.not_finite == len(lost)
         assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
         still = (shot.positions[lost] == start[lost]).all(axis=1)
         assert still.all() or shot.solver.report.hits  # another may push it
@@ -193,7 +192,7 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
     builder.color()
     model = builder.finalize(device=device)
     rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
-    rollout.solver._response.max_iterations = iterations
+    rollout.solver._work.status.max_iterations = iterations
     certified, uncertified = [], 0
     for next_gap in gaps:
         gap = next_gap
@@ -226,7 +225,7 @@ def test_shapes_may_pass_through_each_other(device):
         rollout.step()
         report = rollout.solver.report
         assert (report.certified, report.hits, report.remaining) == (True, 0, 0)
-        assert status(rollout.solver, "crossings") == 0
+        assert rollout.solver.report.crossings == 0
     np.testing.assert_array_equal(rollout.positions, np.float32(cloth))
 
 
@@ -246,7 +245,7 @@ def test_vertices_that_start_in_the_solid_of_a_plane(device):
         assert rollout.solver.report.certified and rollout.solver.report.frozen == 0
         assert rollout.positions[below].tobytes() == wanted[below].tobytes()
         assert rollout.positions[~below, 2].min() > 0.0
-        excluded += status(rollout.solver, "excluded")
+        excluded += rollout.solver.report.excluded
     assert excluded == 2 * below.sum()  # in two steps they also end there
     assert rollout.positions[below, 2].min() > 0.0
 
@@ -260,7 +259,7 @@ def test_worlds_do_not_notice_each_other(trouble, device):
         middle = np.arange(model.particle_count // 3, 2 * model.particle_count // 3)
         patch = middle[-81:]
         rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
-        response = rollout.solver._response
+        response = rollout.solver._work
         if trouble != "jammed":
             response.max_iterations = 2  # as many as the other worlds need
         state = rollout.states[0]
@@ -286,11 +285,11 @@ def test_worlds_do_not_notice_each_other(trouble, device):
             outcome = response.vertices.outcome.numpy()
             assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
             troubled |= {
-                "crossing": status(rollout.solver, "crossings") > 0 and status(rollout.solver, "excluded") > 0,
-                "lost": status(rollout.solver, "lost") > 0,
+                "crossing": rollout.solver.report.crossings > 0 and rollout.solver.report.excluded > 0,
+                "lost": rollout.solver.report.not_finite > 0,
                 "broken": not rollout.solver.report.certified,
                 "divided": bool((outcome & int(DIVIDED)).any()),
-                "jammed": rollout.solver.report.rounds > 3,
+                "jammed": rollout.solver.report.iterations > 3,
             }[trouble]
         assert troubled == (not calm) and hits > 100
         ends.append(np.stack(bits).tobytes())
@@ -320,7 +319,7 @@ def test_the_rollers_of_newton(device, monkeypatch):
         moved[: example.num_cloth_verts].max(),
         (moved[: example.num_cloth_verts] > 1e-3).sum(),
         report,
-        status(stages[0], "crossings"),
+        stages[0].report.crossings,
     )
     assert (moved[: example.num_cloth_verts] > 1e-3).sum() > 100
     assert moved[example.num_cloth_verts :].min() > 0.5

@@ -7,7 +7,7 @@ import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch
 
 import warp_bsc as bsc
-from warp_bsc.response.buffers import DIVIDED, FROZEN, PROJECTED
+from warp_bsc.response.state.structs import DIVIDED, FROZEN, PROJECTED
 
 IDENTITY = wp.transform_identity()
 
@@ -71,7 +71,7 @@ def momenta(model, state):
 
 def check_vertices(rollout):
     """Asserts that the certified vertices are those of the poses of the state, bit by bit."""
-    certified = rollout.solver._response.vertices.x1.numpy()
+    certified = rollout.solver._work.vertices.x1.numpy()
     assert certified.tobytes() == rollout.vertices(rollout.states[0]).tobytes()
 
 
@@ -195,7 +195,7 @@ def test_a_body_that_projection_does_not_stop_is_put_back_as_one(freezes, device
     """Its pose goes back along its path until its vertices are on their sides, or to its start."""
     model = ball_and_sheet(device, fixed=True, n=8)
     rollout = Rollout(model, bsc.SolverCCD(free(model)))
-    response = rollout.solver._response
+    response = rollout.solver._work
     response.max_iterations = 0
     if freezes:
         response.progress.max_truncations = 0
@@ -244,7 +244,7 @@ def test_bodies_that_cannot_be_moved_keep_every_bit(why, device):
         assert solver.report.certified
         start, end = end, start
     else:
-        assert solver.report.rounds > 0 and start.particle_q.numpy()[:, 2].min() < -0.03
+        assert solver.report.iterations > 0 and start.particle_q.numpy()[:, 2].min() < -0.03
 
 
 def test_coupling_stops_a_ball_earlier(device):
@@ -374,7 +374,7 @@ def test_cloth_pushes_no_box_into_the_ground(tilt, device):
         rollout.step()
         assert rollout.solver.report.certified
         lowest = lowest_vertex(rollout, rollout.states[0])
-        assert lowest > 0.0 or lowest > min(before, wanted[-1]) - 0.05 * rollout.solver._response.separation
+        assert lowest > 0.0 or lowest > min(before, wanted[-1]) - 0.05 * rollout.solver._work.separation
         pushed += lowest < wanted[-1] - 1e-4
     assert pushed > 0
 

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warp_bsc as bsc
-from warp_bsc.response.adjoint import RecordedStep, StepAdjoint
+from warp_bsc.response.adjoint.adjoint import RecordedStep, StepAdjoint
 
 DT = 0.01
 
@@ -96,8 +96,8 @@ class Step:
         )
         options = {"friction": self.friction, "restitution": self.restitution, "bodies": True}
         self.solver = bsc.SolverCCD(Still(model), **options)
-        self.solver._response.max_iterations = projections
-        self.solver._response.progress.max_truncations = truncations
+        self.solver._work.status.max_iterations = projections
+        self.solver._work.progress.max_truncations = truncations
         self.states = start, end = model.state(), model.state()
         self.arrays = {
             "start_q": start.particle_q,
@@ -225,7 +225,7 @@ def test_an_incomplete_record_gives_nan(device):
     scene.end(scene.values)
     with wp.Tape():
         scene.solver.step(*scene.states, None, None, DT)
-    response = scene.solver._response
+    response = scene.solver._work
     recorded = RecordedStep(scene.solver._motion, response.resolution, scene.solver._recorder, DT)
     arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
     for complete in (1, 0):

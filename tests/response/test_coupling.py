@@ -9,7 +9,7 @@ import warp as wp
 from newton_scenes import DT, SOFT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.coupling import edges_at_rest
+from warp_bsc.response.substeps.strain import edges_at_rest
 
 
 def drape(device):
@@ -399,7 +399,7 @@ def test_a_moving_plate_pushes_in_each_substep(device):
         end.body_q.assign(np.float32([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]]))
         solver.step(start, end, model.control(), None, DT)
         assert solver.report.certified
-        is_pushed = solver._response.progress.fast.numpy()[0] == 1  # so that no vertex is left in the way
+        is_pushed = solver._work.progress.fast.numpy()[0] == 1  # so that no vertex is left in the way
         assert is_pushed or solver.report.hits == 0
         start, end = end, start
     assert solver.report.coupled_steps > 8

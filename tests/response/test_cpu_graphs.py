@@ -187,7 +187,7 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
                 wp.capture_launch(capture.graph)
             else:
                 step()
-            reports.append([solver.report.hits, solver.report.rounds, solver.report.truncated_steps])
+            reports.append([solver.report.hits, solver.report.iterations, solver.report.truncated_steps])
         assert (solver.report.steps, solver.report.uncertified_steps) == (8, 0)
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy(), reports])
     assert np.max(reports, axis=0)[1] > 1
@@ -243,7 +243,12 @@ def test_a_replay_without_room_is_taken_back():
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
         retaken.append((steps.retaken, int(replays.numpy()[0])))
         report = solver.report
-        assert (report.steps, report.undetected_steps, report.lost_gradients, report.uncertified_steps) == (7, 0, 0, 0)
+        assert (report.steps, report.undetected_steps, report.lost_gradients, report.uncertified_steps) == (
+            7,
+            0,
+            0,
+            0,
+        )
     assert retaken == [(2, 6), (0, 0)]  # the first run is outside the graph
     for actual, expected in zip(*ends, strict=True):
         np.testing.assert_array_equal(actual, expected)

@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_crossing_sheets, add_patch, crossing_sheets, status
+from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_crossing_sheets, add_patch, crossing_sheets
 from stage_stress import SCENES, Stress
 
 import warp_bsc as bsc
@@ -42,8 +42,8 @@ def test_crossing_sheets(pull, steps, device):
     for _ in range(steps):
         rollout.step()
         assert rollout.solver.report.certified
-        assert status(rollout.solver, "crossings") == len(before)
-        excluded += status(rollout.solver, "excluded")
+        assert rollout.solver.report.crossings == len(before)
+        excluded += rollout.solver.report.excluded
         before = check_new_crossings(rollout, before)
         counts.append(len(before))
     assert counts[0] > 20
@@ -86,7 +86,7 @@ def test_the_count_is_that_of_exact_detection(device):
             rollout.states[0].particle_q.assign(moved)
         expected = len(rollout.find_crossings(rollout.positions))
         rollout.step()
-        assert status(rollout.solver, "crossings") == expected
+        assert rollout.solver.report.crossings == expected
         assert rollout.solver.report.certified and rollout.collisions == 0
         counts.append(expected)
     assert [count > 0 for count in counts] == [bool(int(digit)) for digit in "001110010"]
@@ -105,7 +105,7 @@ def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):
     for _ in range(5):
         rollout.step()
         assert rollout.solver.report.certified
-        assert status(rollout.solver, "crossings") > 0
+        assert rollout.solver.report.crossings > 0
         hits += rollout.solver.report.hits
     assert rollout.collisions == 0 and hits > 100
     assert rollout.velocities[-49:, 2].mean() > -20.0
@@ -124,7 +124,7 @@ def test_a_vertex_on_a_face(velocity, device):
     rollout.step()
     assert rollout.solver.report.certified and rollout.collisions == 0
     assert rollout.solver.report.frozen == 0
-    assert status(rollout.solver, "crossings") == 0
+    assert rollout.solver.report.crossings == 0
     if velocity[2] > 0.0:
         assert rollout.positions.tobytes() == wanted.tobytes()
     assert np.abs(rollout.positions - wanted)[-3:].max() < 0.1 * DT
@@ -220,7 +220,7 @@ def test_a_sheet_that_folds_within_its_plane_is_stopped(device):
     assert rollout.find_collisions(start, folded)
     rollout.step()
     assert rollout.solver.report.certified and rollout.collisions == 0
-    assert status(rollout.solver, "excluded") == status(rollout.solver, "crossings") == 0
+    assert rollout.solver.report.excluded == rollout.solver.report.crossings == 0
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -9,8 +9,8 @@ from newton.solvers import SolverBase
 from newton_scenes import SOFT, SOLVERS, Rollout, add_patch
 
 import warp_bsc as bsc
-from warp_bsc.response import inner_contacts
-from warp_bsc.response.model_mesh import ModelMesh
+from warp_bsc.response.state.mesh import ModelMesh
+from warp_bsc.response.substeps import inner_contacts
 
 RATE = 60
 

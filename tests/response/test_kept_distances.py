@@ -52,7 +52,7 @@ def test_a_bullet(speed, iterations, device):
     """It stops at the distance, by projection, and by planes alone."""
     model, distance = bullet(speed, device), 0.012
     rollout = DistanceRollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), min_distance=distance), distance)
-    rollout.solver._response.max_iterations = iterations
+    rollout.solver._work.status.max_iterations = iterations
     hits = 0
     for _ in range(8 if speed < 50.0 else 4):
         rollout.step()
@@ -273,7 +273,7 @@ def test_bodies_alone(device):
         states[0].clear_forces()
         solver.step(*states, model.control(), None, DT)
         states = states[::-1]
-        rounds += solver.report.rounds
+        rounds += solver.report.iterations
         assert solver.report.certified
         if step % 20 == 19:
             mesh.positions(states[0].particle_q, states[0].body_q, x)

@@ -88,14 +88,19 @@ def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(scen
         assert report.remaining == report.hits
         assert report.certified == (report.hits == 0) == (len(report.uncertified_vertices) == 0)
         assert report.crossings == len(rollout.detector.find_intersections(x0))
-        assert (report.rounds, report.truncated, report.frozen, report.lost) == (0, 0, 0, 0)
+        assert (report.iterations, report.truncated, report.frozen, report.not_finite) == (0, 0, 0, 0)
         hits, excluded, crossings = hits + report.hits, excluded + report.excluded, crossings + report.crossings
         uncertified += not report.certified
     assert hits > 100
     assert (excluded > 0) == (crossings > 0) == (scene is blade)  # the other is through within one step
     assert 0 < uncertified < 8 and equal > 0
     assert (report.steps, report.uncertified_steps) == (8, uncertified)
-    assert (report.truncated_steps, report.frozen_steps, report.lost_steps, report.undetected_steps) == (0, 0, 0, 0)
+    assert (report.truncated_steps, report.frozen_steps, report.not_finite_steps, report.undetected_steps) == (
+        0,
+        0,
+        0,
+        0,
+    )
 
 
 def test_the_monitor_is_the_stage_without_a_response(device):
@@ -203,7 +208,7 @@ def test_a_particle_without_a_wanted_position_stands_and_is_counted(device):
         np.testing.assert_array_equal(rollout.positions[last], before[last])
         assert (rollout.positions[last - 1] != before[last - 1]).any()
     report = rollout.solver.report
-    assert (report.lost, report.lost_steps, report.frozen_steps, report.uncertified_steps) == (1, 2, 0, 0)
+    assert (report.not_finite, report.not_finite_steps, report.frozen_steps, report.uncertified_steps) == (1, 2, 0, 0)
     assert report.certified and len(report.uncertified_vertices) == 0
     assert str(report).endswith("0 not certified, 2 steps with positions that are not finite")
 
@@ -215,7 +220,7 @@ def test_the_monitor_does_not_certify_positions_that_are_not_finite(device):
     start, end = model.state(), model.state()
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
-    assert (report.lost, report.lost_steps, report.hits, report.uncertified_steps) == (1, 1, 0, 1)
+    assert (report.not_finite, report.not_finite_steps, report.hits, report.uncertified_steps) == (1, 1, 0, 1)
     assert np.isnan(end.particle_q.numpy()[last]).all()
     np.testing.assert_array_equal(report.uncertified_vertices, particles_of_elements_with(model, last))
 
@@ -244,7 +249,7 @@ def test_a_body_without_a_position_leaves_a_step_uncertified(make, device):
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
     assert not report.certified and report.uncertified_steps == 1
-    assert report.lost == 0 and len(report.uncertified_vertices) == 0
+    assert report.not_finite == 0 and len(report.uncertified_vertices) == 0
 
 
 def test_particles_that_kinematic_ones_squeeze_are_named(device):

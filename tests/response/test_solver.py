@@ -7,7 +7,8 @@ import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.constraints import EDGE_EDGE_PROXIMITY, MAX_ITERATIONS, VERTEX_FACE_PROXIMITY
+from warp_bsc.response.contacts.constraints import EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY
+from warp_bsc.response.schedule import MAX_ITERATIONS
 
 SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
 
@@ -79,7 +80,7 @@ def test_without_collisions_nothing_changes(inner, device):
     for _ in range(3):
         staged.step()
         report = staged.solver.report
-        assert (report.hits, report.rounds, report.truncated, report.frozen, report.certified) == (0, 0, 0, 0, True)
+        assert (report.hits, report.iterations, report.truncated, report.frozen, report.certified) == (0, 0, 0, 0, True)
         assert staged.positions.tobytes() == wanted[0].tobytes()
         assert staged.velocities.tobytes() == wanted[1].tobytes()
 
@@ -103,7 +104,7 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
         assert rollout.collisions == 0 and rollout.solver.report.certified and rollout.solver.report.truncated == 0
         heights = rollout.positions[:, 2].reshape(6, -1)
         assert (np.diff(heights.mean(axis=1), prepend=0.0) > 0.0).all()
-        return rollout.solver.report.rounds
+        return rollout.solver.report.iterations
 
     with_proximities = rounds()
     monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
@@ -121,7 +122,7 @@ def test_proximities_are_of_neighbours_in_a_pile(device):
     model = builder.finalize(device=device)
     rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
     rollout.step()
-    constraints = rollout.solver._response.constraints
+    constraints = rollout.solver._work.constraints
     kinds, corners = (
         array.numpy()[: constraints.count.numpy()[0]] for array in (constraints.kind, constraints.vertices)
     )
@@ -369,7 +370,7 @@ def test_a_graph_without_room_is_certified_too(device):
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
-    leave_capacity_for_one_contact(rollout.solver._response.detector)
+    leave_capacity_for_one_contact(rollout.solver._work.detector)
     start, end = rollout.states
     with wp.ScopedCapture(device) as capture:
         start.clear_forces()
@@ -401,7 +402,7 @@ def test_captured_steps_retake_nothing_that_a_graph_completes(device):
 
     steps = bsc.CapturedSteps(frame, rollout.solver, [rollout.states[0]])
     steps()
-    leave_capacity_for_one_contact(rollout.solver._response.detector)
+    leave_capacity_for_one_contact(rollout.solver._work.detector)
     steps._capture()
     for _ in range(5):
         steps()

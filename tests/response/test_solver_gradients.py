@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import warp_bsc as bsc
-from warp_bsc.response.adjoint import RecordedStep, StepAdjoint
-from warp_bsc.response.response import Resolution
+from warp_bsc.response.adjoint.adjoint import RecordedStep, StepAdjoint
+from warp_bsc.response.state.workspace import Resolution
 
 DT = 1.0 / 600.0
 STEPS = 40
@@ -66,7 +66,7 @@ class Throw:
         model.particle_grid = None
         self.solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False), **options)
         if projections is not None:
-            self.solver._response.max_iterations = projections
+            self.solver._work.status.max_iterations = projections
         self.states = [model.state() for _ in range(steps + 1)]
         self.control = model.control()
         self.velocity = wp.zeros(1, dtype=wp.vec3, device=device, requires_grad=requires_grad)
@@ -192,7 +192,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(motion, friction, res
         builder.add_ground_plane()
     model = builder.finalize(device=device, requires_grad=True)
     solver = bsc.SolverCCD(Still(model), friction=friction, restitution=restitution)
-    solver._response.max_iterations = projections
+    solver._work.status.max_iterations = projections
     random = np.random.default_rng(0)
     n, dt = len(start), 0.01
     first = [np.array(start), wanted, (wanted - start) / dt + random.normal(scale=0.1, size=(n, 3))]
@@ -321,7 +321,7 @@ def test_an_incomplete_record_gives_nan(device):
     scene.velocity.assign(np.float32([[0.0, 0.0, -9.0]]))
     scene.backward()
     solver = scene.solver
-    response = solver._response
+    response = solver._work
     resolution = Resolution(response.vertices, response.constraints, response.status, response._status_values)
     recorded = RecordedStep(solver._motion, resolution, solver._recorder, DT)
     arrays = [wp.zeros(scene.model.particle_count, dtype=wp.vec3, device=device) for _ in range(3)]

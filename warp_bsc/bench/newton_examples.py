@@ -581,7 +581,7 @@ class _Crossings:
 
     def __init__(self, example: Any):
         from ..detection.detector import CollisionDetector  # noqa: PLC0415 (response, below, imports Newton)
-        from ..response.model_mesh import ModelMesh  # noqa: PLC0415 (imports Newton)
+        from ..response.state.mesh import ModelMesh  # noqa: PLC0415 (imports Newton)
 
         model = getattr(example, "model", None)
         self._example = example

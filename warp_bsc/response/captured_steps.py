@@ -11,8 +11,6 @@ from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
 from .solver_ccd import SolverCCD
 
-__all__ = ["CapturedSteps"]
-
 
 class CapturedSteps:
     """Runs a function that steps a solver on a tape, on a GPU from a CUDA graph.

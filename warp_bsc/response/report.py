@@ -6,14 +6,11 @@ import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
-from .buffers import FROZEN, TRUNCATED
 from .inside import Inside, InsideFinder
-from .model_mesh import ModelMesh
-from .model_motion import ModelMotion
-from .response import Response
-from .step_record import name_elements
-
-__all__ = ["SolverReport", "StepTotals"]
+from .schedule import views_of
+from .state.motion import ModelMotion
+from .state.structs import FROZEN, TRUNCATED
+from .state.workspace import Workspace
 
 
 @wp.struct
@@ -26,7 +23,7 @@ class StepTotals:
     undetected_steps: wp.array[wp.int64]
     truncated_steps: wp.array[wp.int64]
     frozen_steps: wp.array[wp.int64]
-    lost_steps: wp.array[wp.int64]
+    not_finite_steps: wp.array[wp.int64]
     remaining: wp.array[wp.int64]
     excluded: wp.array[wp.int64]
     layerless_steps: wp.array[wp.int64]  # whose contact layer pushed nothing
@@ -37,7 +34,7 @@ class StepTotals:
 class SolverReport:
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
-    Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver wanted is the motion
+    Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver predicted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
     or frozen.
 
@@ -48,7 +45,7 @@ class SolverReport:
     def __init__(
         self,
         motion: ModelMotion,
-        response: Response,
+        work: Workspace,
         substeps: wp.array[int],
         *,
         responds: bool = True,
@@ -56,10 +53,10 @@ class SolverReport:
     ):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._substeps = substeps
-        self._motion, self._response, self._responds = motion, response, responds
+        self._motion, self._work, self._responds = motion, work, responds
         self.speed_limit_lifted = lifts
-        self._totals_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=response.device)
-        self._totals = name_elements(StepTotals, self._totals_values)
+        self._totals_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
+        self._totals = views_of(StepTotals, self._totals_values)
         self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
         self._end: float | wp.Event | None = None
 
@@ -73,12 +70,12 @@ class SolverReport:
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.
         """
-        return bool(_read(self._response.status.certified))
+        return bool(_read(self._work.status.results.certified))
 
     @property
     def hits(self) -> int:
-        """Contacts of the motion that the inner solver wanted in the last step, without those excluded."""
-        return _read(self._response.status.first_hits)
+        """Contacts of the motion that the inner solver predicted in the last step, without those excluded."""
+        return _read(self._work.status.results.first_hits)
 
     @property
     def remaining(self) -> int:
@@ -86,7 +83,7 @@ class SolverReport:
 
         With a response, they could not be resolved, because kinematic vertices leave no room.
         """
-        return _read(self._response.status.remaining)
+        return _read(self._work.status.results.remaining)
 
     @property
     def excluded(self) -> int:
@@ -94,7 +91,7 @@ class SolverReport:
 
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
-        return _read(self._response.status.excluded)
+        return _read(self._work.status.results.excluded)
 
     @property
     def body_contacts(self) -> int:
@@ -104,7 +101,7 @@ class SolverReport:
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
         the response moves no bodies, and counts nothing that it keeps apart (``bodies=True``).
         """
-        return _read(self._response.status.body_contacts)
+        return _read(self._work.status.results.body_contacts)
 
     @property
     def crossings(self) -> int:
@@ -113,15 +110,15 @@ class SolverReport:
         Only pairs that floating point certifies to cross count; :attr:`intersections` lists all of them. In a CUDA
         graph the number is a lower bound if there are more candidates than its queues hold.
         """
-        return _read(self._response.status.crossings)
+        return _read(self._work.status.results.crossings)
 
     @property
-    def lost(self) -> int:
+    def not_finite(self) -> int:
         """Particles whose position or velocity was not finite after the inner solver in the last step.
 
         They stood where they were at the start. Without a response they are left as the inner solver made them.
         """
-        return _read(self._response.status.lost)
+        return _read(self._work.status.results.not_finite)
 
     @property
     def uncertified_vertices(self) -> np.ndarray:
@@ -137,12 +134,12 @@ class SolverReport:
             return np.empty(0, dtype=np.int32)
         if self.undetected:
             return np.arange(particles, dtype=np.int32)
-        vertices = self._response.vertices
+        vertices = self._work.vertices
         listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
         x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
         invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
         if not self._responds:
-            invalid |= self._motion.vertices.is_lost.numpy() != 0
+            invalid |= self._motion.vertices.is_not_finite.numpy() != 0
         for elements in (self._mesh.faces, self._mesh.edges):
             listed[elements[invalid[elements].any(axis=1)]] = True
         return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
@@ -158,7 +155,7 @@ class SolverReport:
         if self.certified or not model.body_count:
             return np.empty(0, dtype=np.int32)
         first = model.particle_count
-        listed = (self._response.vertices.changed.numpy() != 0) | (self._motion.vertices.is_lost.numpy() != 0)
+        listed = (self._work.vertices.changed.numpy() != 0) | (self._motion.vertices.is_not_finite.numpy() != 0)
         bodies = np.unique(self._mesh.shape_vertices.body[listed[first:]])
         return bodies[bodies >= 0].astype(np.int32)
 
@@ -169,12 +166,12 @@ class SolverReport:
         This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
         :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
         """
-        return bool(_read(self._response.status.undetected))
+        return bool(_read(self._work.status.results.undetected))
 
     @property
-    def rounds(self) -> int:
+    def iterations(self) -> int:
         """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
-        return _read(self._response.status.rounds)
+        return _read(self._work.status.results.iterations)
 
     @property
     def truncated(self) -> int:
@@ -210,7 +207,7 @@ class SolverReport:
         nothing any more: later steps are certified, and leave it where it is. See :class:`.inside.InsideFinder` for
         what counts. Computed on each access, on the host.
         """
-        return self._inside_finder.find(self._response.vertices.x1, self._motion.planes.end)
+        return self._inside_finder.find(self._work.vertices.x1, self._motion.planes.end)
 
     @functools.cached_property
     def _inside_finder(self):
@@ -263,9 +260,9 @@ class SolverReport:
         return _read(self._totals.undetected_steps)
 
     @property
-    def lost_steps(self) -> int:
-        """Steps so far with positions or velocities of particles that were not finite, see :attr:`lost`."""
-        return _read(self._totals.lost_steps)
+    def not_finite_steps(self) -> int:
+        """Steps so far with positions or velocities of particles that were not finite, see :attr:`not_finite`."""
+        return _read(self._totals.not_finite_steps)
 
     @property
     def total_remaining(self) -> int:
@@ -308,7 +305,7 @@ class SolverReport:
         """Returns the steps so far, in one line, and what crosses at the start of the last."""
         line = (
             f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
-            f"left standing, {self.uncertified_steps} not certified"
+            f"frozen, {self.uncertified_steps} not certified"
         )
         if self.coupled_steps:
             line += f", {self.coupled_steps} coupled"
@@ -318,20 +315,18 @@ class SolverReport:
             line += f", {self.crossings} crossings at the start"
         if self.total_remaining or self.total_excluded:
             line += f"; contacts: {self.total_remaining} remained, {self.total_excluded} excluded"
-        if self.lost_steps:
-            line += f", {self.lost_steps} steps with positions that are not finite"
+        if self.not_finite_steps:
+            line += f", {self.not_finite_steps} steps with positions that are not finite"
         if self.grazing or self.lost_gradients:
             line += f"; gradients: {self.grazing} grazing contacts, {self.lost_gradients} steps lost"
         return line
 
     @property
     def _mesh(self):
-        mesh = self._response.detector.mesh
-        assert isinstance(mesh, ModelMesh)
-        return mesh
+        return self._work.mesh
 
     def _count_vertices(self, bit):
-        vertices = self._response.vertices
+        vertices = self._work.vertices
         counts = [vertices.outcome] + ([vertices.bodies.outcome] if vertices.bodies.outcome else [])
         return sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in counts)
 

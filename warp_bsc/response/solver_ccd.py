@@ -21,26 +21,24 @@ from .._arguments import (
 )
 from .._one_thread import Occupied, one_at_a_time
 from ..detection.host_function import run_on_host
-from .adjoint import RecordedStep, StepAdjoint
-from .buffers import FROZEN, LOST, TRUNCATED, MovedBodies, SolveStatus
-from .contact_layer import ContactLayer
-from .coupling import SUBSTEPS, Coupling
-from .coupling_hooks import CouplingHooks
-from .friction import Friction
-from .inner_contacts import InnerContacts, without_own_contacts
-from .model_mesh import ModelMesh
-from .model_motion import ModelMotion
+from .adjoint.adjoint import RecordedStep, StepAdjoint
+from .integration.coupling_interface import CouplingHooks
+from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
+from .layer.contact_layer import ContactLayer
 from .report import SolverReport, StepTotals
-from .response import MAX_SWEEPS_PER_STEP, Response
-from .speed_limit import has_speed_limit, without_speed_limit
-from .step_record import RecordCounts, StepRecorder
-
-__all__ = ["CollisionMonitor", "SolverCCD"]
+from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, SolveStatus
+from .state.friction import Friction
+from .state.mesh import ModelMesh
+from .state.motion import ModelMotion
+from .state.record import RecordCounts, StepRecorder
+from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, MovedBodies
+from .state.workspace import Workspace
+from .step import inspect, resolve
+from .substeps.inner_contacts import InnerContacts, without_own_contacts
+from .substeps.substeps import Coupling
+from .tuning import SEPARATION, SUBSTEPS
 
 _MOST_SUBSTEPS = 1024
-
-_SEPARATION = 5e-3
-"""Default distance that contacts are moved apart, as a share of the median edge length."""
 
 
 @wp.kernel(enable_backward=False)
@@ -57,18 +55,18 @@ def _write_back(
     """Writes the particles that the response changed; the others keep every bit of what they are."""
     particle = wp.tid()
     if particle >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
-        if outcome[particle] & LOST != 0:
-            status.certified[0] = 0
+        if outcome[particle] & NOT_FINITE != 0:
+            status.results.certified[0] = 0
         return
     if outcome[particle] != 0:
         particle_q[particle] = x1[particle]
         particle_qd[particle] = velocity[particle]
     if outcome[particle] & TRUNCATED != 0:
-        status.truncated[0] = 1
+        status.results.truncated[0] = 1
     if outcome[particle] & FROZEN != 0:
-        status.frozen[0] = 1
-    if outcome[particle] & LOST != 0:
-        wp.atomic_add(status.lost, 0, 1)
+        status.results.frozen[0] = 1
+    if outcome[particle] & NOT_FINITE != 0:
+        wp.atomic_add(status.results.not_finite, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -94,9 +92,9 @@ def _write_back_bodies(
     if body_q_prev:
         body_q_prev[body] = bodies.pose[body]
     if outcome & TRUNCATED != 0:
-        status.truncated[0] = 1
+        status.results.truncated[0] = 1
     if outcome & FROZEN != 0:
-        status.frozen[0] = 1
+        status.results.frozen[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -113,29 +111,31 @@ def _finish_inspection(
     """
     vertex = wp.tid()
     if vertex == 0:
-        status.first_hits[0] = status.remaining[0]
-        status.rounds[0] = 0
-    if outcome[vertex] & LOST != 0:
-        status.certified[0] = 0
+        status.results.first_hits[0] = status.results.remaining[0]
+        status.results.iterations[0] = 0
+    if outcome[vertex] & NOT_FINITE != 0:
+        status.results.certified[0] = 0
         if vertex < particle_count:
-            wp.atomic_add(status.lost, 0, 1)
+            wp.atomic_add(status.results.not_finite, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
 def _count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals):
     """Adds a step to the totals."""
     # a certified motion of elements that did not cross makes no crossings
-    unchanged = status.certified[0] == 1 and status.crossings[0] == 0 and status.excluded[0] == 0
-    status.recount[0] = wp.where(unchanged, 0, 1)
+    unchanged = (
+        status.results.certified[0] == 1 and status.results.crossings[0] == 0 and status.results.excluded[0] == 0
+    )
+    status.loop.recount[0] = wp.where(unchanged, 0, 1)
     totals.steps[0] += wp.int64(1)
     totals.coupled_steps[0] += wp.int64(wp.min(substeps[0], 1))
-    totals.uncertified_steps[0] += wp.int64(1 - status.certified[0])
-    totals.undetected_steps[0] += wp.int64(status.undetected[0])
-    totals.truncated_steps[0] += wp.int64(status.truncated[0])
-    totals.frozen_steps[0] += wp.int64(status.frozen[0])
-    totals.lost_steps[0] += wp.int64(wp.min(status.lost[0], 1))
-    totals.remaining[0] += wp.int64(status.remaining[0])
-    totals.excluded[0] += wp.int64(status.excluded[0])
+    totals.uncertified_steps[0] += wp.int64(1 - status.results.certified[0])
+    totals.undetected_steps[0] += wp.int64(status.results.undetected[0])
+    totals.truncated_steps[0] += wp.int64(status.results.truncated[0])
+    totals.frozen_steps[0] += wp.int64(status.results.frozen[0])
+    totals.not_finite_steps[0] += wp.int64(wp.min(status.results.not_finite[0], 1))
+    totals.remaining[0] += wp.int64(status.results.remaining[0])
+    totals.excluded[0] += wp.int64(status.results.excluded[0])
 
 
 @wp.kernel(enable_backward=False)
@@ -173,14 +173,14 @@ def _paused_tape():
 
 
 class SolverCCD(SolverBase, CouplingHooks):
-    """Lets another solver step, then makes the motion that it wanted free of collisions.
+    """Lets another solver step, then makes the motion that it predicted free of collisions.
 
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
     particles. Particles push dynamic bodies back, see ``bodies``. All other attributes are those of the inner solver.
 
     Elements that cross or touch at the start of a step, and vertices that begin in the solid of an infinite plane, are
     left to the inner solver. So are contacts of which no vertex can be moved. Everything else is certified. A particle
-    whose wanted position or velocity is not finite stays where it was. A position at the start that is not finite
+    whose predicted position or velocity is not finite stays where it was. A position at the start that is not finite
     leaves the step uncertified, without its elements.
 
     Kinematic particles and bodies that a program moves between steps, as animations do, take that way in the next step:
@@ -192,8 +192,8 @@ class SolverCCD(SolverBase, CouplingHooks):
     The certificate is of straight motion: of all vertices between the stored state at the start and the stored state at
     the end, those of shapes between the poses of their bodies. The vertices of a body that turns go in arcs, whose
     distance from their chords (the sagitta) the response adds to the separation of contacts with that body, up to 4
-    times the separation; the arcs themselves are not certified. A body whose wanted pose or velocity is not finite is
-    left to the inner solver, and the step is not certified.
+    times the separation; the arcs themselves are not certified. A body whose predicted pose or velocity is not finite
+    is left to the inner solver, and the step is not certified.
 
     With ``min_distance`` or ``radius`` the certificate is of distances: no pair that started farther apart comes within
     its minimum distance, and none that started nearer comes nearer than it was, beyond rounding: 2^-30 of that distance
@@ -205,7 +205,7 @@ class SolverCCD(SolverBase, CouplingHooks):
 
     A step on a :class:`warp.Tape` carries gradients, if the model was finalized with ``requires_grad=True`` and the
     inner solver is differentiable: from positions and velocities of particles, poses and velocities of bodies at its
-    end to those that the inner solver wanted, to positions and poses at its start, to ``particle_inv_mass``,
+    end to those that the inner solver predicted, to positions and poses at its start, to ``particle_inv_mass``,
     ``body_inv_mass``, ``body_inv_inertia``, ``body_mass``, ``body_inertia`` and ``shape_material_mu`` of the model, and
     to coefficients of friction and restitution that are arrays. The set of contacts is constant; everything else is
     differentiated as it was computed, see :mod:`.adjoint`. With ``requires_grad`` all sweeps are made, so that results
@@ -251,8 +251,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             coupling: Substeps in which the inner solver takes a step that collides, 2 to 1024, so that it pulls
                 against the contacts, see :mod:`.coupling`; None for none. ``"auto"`` takes a step again only where
-                contacts strain cloth or soft bodies by more than 1% against what the inner solver wanted, in up to 32
-                substeps. The stage then resolves contacts of particles with shapes alone, also where ``contacts`` are
+                contacts strain cloth or soft bodies by more than 1% against the prediction of the inner solver, in up to
+                32 substeps. The stage then resolves contacts of particles with shapes alone, also where ``contacts`` are
                 passed to :meth:`step`: cloth rests at the shape, or with ``radius`` at that distance.
             bodies: Whether dynamic bodies are pushed: their poses and velocities change by mass and inertia, with
                 friction and restitution, so that momentum is kept. Default: particles push them if the inner solver
@@ -261,8 +261,8 @@ class SolverCCD(SolverBase, CouplingHooks):
                 ``report.body_contacts``. True: bodies are kept apart from each other and from static shapes as well, as
                 their flags, groups and filters of collision say, and certified; this needs an inner solver that reads
                 ``body_q`` and ``body_qd`` of the state. False: no body is pushed. Pushes by the stage take no body into
-                an infinite plane that it collides with, nor deeper than it was or is wanted to be; with True, no motion
-                does. Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies
+                an infinite plane that it collides with, nor deeper than it was or is predicted to be; with True, no
+                motion does. Kinematic bodies, bodies without mass, static shapes and infinite planes are never pushed. Bodies
                 that are all kinematic at construction stay so.
             min_distance: Distance that pairs keep [m], vertices from faces and edges from edges, and particles from
                 infinite planes: a pair that started farther apart stays so, and one that started nearer does not come
@@ -331,38 +331,39 @@ class SolverCCD(SolverBase, CouplingHooks):
         keeps_distances = min_distance > 0.0 or bool(radii.any())
         self.mesh = mesh = ModelMesh(model, strands=keeps_distances)
         if separation is None:
-            separation = _SEPARATION * self._median_edge()
+            separation = SEPARATION * self._median_edge()
         if keeps_distances:
             mesh.keep_distances(min_distance, radii, reach=separation if respond else 0.0)
         self._moves_bodies = self._find_moves_bodies(bodies)
         self._motion = ModelMotion(
             mesh, self._friction(friction), moves_bodies=self._moves_bodies, responds_to_bodies=bodies is True
         )
-        self._response = Response(
+        self._work = Workspace(
             mesh,
             separation=float(separation),
             restitution=restitution,
             differentiable=model.requires_grad,
             moves_bodies=self._moves_bodies,
+            max_iterations=MAX_ITERATIONS,
         )
         self._motion.set_start(model.particle_q, model.body_q)
         self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
-        self._response.prepare(self._motion)
+        self._prepare()
         self._recount_crossings()
         if not model.requires_grad:
-            self._motion.remember(self._response.vertices.x1)
+            self._motion.remember(self._work.vertices.x1)
         self._limited = solver if respond and lift_speed_limit and has_speed_limit(solver) else None
         self._coupling = None
         if coupling is not None:
             self._inner_contacts = InnerContacts(mesh, moves_bodies=self._moves_bodies)
             choices = SUBSTEPS if coupling == "auto" else (coupling,)
-            arguments = self._step_inner, solver, mesh, self._motion, self._response, choices
+            arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
             self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
         no_substeps = wp.zeros(1, dtype=int, device=mesh.device)
         self._substeps = no_substeps if self._coupling is None else self._coupling.substeps
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         lifts = self._limited is not None
-        self.report = SolverReport(self._motion, self._response, self._substeps, responds=respond, lifts=lifts)
+        self.report = SolverReport(self._motion, self._work, self._substeps, responds=respond, lifts=lifts)
         self._layer = self._pushed = None
         if contact_layer is not None:
             self._layer = ContactLayer(
@@ -431,9 +432,16 @@ class SolverCCD(SolverBase, CouplingHooks):
                 raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
         return Friction(mesh, of_particles, of_shapes)
 
+    def _prepare(self):
+        """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the results."""
+        resolve(self._work, self._motion, 1.0)
+        for values in self._work.status_values:
+            values.zero_()
+        self._work.vertices.outcome.zero_()
+
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
-        self._response.status.recount.fill_(1)
+        self._work.status.loop.recount.fill_(1)
 
     def _median_edge(self):
         """Returns the median edge length of cloth, soft bodies and ropes at rest [m]; 1 if they have no edges."""
@@ -505,7 +513,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             else:
                 run_on_host(lambda: self._inspect(_arrays(state_out), dt), self.mesh.device)
             if self._coupled is not None:
-                self._coupled.finish(state_out, self._motion.vertices, self._response.vertices)
+                self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
@@ -521,7 +529,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         """Detects the collisions of the motion from the start of the step to a state, and counts the step."""
         with self._timed():
             self._set_end(end, dt)
-            resolution = self._response.inspect(self._motion)
+            resolution = inspect(self._work, self._motion)
             inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
             self._launch(_finish_inspection, self.mesh.vertex_count, inputs, outputs)
             self._count_step(resolution)
@@ -541,7 +549,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         if self.model.body_count:
             arrays += [state_in.body_q, end.body_q, end.body_qd]
         model, motion = self.model, self._motion
-        read = [motion.friction.of_particles, motion.friction.of_shapes, self._response.restitution]
+        read = [motion.friction.of_particles, motion.friction.of_shapes, self._work.restitution]
         read += [model.particle_inv_mass, model.body_inv_mass, model.body_inv_inertia, model.body_mass]
         read += [model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
@@ -561,7 +569,7 @@ class SolverCCD(SolverBase, CouplingHooks):
 
         def go_back():
             if recorded is not None:
-                StepAdjoint(recorded, self._response).backward(*(array.grad for array in arrays))
+                StepAdjoint(recorded, self._work).backward(*(array.grad for array in arrays))
             if pushed is not None:
                 assert self._layer is not None
                 self._layer.backward(pushed, *(array.grad for array in arrays[:3]))
@@ -587,7 +595,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             if self._layer is not None and end.particle_q is not None:
                 arrays = end.particle_q, end.particle_qd
                 self._pushed = self._layer.push(self._motion, *arrays, dt, record=record is not None)
-            resolution = self._response.resolve(self._motion, dt, record)
+            resolution = resolve(self._work, self._motion, dt, record)
             self._finish(resolution, end)
         return resolution
 
