@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DT, SOLVERS, Changed, DistanceRollout, Rollout, add_patch, add_plates, place_plates
-from test_queueless import stage
+from test_search import stage
 
 import warp_bsc as bsc
 
