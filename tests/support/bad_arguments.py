@@ -405,7 +405,11 @@ def calls_of_solvers() -> dict[str, Call]:
         ),
     }
     states = {"state_in": start, "state_out": end, "control": None, "contacts": None, "dt": 0.01}
-    for name, cls in (("SolverCCD", stage), ("CollisionMonitor", bsc.CollisionMonitor(inner))):
+    for name, cls in (
+        ("SolverCCD", stage),
+        ("CollisionMonitor", bsc.CollisionMonitor(inner)),
+        ("ContactLayer", bsc.ContactLayer(inner)),
+    ):
         found[f"{name}.step"] = Call(
             cls.step,
             states,
@@ -431,7 +435,7 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|CollisionMonitor)\.(coupling_\w+|notify_model_changed|observables|reset|set_collision_frequency|"
+    r"(SolverCCD|CollisionMonitor|ContactLayer)\.(coupling_\w+|notify_model_changed|observables|reset|set_collision_frequency|"
     r"update_contacts|validate_observables)$"
 )
 """Methods that delegate to the inner solver, which checks their arguments."""

@@ -191,7 +191,7 @@ class Scene:
         if not stage:
             return solver
         # without Newton's contacts, nobody but the stage keeps bodies on the ground
-        bodies = True if model.body_count and not settings.contacts else None
+        bodies = "separated" if model.body_count and not settings.contacts else "pushed"
         return bsc.SolverCCD(solver, substeps=substeps, bodies=bodies)
 
     def elastic_energy(self, x):
