@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import NoReturn
 
-from .. import __version__
+from .._version import __version__
 from . import bench_detector, bench_newton, bench_paper, bench_queries, query, replay
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses

@@ -26,7 +26,8 @@ from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
 from ..replay.usd_overlay import SHOWN_BY, Overlay
 from ..replay.workers import device_of_cluster
-from ..usd.scene import FrameRange, Scene
+from ..usd.frames import FrameRange
+from ..usd.scene import Scene
 from ..usd.selection import PURPOSES, Selection
 from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
@@ -315,7 +316,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         ignore=(*map(tuple, arguments.ignore), *(_read_pairs(arguments.ignore_from) if arguments.ignore_from else ())),
     )
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
-        importlib.import_module("warp_bsc.usd.meshes")
+        importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     try:
         names = "prims", "exclude", "between", "frames", "subdivide"

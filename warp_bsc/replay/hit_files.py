@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import orjson
 
-from .. import __version__
+from .._version import __version__
 from ..detection.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
 from .outputs import RecordFile

@@ -20,7 +20,8 @@ import sys
 
 from pxr import Plug, Usd, UsdValidation
 
-from ..usd.scene import FrameRange, Scene
+from ..usd.frames import FrameRange
+from ..usd.scene import Scene
 from .intervals import replay
 from .summary import Summary
 

@@ -30,7 +30,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
-from .. import __version__
+from .._version import __version__
 from ..detection.launch import cores
 from ..detection.start import find_device, gpu_count
 from ..usd.interval import ReadingNotes

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
+from .samples import may_jump, sample_times
+from .unreadable import LeftOut, UnreadableError, reading
 
 __all__ = [
     "Instance",
@@ -82,7 +83,7 @@ class Instancer:
         count: Largest number of instances at any time.
         times: Time codes at which transforms of its instances to the world have a sample.
         break_times: Time codes at which instances may appear or vanish.
-        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
+        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
     """
 
     count: int = 0

@@ -51,15 +51,15 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import pairwise
 from numbers import Integral
 
 import numpy as np
 
-from .._arguments import check_instance, checked_flag, checked_integer, checked_number, checked_strings, given
+from .._arguments import check_instance, checked_flag, checked_integer, checked_strings, given
 from .._one_thread import one_at_a_time
 from .files import SceneFiles
+from .frames import FrameRange
 from .interval import (
     Interval,
     LeftOutMesh,
@@ -67,86 +67,23 @@ from .interval import (
     jump_warning,
     left_out_warning,
     message_warning,
-    times_in_words,
 )
+from .jumps import JumpFinder
+from .scene_options import Revealed, SceneOptions
+from .scene_times import find_times
 from .segment import Segment
 from .selection import Selection
 
-__all__ = ["FrameRange", "Scene"]
+__all__ = ["Scene"]
 
-_JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
 _MOST_PARTS = 10_000  # of a step between two times
 _NAMED = 5  # most parts left out, and most messages of OpenUSD, that the warnings list
-_ROUNDING = 1e-12
-_SAME_TIME = 1e-6
 
 # If a crate file is mapped into memory, every page read counts as memory of this process, which then seems to grow with
 # each frame. USD reads these variables when it is loaded; without the second it reports the first on standard error.
 if "USDC_USE_ASSET" not in os.environ:
     os.environ["USDC_USE_ASSET"] = "1"
     os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
-
-
-@dataclass(frozen=True)
-class FrameRange:
-    """A part of a scene's time.
-
-    Attributes:
-        start: First time code, None for that of the scene.
-        end: Last time code, None for that of the scene.
-        step: Time codes from one time to the next, more than 0, None for the samples that the scene has.
-
-    Raises:
-        TypeError: If one of them is no number.
-        ValueError: If one of them is not finite, the end is not after the start, or the step is not more than 0.
-    """
-
-    start: float | None = None
-    end: float | None = None
-    step: float | None = None
-
-    def __post_init__(self):
-        """Checks the attributes."""
-        for name in ("start", "end", "step"):
-            value = getattr(self, name)
-            if value is not None:
-                limits = {"least": 0.0, "above": True} if name == "step" else {}
-                object.__setattr__(self, name, checked_number(value, name, **limits))
-        if self.start is not None and self.end is not None and self.end <= self.start:
-            raise ValueError(f"end must be after the start, {self.start:g}, not {self.end:g}")
-
-    def bounds(self, samples: list[float]) -> tuple[float, float]:
-        """Returns the first and the last time, given all times of the scene, ascending."""
-        return (
-            samples[0] if self.start is None else max(self.start, samples[0]),
-            samples[-1] if self.end is None else min(self.end, samples[-1]),
-        )
-
-    def times(self, samples: list[float], changes: set[float]) -> list[float]:
-        """Returns the times of this part, ascending.
-
-        Args:
-            samples: All times of the scene, ascending.
-            changes: Times at which meshes change their topology, appear or vanish: a step never passes over these.
-
-        Raises:
-            ValueError: If there are fewer than two times.
-        """
-        start = samples[0] if self.start is None else self.start
-        end = samples[-1] if self.end is None else self.end
-        low, high = self.bounds(samples)
-        if self.step is None:
-            times = {low, high, *samples}
-        else:
-            first, last = math.ceil((low - start) / self.step), math.floor((high - start) / self.step + 1e-9)
-            times = {*(min(start + number * self.step, high) for number in range(first, last + 1)), *changes}
-        times = sorted(time for time in times if low <= time <= high)
-        if len(times) < 2:
-            raise ValueError(
-                f"frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
-                f"{samples[-1]:g}"
-            )
-        return times
 
 
 class Scene:
@@ -224,7 +161,7 @@ class Scene:
             check_instance(frames, "frames", FrameRange, "a FrameRange")
         if progress is not None and not callable(progress):
             raise TypeError(f"progress must be a function, not {given(progress)}")
-        options = _Options(
+        options = SceneOptions(
             selection,
             frames,
             checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
@@ -232,31 +169,32 @@ class Scene:
             checked_flag(strict, "strict"),
             checked_strings(allow_missing, "allow_missing"),
         )
-        self._open(path, options, _Revealed(), progress)
+        self._open(path, options, Revealed(), progress)
 
     def _open(
         self,
         path: str | os.PathLike,
-        options: "_Options",
-        revealed: "_Revealed",
+        options: SceneOptions,
+        revealed: Revealed,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Opens the file and finds its meshes, as of ``__init__``, given what reading it has revealed earlier."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        from . import meshes as usd_meshes  # noqa: PLC0415 (import pxr)
-        from . import stage as usd_stage  # noqa: PLC0415
+        from .find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
+        from .stage import open_stage  # noqa: PLC0415
+        from .unreadable import LeftOut, UnreadableError, collecting  # noqa: PLC0415
 
         self._lock = threading.RLock()
         self._options = options
         self.path = str(path)
         self.selection = options.selection or Selection()
-        self._unreadable = usd_stage.UnreadableError
-        self._left_out = usd_stage.LeftOut(path, options.strict, options.allow_missing)
-        self.stage = usd_stage.open_stage(path, self._left_out)  # prims expire with their stage
+        self._unreadable = UnreadableError
+        self._left_out = LeftOut(path, options.strict, options.allow_missing)
+        self.stage = open_stage(path, self._left_out)  # prims expire with their stage
         self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
-        self._collecting = usd_stage.collecting
+        self._collecting = collecting
         with self._collecting(self._messages, path):
             self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
             # Old exporters store it in single precision, which UsdGeom.GetStageMetersPerUnit rejects.
@@ -264,16 +202,19 @@ class Scene:
             self.up_axis = str(UsdGeom.GetStageUpAxis(self.stage))
             texts = {"Comment": "comment", "Documentation": "documentation"}
             self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
-            self._usd_meshes, self._warnings = usd_meshes.find_meshes(self.stage, path, self.selection, self._left_out)
+            self._usd_meshes, self._warnings = find_meshes(self.stage, path, self.selection, self._left_out)
             self._check_meshes(bool(options.selection))
             self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
-            changes = self._find_times(options.frames or FrameRange(), options.subdivide, options.sample_turns)
-            self._note_changes()
-            inner = [index for index, time in enumerate(self.times[:-1]) if index and time in changes]
+            frames = options.frames or FrameRange()
+            own_start = self.stage.GetStartTimeCode()
+            found = find_times(self._usd_meshes, frames, options.subdivide, options.sample_turns, own_start)
+            self.times = found.times
+            self._warnings += found.warnings
+            inner = [index for index, time in enumerate(self.times[:-1]) if index and time in found.changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
             self._segment: Segment | None = None
             self._span: tuple[int, int] | None = None
-            self._last = None  # index, segment and positions of the last interval that was read
+            self._jumps = JumpFinder()
             self._jump_times = {}  # by the mesh's name
             self._welded = 0
             self._parts: list[LeftOutMesh] = []  # left out after the file was opened
@@ -328,7 +269,7 @@ class Scene:
     def __reduce__(self):
         """Returns what opens the scene again."""
         path = os.path.abspath(self.path) if os.path.exists(self.path) else self.path
-        revealed = _Revealed(tuple(self._parts), self._welds)
+        revealed = Revealed(tuple(self._parts), self._welds)
         return _open_again, (path, self._options, revealed, self.files.versions(), self._contents())
 
     def intervals(self, first: int = 0, stop: int | None = None) -> Iterator[Interval]:
@@ -349,7 +290,7 @@ class Scene:
 
     def _intervals(self, first: int, stop: int) -> Iterator[Interval]:
         self.take_notes()
-        if 0 < first < stop and self.segment(first).may_jump and not (self._last and self._last[0] == first - 1):
+        if 0 < first < stop and self.segment(first).may_jump and not self._jumps.has_read(first - 1):
             self._read_positions(first - 1)
         for index in range(first, stop):
             yield self._read(index)
@@ -383,8 +324,9 @@ class Scene:
         while self._segment is None or self._span is None or not self._span[0] <= index < self._span[1]:
             span = next(span for span in self._spans if span[0] <= index < span[1])
             start, stop = span
-            present = [mesh for mesh in self._usd_meshes if _state_at(mesh, self.times[start]) is not None]
-            self._segment = self._span = self._last = None  # before the next is read, to free memory
+            present = [mesh for mesh in self._usd_meshes if mesh.state_at(self.times[start]) is not None]
+            self._segment = self._span = None  # before the next is read, to free memory
+            self._jumps.forget()
             try:
                 times, welds = self.times[start : stop + 1], self._welds.get(span)
                 self._segment = Segment(present, times, self.dtype, progress, welds)
@@ -434,14 +376,12 @@ class Scene:
             while True:
                 segment = self.segment(index)
                 try:
-                    last = self._last
-                    known = last[3] if last and last[:2] == (index - 1, segment) else None
-                    x0 = segment.positions(start, last=known)
+                    x0 = segment.positions(start, last=self._jumps.end_of(index - 1, segment))
                     x1 = segment.positions(end, before=True)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
-        jumps = self._find_jumps(index, segment, x0, x1)
+        jumps = self._jumps.find(index, segment, x0, x1)
         for name in jumps:
             self._jump_times.setdefault(name, set()).add(start)
         return segment, x0, x1, jumps
@@ -467,41 +407,13 @@ class Scene:
             reason = reason or "".join(f"; {warning}" for warning in self._warnings[:1])
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
-    def _find_times(self, frames, subdivide, sample_turns) -> set[float]:
-        """Sets :attr:`times`. Returns those at which meshes change their topology, appear or vanish."""
-        own = set().union(*(mesh.times | mesh.states.keys() for mesh in self._usd_meshes)) - {-math.inf}
-        if not any(mesh.times for mesh in self._usd_meshes):
-            own.add(self.stage.GetStartTimeCode())  # what appears and vanishes does so between moments at rest
-        if len(own) == 1:
-            self.times = [*own, *own]
-            self._warnings.append(f"nothing moves: checked at rest, at time {self.times[0]:g}")
-            return set()
-        whole = set()
-        if sample_turns and frames.step is None:
-            low, high = frames.bounds(sorted(own))
-            whole = whole.union(*(mesh.turning_times(low, high) for mesh in self._usd_meshes))
-        scene_times = _merge(own | whole)
-        for mesh in self._usd_meshes:
-            mesh.take_times(scene_times)
-        changes = {time for mesh in self._usd_meshes for time in mesh.states if time != -math.inf}
-        samples = sorted(set(scene_times.values()))
-        self.times = frames.times(samples, changes)
-        if skipped := sum(self.times[0] < time < self.times[-1] for time in set(samples) - set(self.times)):
-            self._warnings.append(f"--frames steps over {skipped} time samples: motion is straight from step to step")
-        if subdivide > 1:
-            self.times = [
-                start + (end - start) * part / subdivide
-                for start, end in pairwise(self.times)
-                for part in range(subdivide)
-            ] + self.times[-1:]
-        return changes
-
     def _leave_out(self, error, index):
         """Leaves out the mesh of an error from the interval on in which it breaks, or from ``index`` on if later."""
         since = max(index, self.times.index(error.time) - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
-        self._apply(LeftOutMesh(error.mesh.name, since, self.left_out[-1]))
-        if not any((mesh.times or self.is_still) and _is_there(mesh, self.times[since]) for mesh in self._usd_meshes):
+        self._apply(LeftOutMesh(error.mesh, since, self.left_out[-1]))
+        moving = [mesh for mesh in self._usd_meshes if mesh.times or self.is_still]
+        if not any(mesh.is_there_from(self.times[since]) for mesh in moving):
             raise error
 
     def _apply(self, part: LeftOutMesh) -> None:
@@ -515,56 +427,8 @@ class Scene:
         if first < since:
             place = self._spans.index((first, last))
             self._spans[place : place + 1] = [(first, since), (since, last)]
-        self._span = self._last = None
-
-    def _find_jumps(self, index, segment, start, end) -> tuple[str, ...]:
-        """Returns the names of the meshes that do not start an interval where they ended the one before."""
-        last, self._last = self._last, (index, segment, start, end)
-        if last is None or last[:2] != (index - 1, segment) or start is last[3] or np.array_equal(start, last[3]):
-            return ()
-        _, _, last_start, last_end = last
-        gaps = np.abs(start - last_end).max(axis=1)
-        ways = np.maximum(np.abs(last_end - last_start).max(axis=1), np.abs(end - start).max(axis=1))
-        rounding = _ROUNDING * np.abs(start).max()
-        meshes = segment.vertex_meshes
-        names = []
-        for number in np.unique(meshes[gaps > rounding]):
-            own = meshes == number
-            if gaps[own].max() > _JUMP * ways[own].max() + rounding:
-                names.append(segment.meshes[number].name)
-        return tuple(names)
-
-    def _note_changes(self):
-        """Adds a warning for each way in which a mesh appears, vanishes or changes its topology."""
-        for mesh in self._usd_meshes:
-            times_of = {}
-            for (_, old), (time, new) in pairwise(mesh.states.items()):
-                if self.times[0] < time <= self.times[-1]:
-                    what = "appears" if old is None else "vanishes" if new is None else "changes its topology"
-                    times_of.setdefault(what, []).append(time)
-            for what, times in times_of.items():
-                at = times_in_words(times)
-                self._warnings.append(f"{mesh.name} {what} {at}: its motion is split there, a jump is not checked")
-
-
-@dataclass(frozen=True)
-class _Options:
-    """The options with which a scene is opened, see :class:`Scene`."""
-
-    selection: Selection | None
-    frames: FrameRange | None
-    subdivide: int
-    sample_turns: bool
-    strict: bool
-    allow_missing: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class _Revealed:
-    """What reading a scene has revealed: the meshes left out, and the welds of segments, by the span of intervals."""
-
-    left_out: tuple[LeftOutMesh, ...] = ()
-    welds: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+        self._span = None
+        self._jumps.forget()
 
 
 def _open_again(path, options, revealed, versions, contents) -> Scene:
@@ -581,26 +445,3 @@ def _open_again(path, options, revealed, versions, contents) -> Scene:
     if scene._contents() != contents:
         raise ValueError(f"{path}: this process does not read the same meshes as the one that started the replay")
     return scene
-
-
-def _merge(times) -> dict[float, float]:
-    """Returns for each time the one that represents all that count as one: the nearest of them to a whole time code."""
-    times = sorted(times)
-    most = _SAME_TIME * min(1.0, times[-1] - times[0])
-    groups = []
-    for time in times:
-        if groups and time - groups[-1][0] <= most:
-            groups[-1].append(time)
-        else:
-            groups.append([time])
-    return {time: min(group, key=lambda time: abs(time - round(time))) for group in groups for time in group}
-
-
-def _is_there(mesh, time) -> bool:
-    """Returns whether a mesh is there at a time or later."""
-    return _state_at(mesh, time) is not None or any(state for since, state in mesh.states.items() if since > time)
-
-
-def _state_at(mesh, time):
-    """Returns the state of a mesh at a time, see :attr:`UsdMesh.states`."""
-    return next(state for since, state in reversed(mesh.states.items()) if since <= time)

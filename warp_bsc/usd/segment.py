@@ -1,47 +1,19 @@
 """A stretch of a scene's time over which the same meshes, curves and points are there and keep their topology."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .position_reader import PositionReader
+from .scene_mesh import SceneMesh
+from .welding import group_by_position, split_by_position
+
 if TYPE_CHECKING:
     from .meshes import UsdMesh
 
-__all__ = ["SceneMesh", "Segment"]
-
-
-@dataclass(frozen=True)
-class SceneMesh:
-    """The part of a segment that one mesh of the scene is, or the curves or points of one prim.
-
-    Attributes:
-        path: The prim's path.
-        name: The same, with the number of the instance if a point instancer places it.
-        display_name: Display name in the file, empty if there is none.
-        moves: Whether its points or its transform change with time.
-        deforms: Whether its points do, relative to each other, so that it may collide with itself.
-        vertices: Its vertices, among those of all meshes before they were welded.
-        faces: Its faces, among those of all meshes.
-        points: Index of each vertex among the prim's points, shape [len(vertices)].
-        point_count: Number of the prim's points.
-        polygons: Index of the prim's polygon that each face is a part of, ascending, shape [len(faces)].
-        polygon_count: Number of the prim's polygons, holes included.
-    """
-
-    path: str
-    name: str
-    display_name: str
-    moves: bool
-    deforms: bool
-    vertices: slice
-    faces: slice
-    points: np.ndarray = field(repr=False)
-    point_count: int
-    polygons: np.ndarray = field(repr=False)
-    polygon_count: int
+__all__ = ["Segment"]
 
 
 class Segment:
@@ -427,7 +399,7 @@ class Segment:
             points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
         return meshes, points
 
-    def _reader(self, vertices, numbers) -> "_Reader":
+    def _reader(self, vertices, numbers) -> PositionReader:
         """Returns a reader of some vertices, ascending among the unwelded ones, in the meshes of some numbers."""
         ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
         parts = []
@@ -435,11 +407,11 @@ class Segment:
             mesh, rows = self.meshes[number], slice(ends[number], ends[number + 1])
             points = mesh.points[vertices[rows] - mesh.vertices.start]
             parts.append((self._usd_meshes[number], mesh.point_count, rows, points))
-        return _Reader(parts, self.dtype)
+        return PositionReader(parts, self.dtype)
 
     def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
-        welded_to = _split(_group(self._start), self._start)
+        welded_to = split_by_position(group_by_position(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
         owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
@@ -455,74 +427,9 @@ class Segment:
             if progress:
                 progress(done, len(moments))
             reader.read(positions, time, before)
-            groups = _split(groups, positions)
+            groups = split_by_position(groups, positions)
         welded_to[crowded] = crowded[groups]
         return welded_to
-
-
-class _Reader:
-    """Reads positions of some vertices; those of instances of one prim together."""
-
-    def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
-        """Takes for each mesh the number of its points, the rows of its vertices in the result, and their points."""
-        self._dtype = dtype
-        groups: dict[tuple, list] = {}
-        self._single = []
-        for part in parts:
-            (groups.setdefault(part[0].group, []) if part[0].group else self._single).append(part)
-        self._groups = []
-        for members in groups.values():
-            instances = np.array([mesh.index for mesh, *_ in members])
-            rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
-            taken = np.concatenate([place * count + points for place, (_, count, _, points) in enumerate(members)])
-            self._groups.append((members, instances, rows, taken))
-
-    def read(self, positions: np.ndarray, time: float, before: bool) -> None:
-        """Writes the positions at a time, or just before it, to the rows of the meshes.
-
-        Raises:
-            UnreadableError: If a mesh is broken at that time.
-        """
-        singles = list(self._single)
-        for members, instances, rows, taken in self._groups:
-            first, count, *_ = members[0]
-            together = first.read_instances(time, instances, count, before=before)
-            found = None if together is None else together.reshape(-1, 3)[taken]
-            if found is not None and np.isfinite(found).all():
-                positions[rows] = found
-            else:
-                singles += members  # one of them is broken, and says so
-        for mesh, count, rows, points in singles:
-            positions[rows] = mesh.read_positions(
-                time, before=before, used=points, point_count=count, dtype=self._dtype
-            )
-
-
-def _group(positions) -> np.ndarray:
-    """Returns for each position the first one with the same hash, shape [n]."""
-    bits = (positions + positions.dtype.type(0.0)).view(f"u{positions.itemsize}").astype(np.uint64)  # no -0.0
-    hashes = np.zeros(len(positions), dtype=np.uint64)
-    for column in bits.T:
-        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)
-        hashes ^= hashes >> np.uint64(29)
-    _, firsts, numbers = np.unique(hashes, return_index=True, return_inverse=True)
-    return firsts[numbers]
-
-
-def _split(groups, positions) -> np.ndarray:
-    """Splits groups by position: returns for each vertex the first of its group that is in the same place, shape [n].
-
-    Args:
-        groups: The first vertex of each vertex's group, shape [n].
-        positions: Positions of the vertices, shape [n, 3].
-    """
-    (rows,) = np.nonzero((positions != positions[groups]).any(axis=1))
-    if len(rows):
-        keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
-        _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        groups = groups.copy()
-        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
-    return groups
 
 
 def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

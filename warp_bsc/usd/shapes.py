@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .stage import may_jump
+from .samples import may_jump
 
 __all__ = ["MeshPolygons", "Polygons", "ShapePolygons", "is_shape"]
 
@@ -36,7 +36,7 @@ class Polygons(Protocol):
 
     @property
     def may_jump(self) -> bool:
-        """Whether points may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`."""
+        """Whether points may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`."""
         ...
 
     def read_points(self, time: Usd.TimeCode) -> Any:

@@ -6,7 +6,8 @@
 import numpy as np
 from pxr import Sdf, Usd, UsdSkel, Vt
 
-from .stage import UnreadableError, may_jump, sample_times
+from .samples import may_jump, sample_times
+from .unreadable import UnreadableError
 
 __all__ = ["Skin", "find_bindings"]
 
@@ -17,7 +18,7 @@ class Skin:
     Attributes:
         skeleton: The prim in whose space the joints put the points, None if only blend shapes deform the mesh.
         times: Time codes at which the animation has a sample.
-        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
+        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
     """
 
     def __init__(

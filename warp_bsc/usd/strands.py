@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .stage import UnreadableError
+from .unreadable import UnreadableError
 
 __all__ = ["Strands", "is_strands"]
 
