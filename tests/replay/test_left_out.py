@@ -115,7 +115,7 @@ BROKEN = {
     add_mesh_without_points: "/World/Odd: the mesh has no points at time 0",
     add_mesh_with_a_broken_face: "/World/Odd: face 0 refers to vertex 7, but the mesh has 3 points",
     add_points_of_another_type: "/World/Odd: its points are no points, but float",
-    add_faces_of_another_type: "/World/Odd: faceVertexCounts is no list of integers",
+    add_faces_of_another_type: "/World/Odd: faceVertexCounts is not a list of integers",
     add_missing_reference: "gone.usda",
     add_missing_clips: "/World/Odd: its value clips have no faces, edges or points",
     add_instancer_without_prototype: "/World/Odd: instance 0 is of prototype 0, which is not there",

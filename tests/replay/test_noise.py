@@ -61,7 +61,7 @@ def test_pairs_are_ignored_by_a_file(stage, tmp_path, capsys):
     pairs.write_text("# known\n\n/World/Floor '/World/Falling'  # falls\n/World/Gone /World/*\n")
     found = find(stage, "--ignore-from", str(pairs))
     assert colliding(found).keys() == {RESTS}
-    assert "pairs to ignore that match no meshes: 1, the first is /World/Gone /World/*" in found["warnings"]
+    assert "ignore: pairs of patterns that match no meshes: 1, the first is /World/Gone /World/*" in found["warnings"]
     for text, reason in (
         ("/World/A", "line 1: must be two patterns, not 1"),
         ("\n'a b", "line 2: No closing quotation"),
@@ -78,7 +78,7 @@ def test_in_python(stage):
     assert first.summary.mesh_pairs.keys() == {FALLS} and first.summary.ignored == {}
     results = list(bsc.replay(bsc.Scene(scene.path), device="cpu", ignore_initial=True))
     assert [result.summary.ignored.keys() for result in results] == [set(), set(), {RESTS}]
-    with pytest.raises(ValueError, match="only if intersections are found"):
+    with pytest.raises(ValueError, match="ignore_initial: needs intersections=True"):
         next(bsc.replay(scene, device="cpu", ignore_initial=True, intersections=False))
 
 
@@ -117,10 +117,10 @@ def test_what_is_new_against_a_baseline(stage, tmp_path, capsys):
     whole = before.read_text()
     before.write_text(whole.replace('"complete": true', '"complete": false'))
     assert main(["replay", path, *options, str(before)]) == 2
-    assert "before.json: its replay was stopped, and does not say what there is later" in capsys.readouterr().err
+    assert "before.json: its replay was stopped; the baseline must be complete" in capsys.readouterr().err
     before.write_text(whole.replace('"intersections": true', '"intersections": false'))
     assert main(["replay", path, *options, str(before)]) == 2
-    assert "its replay had --no-intersections, and does not say what crossed" in capsys.readouterr().err
+    assert f"error: --intersections: {before} lists none" in capsys.readouterr().err
     assert main(["replay", path, *options, str(before), "--no-intersections", "--fail-on", "new"]) == 0
     before.unlink()
     assert main(["replay", path, *options, str(before)]) == 2
@@ -147,7 +147,7 @@ def test_a_baseline_with_other_options(stage, tmp_path, capsys, options, differe
     assert main(["replay", path, "--device", "cpu", "--json", before]) == 0
     capsys.readouterr()
     status = main(["replay", path, "--device", "cpu", "--baseline", before, "--fail-on", "new", *options])
-    said = f"warp-bsc: error: {before}: its replay was another one, and cannot be compared: {difference}\n"
+    said = f"warp-bsc: error: {before}: written with other options; cannot compare: {difference}\n"
     assert (status, capsys.readouterr().err) == ((2, said) if difference else (0, ""))
 
 

@@ -11,8 +11,8 @@ from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, 
 
 import warp_bsc as bsc
 from warp_bsc.replay.results import IntervalResult, IntervalSummary
-from warp_bsc.usd.interval import Interval
 from warp_bsc.usd.frames import FrameRange
+from warp_bsc.usd.interval import Interval
 
 
 @pytest.fixture

@@ -229,7 +229,7 @@ def near_and_inside(tmp_path):
 def test_overlay_has_what_is_near_and_inside(near_and_inside, tmp_path, suffix):
     path = tmp_path / f"overlay.{suffix}"
     arguments = ["replay", save(near_and_inside), "--device", "cpu", "--overlay", str(path)]
-    assert main([*arguments, "--min-distance", "0.3"]) == 0
+    assert main([*arguments, "--clearance", "0.3"]) == 0
     overlay = Usd.Stage.Open(str(path))
     assert errors_of(overlay) == []
     names = overlay.GetPrimAtPath("/Collisions").GetAttribute("prims").Get()
@@ -718,7 +718,7 @@ def test_no_room_at_the_end_is_an_error(tmp_path, monkeypatch, capsys, suffix):
     assert f"overlay.{suffix}: not all of it is written: [Errno 27] File too large" in capsys.readouterr().err
     overlay = Usd.Stage.Open(str(path))
     data = overlay.GetRootLayer().customLayerData["collisions"]
-    assert (data["complete"], data["intervals"], data["stopped"]) == (False, 7, "no room for more")
+    assert (data["complete"], data["intervals"], data["stopped"]) == (False, 7, "the disk is full")
     assert len(read_contacts(overlay, 6)[0]) == 240 and len(read_contacts(overlay, 7)[0]) == 0
     assert errors_of(overlay) == []
     assert left_behind(tmp_path) == []
@@ -888,20 +888,20 @@ def test_page_without_collisions(tmp_path):
 
 
 def test_page_has_what_is_near_and_inside(near_and_inside, tmp_path):
-    found = json.loads(replay(near_and_inside, "--min-distance", "0.3")[0].read_text())
+    found = json.loads(replay(near_and_inside, "--clearance", "0.3")[0].read_text())
     page = Page((tmp_path / "page.html").read_text())
     data = page.data
     assert data["near"] == [[0, 0], [1, 1], [2, 1]] and [at[3] for at in data["rest"]] == [1, 1, 1]
     assert data["rows"] == [[0, 1, 0], [0, 1, 1], [0, 1, 1]]
     block = page.block("near-2")
     assert (block["kind"][0], block["distance"][0]) == (7, 0.125) and page.block("rest-2")["kind"][0] == 6
-    (row,) = found["intervals"][-1]["near_pairs_at_end"]
+    (row,) = found["intervals"][-1]["proximity_pairs_at_end"]
     np.testing.assert_allclose(block["position"] + data["center"], row["position"], atol=1e-6)
     inside, near = data["pairs"]
     assert (inside["rest"], near["near"]) == ([[0, 2, 1, "stays", "/World/Inside"]], [[1, 2, 0.125]])
-    assert ["0.125", "least distance"] in data["tiles"]
-    replay(near_and_inside, "--min-distance", "0.1")
-    assert ["> 0.1", "least distance"] in Page((tmp_path / "page.html").read_text()).data["tiles"]
+    assert ["0.125", "smallest distance"] in data["tiles"]
+    replay(near_and_inside, "--clearance", "0.1")
+    assert ["> 0.1", "smallest distance"] in Page((tmp_path / "page.html").read_text()).data["tiles"]
 
 
 def test_page_without_intersections(stage, tmp_path):
@@ -1023,12 +1023,12 @@ def test_page_in_chromium(tmp_path, browser):
 
 @pytest.mark.browser
 def test_near_and_inside_in_chromium(near_and_inside, tmp_path, browser):
-    browser.open(replay(near_and_inside, "--min-distance", "0.3")[3])
+    browser.open(replay(near_and_inside, "--clearance", "0.3")[3])
     assert browser.value("document.getElementById('viewer-title').textContent").endswith(
         "; 1 part inside at the start, 1 at the end; 1 pair near at the start, 1 at the end"
     )
     legend = browser.value("document.getElementById('viewer-legend').textContent")
-    assert "part of a mesh inside another" in legend and "near pair" in legend
+    assert "part of a mesh inside another" in legend and "proximity" in legend
     kinds = "[...document.querySelectorAll('#rows tr[data-at] td.kind')].map((cell) => cell.textContent)"
     assert browser.value(kinds) == ["inside", "inside", "near", "inside", "near"]
     browser.click("#rows tr[data-at]", 4)

@@ -257,7 +257,7 @@ def test_purpose(stage):
     add_falling(stage, "/World/Render", 0.25, 0.1).CreatePurposeAttr("render")
     found = find(stage)
     assert hits(found) == []
-    assert "meshes of purpose proxy are not checked: 1; --purpose proxy checks them" in found["warnings"]
+    assert "purposes: meshes of purpose proxy are not checked: 1" in found["warnings"]
     assert hits(find(stage, "--purpose", "default", "proxy")) == [("/World/Proxy", *HIT[1:])]
 
 
@@ -476,9 +476,9 @@ def test_pairs(crowd, options, expected):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--prims", "/World/Z"], "--prims /World/Z: there is no such mesh"),
-        (["--exclude", "/World/Z*"], "--exclude /World/Z*: there is no such mesh"),
-        (["--between", "/World/A", "/World/Z"], "--between /World/Z: there is no such mesh"),
+        (["--prims", "/World/Z"], "--prims: no mesh matches /World/Z"),
+        (["--exclude", "/World/Z*"], "--exclude: no mesh matches /World/Z*"),
+        (["--between", "/World/A", "/World/Z"], "--between: no mesh matches /World/Z"),
         (["--frames", "5:9"], "--frames"),
         (["--frames", "3:1"], "--frames"),
         (["--frames", "0:1:0"], "STEP must be more than 0"),
@@ -521,7 +521,7 @@ def test_frames(stage, frames, times):
     found = find(stage, f"--frames={frames}")
     starts = [interval["start"] for interval in found["intervals"]]
     assert [*starts, found["intervals"][-1]["end"]] == pytest.approx(times)
-    assert any("steps over" in warning for warning in found["warnings"]) == (frames in ("::2", "0:4:1.5"))
+    assert any("step passes over" in warning for warning in found["warnings"]) == (frames in ("::2", "0:4:1.5"))
 
 
 def test_steps_do_not_go_over_a_change_of_topology(stage):

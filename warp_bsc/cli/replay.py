@@ -10,7 +10,7 @@ import shlex
 import time
 from collections.abc import Generator
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Literal
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -25,7 +25,7 @@ from ..replay.results import IntervalResult
 from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
 from ..replay.usd_overlay import SHOWN_BY, Overlay
-from ..replay.workers import device_of_cluster
+from ..replay.workers import checked_address, device_of_cluster
 from ..usd.frames import FrameRange
 from ..usd.scene import Scene
 from ..usd.selection import PURPOSES, Selection
@@ -39,7 +39,6 @@ from .options import (
     add_detection_options,
     add_fail_on,
     distance,
-    naming_options,
     positive,
 )
 from .replay_tables import print_new, print_replay, print_work
@@ -52,15 +51,15 @@ Find the collisions of the meshes of a USD scene, with themselves and with each
 other, between each two consecutive time samples; vertices move straight from
 sample to sample. Meshes that never move are obstacles: contacts between
 obstacles are excluded, and so are contacts of a mesh with itself if only its
-transform moves it. Linear curves and points take part, with half their widths
-as radii. Rotations are sampled at every whole time code as well.
+transform moves it. Linear curves and points are included, with half their
+widths as radii. Rotations are sampled at every whole time code as well.
 At the time samples themselves, find the edges that pass through faces and the
-meshes that are wholly inside closed ones, obstacles and linear curves included;
-where nothing moves, this is done at one time.
+meshes that are wholly inside closed ones, including obstacles and linear
+curves; if nothing moves, at one time.
 Parts that cannot be read are named and left out. Files are written atomically.
-A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
-finished intervals, marked partial; one that is killed leaves, with --json, what
---resume needs."""
+If Ctrl-C, SIGTERM, SIGHUP or an error stops the run, it leaves valid files of
+the finished intervals, marked partial. If it is killed, --json leaves a file
+from which --resume continues."""
 
 _EPILOG = f"""\
 examples:
@@ -70,11 +69,11 @@ examples:
   warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
   warp-bsc replay cloth.usd --device cpu --method conservative
   warp-bsc replay cloth.usd --json > collisions.json
-  warp-bsc replay cloth.usd --min-distance 0.002 --fail-on distance
+  warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
   warp-bsc replay shot.usd --workers 16 --json hits.json --resume
-  warp-bsc replay shot.usd --scheduler tcp://head:8786 --report hits.html
+  warp-bsc replay shot.usd --workers tcp://head:8786 --report hits.html
 
   a recording of one of Newton's examples:
   python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
@@ -104,9 +103,9 @@ def add_to(commands: Commands) -> None:
     which.add_argument(
         "--prims",
         **patterns,
-        help="only meshes at or below these prims or instances, named as in the report; * matches any text",
+        help="check only meshes at or below these prims or instances, named as in the report; * matches any text",
     )
-    which.add_argument("--exclude", **patterns, help="no meshes at or below these prims")
+    which.add_argument("--exclude", **patterns, help="do not check meshes at or below these prims")
     which.add_argument(
         "--self",
         dest="self_collisions",
@@ -122,16 +121,16 @@ def add_to(commands: Commands) -> None:
         "are wholly inside others (default: yes)",
     )
     which.add_argument(
-        "--min-distance",
+        "--clearance",
         type=distance,
         metavar="D",
-        help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
-        "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
-        "samples are not checked, nor are those of curves and points; an edge through a face is an intersection, "
-        "however far their vertices are",
+        help="find the proximities at the time samples themselves: vertices and faces, and edges, that are at most D "
+        "apart, in the scene's unit, and neither share a vertex nor are joined by an edge. Distances between the "
+        "samples are not checked, nor are those of curves and points; an edge that passes through a face is an "
+        "intersection instead",
     )
     which.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
+        "--between", nargs=2, metavar=("A", "B"), help="check only pairs of a mesh of pattern A and one of pattern B"
     )
     which.add_argument(
         "--ignore",
@@ -139,19 +138,19 @@ def add_to(commands: Commands) -> None:
         action="append",
         default=[],
         metavar=("A", "B"),
-        help="ignore pairs of a mesh of pattern A and one of pattern B, which are only counted; may be repeated",
+        help="only count the collisions of a mesh of pattern A and one of pattern B; may be repeated",
     )
     which.add_argument(
         "--ignore-from",
         metavar="FILE",
-        help="pairs to ignore from a file: two patterns a line, in quotation marks if they contain blanks; # begins a "
-        "comment",
+        help="read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
+        "begins a comment",
     )
     which.add_argument(
         "--ignore-initial",
         action="store_true",
-        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; of those "
-        "that are inside others then, ignore only that they are inside",
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; for "
+        "meshes that are inside others then, ignore only that they are inside",
     )
     which.add_argument(
         "--purpose",
@@ -159,7 +158,7 @@ def add_to(commands: Commands) -> None:
         action="extend",
         choices=PURPOSES,
         metavar="PURPOSE",
-        help="purposes of the meshes: default, render, proxy, guide (default: default render)",
+        help="purposes of the meshes to check: default, render, proxy, guide (default: default render)",
     )
     which.add_argument(
         "--frames",
@@ -183,15 +182,16 @@ def add_to(commands: Commands) -> None:
     which.add_argument(
         "--allow-missing",
         **patterns,
-        help="only note that these files, or files or prims to which these prims refer, are missing; * matches any "
-        "text. Materials, textures and other files that cannot hold geometry may always be missing",
+        help="do not count these files, or the files and prims that these prims refer to, as left out if they are "
+        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
+        "may always be missing",
     )
     which.add_argument(
         "--validate",
         type=_validate,
         default=0,
         metavar="all|N",
-        help="compare answers with the exact checker: all, or N hits and N other pairs of each interval",
+        help="decide pairs of each interval again by the exact checker: all, or N hits and N other pairs",
     )
 
     out = command.add_argument_group("output")
@@ -210,38 +210,34 @@ def add_to(commands: Commands) -> None:
     out.add_argument(
         "--baseline",
         metavar="FILE",
-        help="compare with the JSON file of an earlier replay, which had the same options: print which meshes collide, "
-        "cross, are inside others or, with --min-distance, near each other at times at which they were not",
+        help="compare with the JSON file of an earlier replay with the same options: print which meshes collide, "
+        "cross, are inside others or, with --clearance, are near each other at times at which they were not then",
     )
     add_fail_on(
         out,
         {
             "intersections": "edges through faces, meshes inside others",
             "collisions": "",
-            "distance": "what --min-distance finds",
-            "new": "what --baseline does not have",
+            "distance": "proximities, with --clearance",
+            "new": "findings that --baseline does not contain",
         },
     )
     run = command.add_argument_group("running")
     run.add_argument(
         "--workers",
-        type=positive,
+        type=_workers,
         default=1,
-        metavar="N",
-        help="check intervals in N processes on this machine, which share its cores, or use a GPU each, in turns, "
-        "unless --device names one, such as cuda:0; more processes than GPUs share these (default: 1)",
-    )
-    run.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="check intervals in the workers of a Dask cluster with this scheduler, which must see the scene by the "
-        "same path; needs pip install 'warp-bsc[cluster]'",
+        metavar="N|ADDRESS",
+        help="check intervals in N processes on this machine, which share its cores or, unless --device names one "
+        "such as cuda:0, its GPUs (default: 1); or in the workers of the Dask cluster whose scheduler has this "
+        "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
     )
     run.add_argument(
         "--resume",
         action="store_true",
-        help="take what the file of --json, or that file with .part appended, has of an earlier run with the same "
-        "options and files, which was stopped or killed, and check the rest; without these files, check all",
+        help="continue an earlier run with the same options and files that was stopped or killed: take its finished "
+        "intervals from the file of --json, or that name with .part appended, and check the others; without these "
+        "files, check all",
     )
     add_detection_options(command, method="exact")
 
@@ -253,14 +249,15 @@ def _run(arguments: argparse.Namespace) -> int:
         baseline = Baseline(
             arguments.baseline,
             method=arguments.method,
-            min_distance=arguments.min_distance,
+            clearance=arguments.clearance,
             options=_describe_options(scene, arguments),
         )
-    if arguments.scheduler:
+    if isinstance(arguments.workers, str):
         try:
-            return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device), baseline)
-        except ModuleNotFoundError as error:
-            raise ValueError(f"--scheduler: {error}") from error
+            device = device_of_cluster(arguments.workers, arguments.device)
+        except ModuleNotFoundError as error:  # wrong usage, not an unforeseen error
+            raise ValueError(str(error)) from error
+        return run_replay(scene, arguments, device, baseline)
     device = find_device(arguments.device)
     with loading_kernels(device):
         load_detector(
@@ -268,7 +265,7 @@ def _run(arguments: argparse.Namespace) -> int:
             scene.dtype,
             device,
             intersections=arguments.intersections,
-            proximities=arguments.min_distance is not None,
+            proximities=arguments.clearance is not None,
             strands=scene.has_strands,
         )
     return run_replay(scene, arguments, str(device), baseline)
@@ -292,21 +289,19 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
-    if "distance" in arguments.fail_on and arguments.min_distance is None:
-        raise ValueError("--fail-on distance needs --min-distance")
+    if "distance" in arguments.fail_on and arguments.clearance is None:
+        raise ValueError("--fail-on distance needs --clearance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
-        raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
+        raise ValueError("--ignore-initial and --fail-on intersections need --intersections")
     if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
-    if arguments.scheduler and arguments.workers > 1:
-        raise ValueError("--workers, --scheduler: either processes on this machine, or those of a cluster")
     if outputs.count(STDOUT) > 1:
-        raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
+        raise ValueError("--json, --csv and --report: only one of them can be printed on standard output")
     written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
-    places = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
-    for place in places:
-        if places.count(place) > 1:
-            raise ValueError(f"{place}: named twice, as two files of a replay")
+    paths = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path}: named twice, as two files of a replay")
     selection = Selection(
         prims=tuple(arguments.prims),
         exclude=tuple(arguments.exclude),
@@ -319,8 +314,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     try:
-        names = "prims", "exclude", "between", "frames", "subdivide"
-        with naming_options(*names), _Progress("Comparing vertices") as progress:
+        with _Progress("Comparing vertices") as progress:
             scene = Scene(
                 arguments.scene,
                 selection=selection,
@@ -347,13 +341,13 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         scene: The scene.
         arguments: The options.
         device: Name of the Warp device.
-        baseline: What an earlier replay has found, to compare with; None for nothing.
+        baseline: The earlier replay to compare with, None without one.
 
     Raises:
-        ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
-            disk, as far as it has space.
+        ValueError: If the scene is broken at some time, or a file cannot be written. The files contain the finished
+            intervals, or as many as the disk has space for.
     """
-    settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
+    settings = {"method": arguments.method, "device": device, "clearance": arguments.clearance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
     with contextlib.ExitStack() as stack:
         earlier = find_earlier(arguments.json, facts) if arguments.resume else None
@@ -387,19 +381,19 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
             except Exception as error:
-                interrupt = INTERRUPTS.came  # which a library may have turned into another error
+                interrupt = INTERRUPTS.came  # a library may have turned it into another error
                 problems += [] if interrupt else [_explain(error, scene)]
             try:
                 written.wait()
             except Exception as error:
-                problem = _explain(error, scene)  # a change of the scene's files is found by all that read or write
+                problem = _explain(error, scene)  # readers and writers all find a change of the scene's files
                 problems += [] if interrupt or problem in problems else [problem]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
-            if len(intervals) < earlier_count:  # or a shorter one, from which a later run can go on
+            if len(intervals) < earlier_count:  # or than a shorter one, as a later run can resume it
                 finished = [output for output in finished if not isinstance(output, HitsJson)]
-            # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
+            # Signals do not interrupt the files. They do interrupt streams, whose reader may not read to the end.
             problems += _finish([output for output in finished if not output.file.is_stream], summary)
             try:
                 with INTERRUPTS.raised():
@@ -438,7 +432,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
 
 
 def _explain(error: Exception, scene: Scene) -> str:
-    """Describes what stopped a replay: a change of the scene's files, which may cause any error, or the error."""
+    """Returns why a replay stopped: a change of the scene's files, which may cause any error, or else the error."""
     try:
         scene.files.check()
     except ValueError as changed:
@@ -449,12 +443,13 @@ def _explain(error: Exception, scene: Scene) -> str:
 
 
 def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
-    """Puts files in their places, without the last intervals if the disk is full; returns the parts that are missing.
+    """Finishes files, without their last intervals if the disk is full; returns messages on missing parts.
 
-    On a full disk all files shrink, but not below half of their intervals: tables matter more than a page.
+    On a full disk all files shrink down to half of their intervals. After that only the file that does not fit
+    shrinks, or is omitted; the page comes first, as it matters least.
     """
     problems, shortages = [], {}
-    shared = 5  # times an eighth is a half
+    shared = 5  # number of eighths that all files lose, which leave about a half
     waiting = outputs[::-1]  # the tables, which are the largest, come last
     while waiting:
         output = waiting[0]
@@ -462,7 +457,7 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
             output.finish(summary)
         except Exception as error:
             if isinstance(error, BrokenPipeError) and str(output.file.path) == STDOUT:
-                raise  # nobody reads it any more, which is no error
+                raise  # its reader has closed it, which is not an error
             number = error.errno if isinstance(error, OSError) else None
             sharing, smaller = [output], []
             if number in (errno.ENOSPC, errno.EDQUOT) and shared:
@@ -485,7 +480,7 @@ def _open_outputs(
     facts: dict[str, Any],
     earlier_count: int,
 ) -> list[ReplayOutput]:
-    """Opens the files to write; the stack discards those that are not finished."""
+    """Opens the files that the options name; the stack discards those that are not finished."""
     makers = (
         (
             arguments.json,
@@ -504,12 +499,12 @@ def _open_outputs(
 
 
 class _Progress:
-    """Shows how far a run is: a bar on a terminal, else a line on standard error every few seconds."""
+    """Shows the progress of a run: a bar on a terminal, else a line on standard error every ten seconds."""
 
-    def __init__(self, what: str):
-        self._what = what
+    def __init__(self, activity: str):
+        self._activity = activity
         self._bar = Progress(
-            TextColumn(what),
+            TextColumn(activity),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
@@ -519,7 +514,7 @@ class _Progress:
         )
         self._bar.disable = not self._bar.console.is_terminal
         self._task = self._bar.add_task("", total=None, note="")
-        self._started = self._said = time.monotonic()
+        self._started = self._last_line = time.monotonic()
 
     def __enter__(self) -> "_Progress":
         self._bar.start()
@@ -529,15 +524,15 @@ class _Progress:
         self._bar.stop()
 
     def show(self, done: int, total: int, note: str = "") -> None:
-        """Shows how much is done of all, and a note on it."""
+        """Shows how much of the total is done, and a note."""
         now = time.monotonic()
         if done:
             note += f"{', ' * bool(note)}{done / max(now - self._started, 1e-9):.1f}/s"
         self._bar.update(self._task, completed=done, total=total, note=note)
-        if self._bar.disable and done and now - self._said > _LOG_SECONDS:
-            self._said = now
+        if self._bar.disable and done and now - self._last_line > _LOG_SECONDS:
+            self._last_line = now
             left = (now - self._started) / done * (total - done)
-            say(self._bar.console, f"{self._what}: {done} of {total}, {note}, about {left:,.0f} s left")
+            say(self._bar.console, f"{self._activity}: {done} of {total}, {note}, about {left:,.0f} s left")
 
 
 def _track(
@@ -552,18 +547,17 @@ def _track(
             device=arguments.device,
             intersections=arguments.intersections,
             ignore_initial=arguments.ignore_initial,
-            min_distance=arguments.min_distance,
-            validate_most=arguments.validate,
+            clearance=arguments.clearance,
+            validate=arguments.validate,
             earlier=earlier.results(scene) if earlier else (),
             workers=arguments.workers,
-            scheduler=arguments.scheduler,
         ):
             yield result
             progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
+    """Returns the options that the results depend on, except method, device and clearance."""
     selection = asdict(scene.selection)
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
     names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
@@ -613,10 +607,18 @@ def _frames(text: str) -> FrameRange:
     return FrameRange(start, end, step)
 
 
-def _validate(text: str) -> int | None:
+def _validate(text: str) -> int | Literal["all"]:
     if text == "all":
-        return None
+        return "all"
     try:
         return positive(text)
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(f"must be all or an integer of at least 1, not {text}") from error
+
+
+def _workers(text: str) -> int | str:
+    try:
+        return checked_address(text) if "://" in text else positive(text)
+    except (argparse.ArgumentTypeError, ValueError) as error:
+        message = f"must be an integer of at least 1, or an address such as tcp://head:8786, not {text}"
+        raise argparse.ArgumentTypeError(message) from error

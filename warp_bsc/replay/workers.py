@@ -1,11 +1,11 @@
 """Checks the intervals of a scene in several processes, on this machine or on a Dask cluster.
 
-The intervals are cut into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
-results pickled, with numbers in the place of segments, which the receiving process has as well. Results are yielded in
-order, whichever worker is the first. The chunks of a worker that dies are checked again by another.
+The intervals are divided into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
+pickled results, with numbers for segments, which the receiving process has as well. Results are yielded in the order of
+the intervals. Chunks of a worker that dies are checked again by another one.
 
-A mesh that turns out to be broken is left out from then on. Workers that check later intervals meanwhile do not know
-that yet: their results are dropped, and the chunks are checked again.
+A mesh found to be broken is left out from then on. Results of later intervals that workers have computed with it are
+dropped, and their chunks are checked again.
 """
 
 import contextlib
@@ -30,6 +30,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Protocol
 
+from .._arguments import given
 from .._version import __version__
 from ..detection.launch import cores
 from ..detection.start import find_device, gpu_count
@@ -45,15 +46,16 @@ __all__ = [
     "LocalWorkers",
     "Workers",
     "check_in_workers",
+    "checked_address",
     "device_of_cluster",
     "device_of_worker",
     "selection_without_initial_in_workers",
 ]
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
-_MOST_INTERVALS = 16  # in a chunk; the first of a chunk costs reading and checking a time more
-_CHUNK_SECONDS = 15.0  # after which a chunk ends: two wait for each worker, and what is not written yet can be lost
-_CHUNKS_EACH = 4  # the fewest for each worker, so that all end at about the same time
+_MOST_INTERVALS = 16  # in a chunk; each chunk reads and checks one time more than it has intervals
+_CHUNK_SECONDS = 15.0  # a chunk ends after this time: results that are not yet written can be lost
+_CHUNKS_EACH = 4  # fewest chunks for each worker, so that all workers end at about the same time
 _CONNECT_SECONDS = 10.0
 
 
@@ -61,8 +63,8 @@ class Workers(Protocol):
     """Processes to which functions can be submitted.
 
     Attributes:
-        died: The error that a future of :meth:`submit` has if the process that called the function has died.
-        attempts: How often a function is to be submitted if its process dies.
+        died: The error of a future of :meth:`submit` whose process has died.
+        attempts: Number of times that a function is submitted before its processes' deaths are an error.
     """
 
     died: type[Exception]
@@ -70,7 +72,7 @@ class Workers(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of processes at the moment, at least 1."""
+        """Current number of processes, at least 1."""
         ...
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -78,26 +80,26 @@ class Workers(Protocol):
         ...
 
     def result(self, future: Any) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
         ...
 
     def close(self) -> None:
-        """Ends the work at once, finished or not."""
+        """Ends the processes' work at once, without waiting for it."""
         ...
 
 
 class LocalWorkers:
-    """Processes on this machine, which end when this one ends, however it does.
+    """Processes on this machine, which end when this one ends, even if it is killed.
 
-    Each has a pipe of its own and a thread here that waits for it. (The pool of Python's ``concurrent.futures`` has one
-    pipe for all results: it waits for ever if a process is killed while it writes there.)
+    Each has its own pipe, and a thread in this process that waits at it. (The pool of Python's ``concurrent.futures``
+    has one pipe for all results, and hangs if a process is killed while it writes to it.)
     """
 
     died: type[Exception] = ChildProcessError
     attempts = 3
 
     def __init__(self, count: int):
-        """Starts no process yet: they start when they get work.
+        """Makes the pool; a process starts at its first call.
 
         Args:
             count: Number of processes, at least 1.
@@ -114,7 +116,7 @@ class LocalWorkers:
         return self._threads.submit(self._call, function, arguments)
 
     def result(self, future: Future) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
         return future.result()
 
     def close(self) -> None:
@@ -165,7 +167,7 @@ class LocalWorkers:
 class Cluster:
     """The workers of a running Dask cluster."""
 
-    attempts = 1  # Dask makes several itself
+    attempts = 1  # Dask itself repeats a call whose worker dies
 
     def __init__(self, address: str):
         """Connects to the cluster.
@@ -175,28 +177,28 @@ class Cluster:
 
         Raises:
             ModuleNotFoundError: If Dask is not installed.
-            OSError: If there is no scheduler.
+            OSError: If the scheduler cannot be reached.
         """
         try:
             from distributed import Client, KilledWorker  # noqa: PLC0415 (optional)
             from distributed.comm.core import CommClosedError  # noqa: PLC0415
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
+            raise ModuleNotFoundError("workers: a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
         self.died: type[Exception] = KilledWorker
         self._address = address
         self._disconnected = CancelledError, CommClosedError
-        # What it writes on standard error when the scheduler is lost is raised here as well.
+        # The loss of the scheduler, which it logs on standard error, is raised here as an error.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             self._client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise OSError(f"{address}: no scheduler of a Dask cluster answers: {error}") from error
+            raise OSError(f"workers: {address}: cannot reach the scheduler of a Dask cluster: {error}") from error
 
     @property
     def count(self) -> int:
-        """Number of workers at the moment, at least 1."""
-        with self._connected(Exception):  # of several types, and nothing else is done here
-            threads: Any = self._client.nthreads()  # by worker; a coroutine for asynchronous clients only
+        """Current number of workers, at least 1."""
+        with self._connected(Exception):  # of several types; the block has no other errors
+            threads: Any = self._client.nthreads()  # by worker; a coroutine only for asynchronous clients
         return max(1, len(threads))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -205,12 +207,12 @@ class Cluster:
             return self._client.submit(function, *arguments, pure=False)
 
     def result(self, future: Any) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
-        with self._connected(*self._disconnected):  # no future is cancelled of which a result is wanted
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
+        with self._connected(*self._disconnected):  # of which only a lost scheduler cancels a future that is read
             return future.result()
 
     def close(self) -> None:
-        """Disconnects from the cluster, which drops the work that is waiting."""
+        """Disconnects from the cluster, which drops its waiting calls."""
         self._client.close()
 
     @contextlib.contextmanager
@@ -219,11 +221,11 @@ class Cluster:
         try:
             yield
         except errors as error:
-            raise ConnectionError(f"{self._address}: the scheduler of the Dask cluster answers no more") from error
+            raise ConnectionError(f"workers: {self._address}: lost the scheduler of the Dask cluster") from error
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
-    """Returns what :meth:`~warp_bsc.replay.checking.IntervalChecker.selection_without_initial` does, in a worker.
+    """Returns the result of ``IntervalChecker.selection_without_initial`` in a worker.
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
@@ -237,13 +239,13 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
 
     Args:
         scene: The scene. All intervals before the first have been read.
-        checks: What to look for.
+        checks: The checks.
         workers: The processes.
         first: Number of the first interval.
 
     Raises:
         ChildProcessError: If worker after worker dies while it checks the same intervals.
-        Exception: What checking raises, after all results before.
+        Exception: Errors of checking an interval, after the results of all intervals before it.
     """
     job = _pack(scene, checks)
     calls = deque(
@@ -260,8 +262,20 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
             for call in calls:
                 call.withdraw()
                 call.arguments = (job, *call.arguments[1:])
-        if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk took long
+        if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk has ended early
             calls.appendleft(_Call(_name_chunk(scene, first, stop), _check_chunk, (job, first, stop)))
+
+
+def checked_address(address: str) -> str:
+    """Returns the address of a scheduler, the argument ``workers``.
+
+    Raises:
+        ValueError: If it is not an address such as ``"tcp://head:8786"``.
+    """
+    protocol, separator, host = address.partition("://")
+    if not (protocol and separator and host):
+        raise ValueError(f'workers must be an integer or an address such as "tcp://head:8786", not {given(address)}')
+    return address
 
 
 def device_of_cluster(address: str, name: str | None) -> str:
@@ -269,7 +283,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
 
     Args:
         address: As of :class:`Cluster`.
-        name: The device that is wanted, None for Warp's default.
+        name: Name of the requested device, None for Warp's default.
 
     Raises:
         ModuleNotFoundError: As of :class:`Cluster`.
@@ -284,12 +298,12 @@ def device_of_cluster(address: str, name: str | None) -> str:
 
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
-    """Returns the device that a worker on this machine uses: one GPU each, in turns, where no certain one is named.
+    """Returns the name of the device that a worker on this machine uses: the GPUs in turns unless one is named.
 
-    Workers share GPUs if there are more of them.
+    If there are more workers than GPUs, workers share them.
 
     Args:
-        name: The device that is wanted, None for Warp's default.
+        name: Name of the requested device, None for Warp's default.
         number: Number of the worker, from 0.
         gpu_count: Number of GPUs of the machine.
     """
@@ -298,36 +312,39 @@ def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | Non
 
 @dataclass
 class _Call:
-    """A call that is to be made in a worker, and its future once it is submitted.
+    """A call of a function in a worker.
 
     Attributes:
-        what: What is done meanwhile, in words.
+        activity: What the worker does, in words, such as "checked time 0 to 8".
         function: The function.
         arguments: Its arguments.
-        future: Future of its result.
-        deaths: How many workers have died that made it.
+        future: Future of its result, None before it is submitted.
+        deaths: Number of workers that have died in this call.
     """
 
-    what: str
+    activity: str
     function: Callable[..., Any]
     arguments: tuple
     future: Any = None
     deaths: int = 0
 
     def withdraw(self) -> None:
-        """Forgets the future."""
+        """Cancels the call, so that it can be submitted again."""
         if self.future:
             self.future.cancel()
             self.future = None
 
 
 def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
-    """Makes calls in workers and yields their results in order; again where a worker dies.
+    """Makes calls in workers and yields their results in order. A call whose worker dies is made again.
 
     Args:
         workers: The workers.
-        calls: The calls, which are removed when their result is there. Between two results, those that remain may be
-            withdrawn and changed, and others put before them.
+        calls: The calls; each is removed when its result is there. Between two results, the caller may withdraw and
+            change the remaining ones, and add others before them.
+
+    Raises:
+        ChildProcessError: If worker after worker dies in the same call.
     """
     while calls:
         for call in islice(calls, 2 * workers.count):
@@ -339,14 +356,14 @@ def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
             call.future = None
             call.deaths += 1
             if call.deaths == workers.attempts:
-                raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
+                raise ChildProcessError(f"worker after worker died while it {call.activity}: out of memory?") from error
             continue
         calls.popleft()
         yield result
 
 
 def _name_chunk(scene: Scene, first: int, stop: int) -> str:
-    """Returns what is done to a chunk, in words."""
+    """Returns in words what is done with a chunk."""
     return f"checked time {scene.times[first]:g} to {scene.times[stop]:g}"
 
 
@@ -368,23 +385,23 @@ _local: tuple[int, int] | None = None
 """Number of this worker and number of all workers on this machine, None in a worker of Dask."""
 
 _opened: tuple[bytes, IntervalChecker] | None = None
-"""What this worker has checked last, and the checker."""
+"""The job of the last chunk of this worker, and its checker."""
 
 
 def _serve(connection: Connection, number: int, count: int) -> None:
-    """Calls the functions that come through a connection until it is closed: the program of a local worker."""
+    """Runs a local worker: calls the functions that it receives through a connection until that is closed."""
     global _local  # noqa: PLW0603 (one for the process)
     _local = number, count
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the first one ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError):
         while True:
             function, arguments = connection.recv()
             try:
-                answer = function(*arguments), None
+                reply = function(*arguments), None
             except Exception as error:
-                answer = None, _portable(error)
-            connection.send(answer)
+                reply = None, _portable(error)
+            connection.send(reply)
 
 
 def _end_with_parent() -> None:
@@ -395,9 +412,10 @@ def _end_with_parent() -> None:
 
 
 def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
-    """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them.
+    """Checks intervals and returns the results, and the error that stopped them, pickled for :func:`_unpack`.
 
-    The last intervals are missing, but not the first one, if all take too long.
+    After :data:`_CHUNK_SECONDS` no more intervals are read, so that the last ones may be missing; the first one never
+    is.
     """
     global _opened  # noqa: PLW0603
     stream = io.BytesIO()
@@ -421,7 +439,7 @@ def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
 
 
 def _find_selection_without_initial(job: bytes) -> Selection:
-    """Returns the selection that also ignores what crosses or is inside at the first time."""
+    """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
     try:
         with _ONE_CHUNK, cores(_core_count()):
             return _open(job).selection_without_initial()
@@ -476,16 +494,16 @@ def _portable(error: Exception) -> Exception:
     return RuntimeError(f"{type(error).__name__}: {error} (in worker {_worker_name()}, {place})")
 
 
-# What they exchange ----------------------------------------------------------------------------------------------
+# Messages between the processes ----------------------------------------------------------------------------------
 
 
 def _pack(scene: Scene, checks: Checks) -> bytes:
-    """Returns what a worker opens, as bytes that are the same for the same content."""
+    """Returns a scene and checks as a worker opens them, equal bytes for equal content."""
     return pickle.dumps(__version__) + pickle.dumps((scene, checks))
 
 
 class _Pickler(pickle.Pickler):
-    """Writes the number of an interval in the place of its segment."""
+    """Writes the number of an interval instead of its segment."""
 
     index = 0
 
@@ -494,7 +512,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads the segments of a scene in the place of numbers of intervals."""
+    """Reads numbers of intervals as their segments in a scene."""
 
     def __init__(self, stream: io.BytesIO, scene: Scene):
         super().__init__(stream)
@@ -505,8 +523,8 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
-    """Yields the results of a chunk, raises what stopped it, and notes in the scene what reading it has revealed."""
-    unpickler = _Unpickler(io.BytesIO(found), scene)  # it remembers what consecutive intervals share
+    """Yields the results of a chunk, records the scene's reading notes, and raises the error that stopped the chunk."""
+    unpickler = _Unpickler(io.BytesIO(found), scene)  # one for all, as consecutive intervals share objects
     while notes := unpickler.load():
         scene.note(*notes)
         result = unpickler.load()

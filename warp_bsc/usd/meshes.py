@@ -1,4 +1,4 @@
-"""Reads one mesh of a USD stage, or the curves or points of a prim. Imports pxr, which is slow: import this where used."""
+"""Reads a mesh of a USD stage, or curves or points of a prim. Imports pxr, which is slow: import this where used."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -186,8 +186,8 @@ class UsdMesh:
             low, high = math.floor(max(first, start)) + 1, math.ceil(min(last, end)) - 1
             if high - low >= _MOST_TIMES - len(times):
                 raise ValueError(
-                    f"{self._where}: turns from time {first:g} to {last:g}, which is to be looked at every whole time "
-                    "code; --frames START:END:STEP looks at fewer"
+                    f"frames: {self._where} turns from time {first:g} to {last:g}, more than a million whole time codes "
+                    "at which it is sampled; a step samples fewer"
                 )
             if low <= high and (bends or self._bends(first, last)):
                 times.update(map(float, range(low, high + 1)))

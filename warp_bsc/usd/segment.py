@@ -208,7 +208,7 @@ class Segment:
             polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
         return meshes, polygons
 
-    def places_in_polygons(self, faces: np.ndarray) -> np.ndarray:
+    def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
         """Returns which of the triangles of its polygon each face is, from 0, shape [n]."""
         places = np.zeros(len(faces), dtype=np.int64)
         meshes = np.searchsorted(self._face_ends, faces, side="right")
@@ -219,7 +219,7 @@ class Segment:
         return places
 
     def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Returns faces, given what :meth:`locate_faces` and :meth:`places_in_polygons` return for them, shape [n]."""
+        """Returns faces, given what :meth:`locate_faces` and :meth:`triangles_in_polygons` return for them, shape [n]."""
         faces = np.zeros(len(meshes), dtype=np.int64)
         for number in np.unique(meshes):
             mesh, members = self.meshes[number], meshes == number

@@ -91,7 +91,7 @@ class Selection:
         for name in ("prims", "exclude", "between"):
             for pattern in getattr(self, name) or ():
                 if not any(_matches(mesh, pattern) for mesh in meshes):
-                    raise ValueError(f"{name} {pattern}: there is no such mesh")
+                    raise ValueError(f"{name}: no mesh matches {pattern}")
 
     def unmatched(self, meshes: Sequence[NamedMesh]) -> list[tuple[str, str]]:
         """Returns the pairs to ignore of which a pattern matches none of all meshes."""

@@ -14,7 +14,6 @@ from pxr import Tf, Usd, UsdShade, UsdUtils
 __all__ = ["LeftOut", "UnreadableError", "collecting", "describe_error", "in_one_line", "reading"]
 
 _DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
-# What OpenUSD says of a missing file or prim; its classes do not tell Python.
 _NO_GEOMETRY = frozenset(
     f".{extension}"
     for kinds in (
