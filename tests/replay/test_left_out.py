@@ -114,11 +114,11 @@ def add_mesh_without_points(stage):
 BROKEN = {
     add_mesh_without_points: "/World/Odd: the mesh has no points at time 0",
     add_mesh_with_a_broken_face: "/World/Odd: face 0 refers to vertex 7, but the mesh has 3 points",
-    add_points_of_another_type: "/World/Odd: its points are no points, but float",
+    add_points_of_another_type: "/World/Odd: attribute points holds float, not point3f[]",
     add_faces_of_another_type: "/World/Odd: faceVertexCounts is not a list of integers",
     add_missing_reference: "gone.usda",
     add_missing_clips: "/World/Odd: its value clips have no faces, edges or points",
-    add_instancer_without_prototype: "/World/Odd: instance 0 is of prototype 0, which is not there",
+    add_instancer_without_prototype: "/World/Odd: instance 0 is of prototype 0, which does not exist",
     add_instancer_of_itself: "/World/Odd: the point instancer contains itself",
     add_instancer_whose_arrays_do_not_fit: "/World/Odd[1]/Leaf: its instancer has no valid transform for it at time 0",
     add_broken_binding: "/World/Odd/Mesh: the binding to /World/Odd/Skeleton is broken",

@@ -18,7 +18,7 @@ class FrameRange:
         step: Time codes from one time to the next, more than 0, None for the samples that the scene has.
 
     Raises:
-        TypeError: If one of them is no number.
+        TypeError: If one of them is not a number.
         ValueError: If one of them is not finite, the end is not after the start, or the step is not more than 0.
     """
 
@@ -48,7 +48,7 @@ class FrameRange:
 
         Args:
             samples: All times of the scene, ascending.
-            changes: Times at which meshes change their topology, appear or vanish: a step never passes over these.
+            changes: Times at which meshes change their topology, appear or vanish; steps never pass over these.
 
         Raises:
             ValueError: If there are fewer than two times.
@@ -64,7 +64,7 @@ class FrameRange:
         times = sorted(time for time in times if low <= time <= high)
         if len(times) < 2:
             raise ValueError(
-                f"frames: no motion from time {start:g} to {end:g}; the scene's goes from {samples[0]:g} to "
+                f"frames: no motion from time {start:g} to {end:g}; the scene moves from {samples[0]:g} to "
                 f"{samples[-1]:g}"
             )
         return times

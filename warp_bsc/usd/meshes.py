@@ -29,7 +29,7 @@ from .unreadable import UnreadableError, reading
 
 __all__ = ["UsdMesh"]
 
-_BETWEEN = 0.382  # where between two samples a transform is tested for a bend; halfway, two whole turns look like none
+_BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
 _MOST_TIMES = 1_000_000
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
@@ -39,21 +39,21 @@ class UsdMesh:
 
     Attributes:
         path: The prim's path.
-        name: The same, with the number of the instance if a point instancer places it.
-        group: The same for all instances of a prim that one instancer places; empty if none places it.
+        name: The path, with the number of the instance if a point instancer places it.
+        group: The same value for all instances of a prim that one instancer places; empty without an instancer.
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
         is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`.
-        is_strands: Whether it is no mesh, but :class:`~warp_bsc.usd.strands.Strands`.
+        is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
-        states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
-            is invisible, not there or empty, else a digest of its topology.
-        turns: Whether a transform or a skeleton moves it, which is not linear between the samples.
-        deforms: Whether anything but its transform moves it.
+        states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
+            absent or empty, else a digest of its topology.
+        turns: Whether a transform or a skeleton moves it, so that it may move nonlinearly between the samples.
+        deforms: Whether anything except its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
         is_empty: Whether it has no faces, and no edges or points, at any time.
-        is_nowhere: Whether its transform is finite at no time.
+        is_nowhere: Whether its transform is not finite at any time.
     """
 
     def __init__(self, found: MeshPrim, file: str | os.PathLike):
@@ -64,7 +64,7 @@ class UsdMesh:
             file: Its file, for messages.
 
         Raises:
-            UnreadableError: If an attribute has a value that a mesh cannot have.
+            UnreadableError: If the value of an attribute is invalid.
         """
         prim, instance = found.prim, found.instance
         self._file = file
@@ -85,7 +85,7 @@ class UsdMesh:
         self._where = f"{file}: {found.name}"
         instancer = instance.instancer if instance else None
         self.group = (id(instancer), self.path) if instancer else ()
-        self._last_points: dict[tuple, np.ndarray] = {}  # shared by all instances, as are the next ones
+        self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
         breaks = visibility_times(prim, self._root) | sample_times(*self._polygons.topology_attributes)
@@ -97,7 +97,7 @@ class UsdMesh:
         )
         has_elements = [not is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
         self.is_empty = not any(has_elements)
-        # A mesh may be empty for some time, as where a fluid has not begun to flow.
+        # A mesh may be empty for some time, such as a fluid before it flows.
         self._states = [
             self._read_topology(code).digest() if has and is_shown(prim, self._root, code) else None
             for code, has in zip(self._break_codes, has_elements, strict=True)
@@ -145,7 +145,7 @@ class UsdMesh:
         self.name = found.name
         self._where = f"{self._file}: {self.name}"
         self._instance = instance = found.instance
-        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that count as that one
+        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that it stands for
         states = self._states
         if instance:
             present = instance.are_present(self._break_codes)
@@ -170,11 +170,11 @@ class UsdMesh:
         )
 
     def turning_times(self, start: float, end: float) -> set[float]:
-        """Returns the whole time codes between samples at which the mesh is off the straight way between them.
+        """Returns the whole time codes between samples at which the mesh is not on the straight path between them.
 
         Args:
-            start: Only after this time.
-            end: Only before this time.
+            start: Time code after which they are.
+            end: Time code before which they are.
 
         Raises:
             ValueError: If there are more than a million.
@@ -186,17 +186,17 @@ class UsdMesh:
             low, high = math.floor(max(first, start)) + 1, math.ceil(min(last, end)) - 1
             if high - low >= _MOST_TIMES - len(times):
                 raise ValueError(
-                    f"frames: {self._where} turns from time {first:g} to {last:g}, more than a million whole time codes "
-                    "at which it is sampled; a step samples fewer"
+                    f"frames: {self._where} turns from time {first:g} to {last:g} and is sampled at every whole time "
+                    "code, more than a million; a step takes fewer"
                 )
             if low <= high and (bends or self._bends(first, last)):
                 times.update(map(float, range(low, high + 1)))
         return times
 
     def take_times(self, scene_times: dict[float, float]) -> None:
-        """Replaces the mesh's times by the scene's, where the scene merged times that are almost one.
+        """Replaces the mesh's times by the scene's, which stand for several times that differ by rounding.
 
-        The moment before such a time is read just before the first of the mesh's own times, the rest at the last.
+        The moment before such a time is read just before the first of the mesh's own times, the time at the last.
 
         Args:
             scene_times: The scene's time for each time found in any mesh.
@@ -223,7 +223,7 @@ class UsdMesh:
         self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
-        """Reads the points as they are stored, or as a skeleton moves them, shape [point_count, 3].
+        """Returns the stored points, or those that a skeleton and blend shapes deform, shape [point_count, 3].
 
         Args:
             time: Time code.
@@ -237,7 +237,7 @@ class UsdMesh:
             key = code.GetValue(), code.IsPreTime(), before and time not in self.states
             if key in self._last_points:
                 return self._last_points[key]
-            # Where the topology stays, a changed number of points is an error, which the moment before would hide.
+            # A number of points that changes without the topology is an error, which the moment before would hide.
             at_time = before and time not in self.states
             points = self._polygons.read_points(Usd.TimeCode(code.GetValue()) if at_time else code)
             if is_empty(points):
@@ -246,7 +246,7 @@ class UsdMesh:
                 self._skin.deform(points, code)
             array = np.array(points)
             if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
-                raise UnreadableError(f"{self._where}: its points are no points, but {type(points).__name__}")
+                raise UnreadableError(f"{self._where}: attribute points holds {type(points).__name__}, not point3f[]")
             if self.group:
                 self._last_points.clear()
                 self._last_points[key] = array
@@ -255,7 +255,7 @@ class UsdMesh:
     def read_positions(
         self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
     ) -> np.ndarray:
-        """Reads the positions of some points in world space.
+        """Returns the positions of some points in world space.
 
         Args:
             time: Time code.
@@ -290,7 +290,7 @@ class UsdMesh:
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
     ) -> np.ndarray | None:
-        """Reads the positions of all points in several instances of the same :attr:`group` in world space, float64.
+        """Returns the positions of all points in several instances of one :attr:`group` in world space, float64.
 
         Args:
             time: Time code.
@@ -299,8 +299,8 @@ class UsdMesh:
             before: As of :meth:`read_positions`.
 
         Returns:
-            Positions, shape [n, point_count, 3]; None if any instance is broken, which :meth:`read_positions` of that
-            one then says.
+            Positions, shape [n, point_count, 3]; None if an instance is broken, for which its :meth:`read_positions`
+            raises the error.
 
         Raises:
             UnreadableError: If the points cannot be read.
@@ -315,11 +315,11 @@ class UsdMesh:
 
     @property
     def index(self) -> int:
-        """Number of the instance, 0 for a mesh that no instancer places."""
+        """Number of the instance, 0 for a mesh without an instancer."""
         return self._instance.index if self._instance else 0
 
     def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Reads the polygons that are no holes, as triangles that turn counterclockwise seen from outside.
+        """Returns the polygons without the holes, as triangles that turn counterclockwise seen from outside.
 
         Args:
             time: Time code.
@@ -347,10 +347,10 @@ class UsdMesh:
             return self._last_triangles[key]
 
     def read_strands(self, times: list[float], point_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reads the edges of curves, and the radii of curves and points; of a mesh, there are none.
+        """Returns the edges of curves, and the radii of curves and points; empty and zero for a mesh with faces.
 
         Args:
-            times: Times, ascending, from the first to before the last of which the topology is the same.
+            times: Times, ascending; the topology is the same from the first to just before the last.
             point_count: Number of points.
 
         Returns:
@@ -374,7 +374,7 @@ class UsdMesh:
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:
-        """Returns the largest factor by which the transform lengthens at each time, to nine digits; 1 for no times."""
+        """Returns the largest stretch of the transform at each time, to nine digits; [1] without times."""
         found = [self._find_transform(self._time_code(time, False)) for time in times if not self.is_placed]
         scales = [
             np.linalg.norm(transform[:3, :3], 2)
@@ -384,6 +384,7 @@ class UsdMesh:
         return [float(f"{scale:.9g}") for scale in scales] or [1.0]
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
+        """Returns the result of :meth:`read_triangles`."""
         topology = self._read_topology(code)
         triangles, polygons = topology.triangles(points, self._where)
         is_left_handed = UsdGeom.Gprim(self._prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
@@ -394,11 +395,11 @@ class UsdMesh:
     def _time_code(self, time, before) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
-        # Reading the moment before a time takes twice as long: USD interpolates from the sample before.
+        # Reading the moment before a time takes twice as long, as USD interpolates from the previous sample.
         return as_time_code(first if before else last, before=before and (self.may_jump or time in self.states))
 
     def _transform(self, time, *, before=False) -> np.ndarray:
-        """Returns the matrix that takes points, as rows, to world space, shape [4, 4]."""
+        """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""
         transform = self._find_transform(self._time_code(time, before))
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
@@ -407,7 +408,7 @@ class UsdMesh:
         return transform
 
     def _bends(self, start, end) -> bool:
-        """Returns whether the transform leaves the straight way from one sample to the next."""
+        """Returns whether the transform leaves the straight path from one sample to the next."""
         if (start, end) not in self._bent:
             codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
             (first, *_), (between, *_), (last, *_) = found = [self._read_transforms(self._instance, c) for c in codes]
@@ -425,7 +426,7 @@ class UsdMesh:
         return self._instance.transform(self._frame, time)
 
     def _read_transforms(self, instance, time) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what :meth:`Instancer.transforms` does of all instances, or one matrix for a mesh that is none."""
+        """Returns the result of :meth:`Instancer.transforms`, or one matrix for a mesh without an instancer."""
         if instance:
             return instance.instancer.transforms(self._frame, instance.root, time)
         transform = np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))

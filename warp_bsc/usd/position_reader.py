@@ -11,10 +11,16 @@ __all__ = ["PositionReader"]
 
 
 class PositionReader:
-    """Reads positions of some vertices; those of instances of one prim together."""
+    """Reads positions of some vertices of meshes, those of instances of one prim together."""
 
     def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
-        """Takes for each mesh the number of its points, the rows of its vertices in the result, and their points."""
+        """Makes a reader.
+
+        Args:
+            parts: For each mesh the mesh, the number of its points, the rows of its vertices in the result, and the
+                indices of these among its points.
+            dtype: Type of the positions.
+        """
         self._dtype = dtype
         groups: dict[tuple, list] = {}
         self._single = []
@@ -24,7 +30,7 @@ class PositionReader:
         for members in groups.values():
             instances = np.array([mesh.index for mesh, *_ in members])
             rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
-            taken = np.concatenate([place * count + points for place, (_, count, _, points) in enumerate(members)])
+            taken = np.concatenate([number * count + points for number, (_, count, _, points) in enumerate(members)])
             self._groups.append((members, instances, rows, taken))
 
     def read(self, positions: np.ndarray, time: float, before: bool) -> None:
@@ -41,7 +47,7 @@ class PositionReader:
             if found is not None and np.isfinite(found).all():
                 positions[rows] = found
             else:
-                singles += members  # one of them is broken, and says so
+                singles += members  # one of them is broken; reading it raises the error
         for mesh, count, rows, points in singles:
             positions[rows] = mesh.read_positions(
                 time, before=before, used=points, point_count=count, dtype=self._dtype

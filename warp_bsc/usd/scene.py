@@ -1,47 +1,46 @@
-"""The meshes of a USD scene as motions between time samples: fixed faces, and positions in world space.
+"""The meshes of a USD scene as motion between time samples: fixed faces, and positions in world space.
 
 What is read
 ------------
-Every ``UsdGeom.Mesh`` that is loaded and selected is read, wherever references, payloads, variants, native instances
-and point instancers put it. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra; linear
-``UsdGeom.BasisCurves`` as edges, and ``UsdGeom.Points`` as points, with half their widths, lengthened as much as their
-transform lengthens most, as radii; without widths, radii are 0. In what follows, these are meshes too. All meshes are
-merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
-alike. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once; holes and
-points that no face refers to are left out. Blend shapes and joints move the points as UsdSkel computes them.
+Every ``UsdGeom.Mesh`` that is loaded and selected is read, including those of references, payloads, variants, native
+instances and point instancers. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra, linear
+``UsdGeom.BasisCurves`` as edges, and ``UsdGeom.Points`` as points. The radius of curves and points is half their width,
+multiplied by the largest stretch of their transform, or 0 without widths. Below, all of these are called meshes. Meshes
+are merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
+in the same way. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once;
+holes and points without faces are omitted. Blend shapes and joints move the points as UsdSkel computes them.
 
-Vertices that are in one place at every time are welded to one. The two sides of a seam are an example, or a cloth that
-was written as one mesh for each of its colours: unwelded, they would touch all the time.
+Vertices that have the same position at every time are welded to one. Examples are the two sides of a seam, or a cloth
+that was written as one mesh for each of its colours: unwelded, they would touch all the time.
 
 What moves
 ----------
 The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
 meshes together; at a time that is not a mesh's own sample, USD interpolates. Rotating transforms and skeletons do not
 move points straight from one sample to the next: they are sampled at every whole time code between as well, and splines
-as finely as :func:`~warp_bsc.usd.stage.sample_times` says. From one time to the next each vertex is taken to move
-straight, from its place at the first time to its place just before the second. A mesh that jumps at the second time,
-from one value clip to the next or because a value was held, therefore ends where it was before the jump.
+as :func:`~warp_bsc.usd.samples.sample_times` describes. From one time to the next, each vertex moves straight from its
+position at the first time to its position just before the second. A mesh that jumps at the second time, from one value
+clip to the next or because a value was held, ends at its position before the jump.
 
-Times less than a millionth of a time code apart, or less than a millionth of the whole time if that is shorter, count
-as one: rounding produces such times in files, and OpenUSD uses them to separate the end of a value clip from the start
-of the next.
+Times that differ by less than a millionth of a time code, or of the whole time if that is shorter, count as one:
+rounding produces them in files, and OpenUSD uses them to separate the end of a value clip from the start of the next.
 
-Where a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
+When a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
 begins.
 
 Precision
 ---------
 USD stores points in single precision, transforms in double. If every transform is the identity, positions are the
-stored ones, in single precision; otherwise all are computed and returned in double precision.
+stored ones in single precision; otherwise all are computed and returned in double precision.
 
 What cannot be read
 -------------------
-Broken meshes and instances, and files that cannot be opened and may hold geometry, are left out from the time on at
-which they are broken, and named in :attr:`Scene.left_out`. The rest is read as long as something in it moves. A scene
-in which nothing ever moves is read at one time.
+Broken meshes and instances are left out from the time at which they break, and files that cannot be opened and may
+hold geometry are left out as a whole; :attr:`Scene.left_out` names them. The rest is read as long as something in it
+moves. A scene in which nothing ever moves is read at one time.
 
-:attr:`Scene.warnings` names the contents that this module does not read (other curves and shapes without polygons,
-unselected meshes) and the changes that it makes to the motion.
+:attr:`Scene.warnings` names the contents that are not read (other curves and shapes without polygons, unselected
+meshes) and the changes to the motion.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -77,10 +76,10 @@ from .selection import Selection
 __all__ = ["Scene"]
 
 _MOST_PARTS = 10_000  # of a step between two times
-_NAMED = 5  # most parts left out, and most messages of OpenUSD, that the warnings list
+_NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
 
-# If a crate file is mapped into memory, every page read counts as memory of this process, which then seems to grow with
-# each frame. USD reads these variables when it is loaded; without the second it reports the first on standard error.
+# If a crate file is mapped into memory, every page read counts as memory of this process, which seems to grow with each
+# frame. USD reads these variables when it is loaded; without the second one it reports the first on standard error.
 if "USDC_USE_ASSET" not in os.environ:
     os.environ["USDC_USE_ASSET"] = "1"
     os.environ.setdefault("TF_ENV_SETTING_ALERTS_ENABLED", "0")
@@ -89,16 +88,16 @@ if "USDC_USE_ASSET" not in os.environ:
 class Scene:
     """The moving meshes of a USD file, as intervals between consecutive times: ``for interval in scene``.
 
-    A scene holds one segment of the motion in memory and reads others when an interval needs them. Threads may share a
-    scene: each interval that one reads waits for the one before. Jumps are found between intervals read in order.
+    A scene holds one segment of the motion in memory and reads another one when an interval needs it. Threads may share
+    a scene: they read one interval at a time. Jumps are found between intervals that are read in order.
 
     It can be pickled, for another process that reads other intervals of the same files: the pickle holds its path, its
-    options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if it is not
-    the same one.
+    options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if the file
+    has changed.
 
     Attributes:
         path: The file.
-        selection: Which of its meshes are checked.
+        selection: The meshes that are checked, and the pairs of them.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
         times: Time codes between which motion is straight, ascending, at least two. If nothing moves, appears or
@@ -134,25 +133,25 @@ class Scene:
 
         Args:
             path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
-            selection: Which of its meshes are checked; default: those to be rendered.
+            selection: Selects the meshes that are checked, and the pairs of them; default: those to be rendered.
             frames: The part of its time; default: all.
             subdivide: Number of intervals, 1 to 10,000, into which each step between two times is divided.
             sample_turns: Whether rotating transforms and skeletons are sampled at every whole time code too, if
                 ``frames`` has no step.
             strict: Whether unreadable parts are an error instead of being left out.
-            allow_missing: Patterns of files, and of prims, that may be missing: a warning names them, and they neither
-                are in :attr:`left_out` nor an error. ``*`` matches any text. A pattern is matched with the path of a
-                missing file, its end from any folder on, and the path of the prim that refers to it or to a missing
-                prim; it includes the prims below. Files that cannot hold geometry, such as materials and textures,
-                always may be missing.
-            progress: Called while vertices are welded, which reads the scene once: with the number of its times that
-                have been compared, and of all.
+            allow_missing: Patterns of files and prims that may be missing: a warning names them; they are neither in
+                :attr:`left_out` nor an error. ``*`` matches any text. A pattern is matched with the path of a missing
+                file, its end from any folder on, and the path of the prim that refers to it or to a missing prim; it
+                includes the prims below. Files that cannot hold geometry, for example materials and textures, may
+                always be missing.
+            progress: Called while vertices are welded, which reads the scene once, with the number of its times that
+                have been compared, and their total.
 
         Raises:
             TypeError: If an argument has another type.
             FileNotFoundError: If there is no such file.
-            ValueError: If the file is not USD, has no mesh that can be read, or a selection selects nothing; if
-                ``strict``, also if a part cannot be read. The message names the file, the prim and the time.
+            ValueError: If the file is not USD, has no readable mesh, or no mesh is selected; if ``strict``, also if a
+                part cannot be read. The message names the argument, or the file, the prim and the time.
         """
         check_instance(path, "path", (str, os.PathLike), "the path of a file")
         if selection is not None:
@@ -178,7 +177,7 @@ class Scene:
         revealed: Revealed,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Opens the file and finds its meshes, as of ``__init__``, given what reading it has revealed earlier."""
+        """Opens the file and finds its meshes, given what reading it has revealed in another process."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
         from .find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
@@ -234,7 +233,7 @@ class Scene:
 
     @property
     def left_out(self) -> list[str]:
-        """The parts left out so far because they could not be read, and why, a sentence each."""
+        """The parts that were left out so far because they could not be read, and the reasons, a sentence each."""
         return self._left_out.reasons
 
     @property
@@ -263,24 +262,24 @@ class Scene:
         return len(self.times) - 1
 
     def __iter__(self) -> Iterator[Interval]:
-        """Reads all intervals in order, each when it is reached. Errors are those of :meth:`interval`."""
+        """Yields all intervals in order, reading each when it is reached; errors as of :meth:`interval`."""
         return self.intervals()
 
     def __reduce__(self):
-        """Returns what opens the scene again."""
+        """Returns the call that opens the scene again."""
         path = os.path.abspath(self.path) if os.path.exists(self.path) else self.path
         revealed = Revealed(tuple(self._parts), self._welds)
         return _open_again, (path, self._options, revealed, self.files.versions(), self._contents())
 
     def intervals(self, first: int = 0, stop: int | None = None) -> Iterator[Interval]:
-        """Reads intervals in order, each when it is reached, with the jumps from the one before the first, too.
+        """Yields intervals in order, reading each when it is reached, and the one before the first to find jumps.
 
         Args:
             first: Number of the first interval.
             stop: Number of the interval after the last one; default: all.
 
         Raises:
-            TypeError: If a number is no integer.
+            TypeError: If a number is not an integer.
             IndexError: If there is no such interval.
             ValueError: As of :meth:`interval`.
         """
@@ -296,13 +295,13 @@ class Scene:
             yield self._read(index)
 
     def interval(self, index: int) -> Interval:
-        """Reads the motion from one time to the next.
+        """Returns the motion from one time to the next.
 
         Args:
-            index: Number of the interval, from 0: it starts at that one of :attr:`times`.
+            index: Number of the interval, from 0; it starts at ``times[index]``.
 
         Raises:
-            TypeError: If a number is no integer.
+            TypeError: If a number is not an integer.
             IndexError: If there is no such interval.
             ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
         """
@@ -312,11 +311,11 @@ class Scene:
 
     @one_at_a_time
     def segment(self, index: int, progress: Callable[[int, int], None] | None = None) -> Segment:
-        """Returns the segment that an interval is in: the one in memory if possible.
+        """Returns the segment of an interval, the one in memory if possible.
 
         Args:
             index: Number of the interval.
-            progress: As of the constructor.
+            progress: As of :class:`Scene`.
 
         Raises:
             ValueError: As of :meth:`interval`.
@@ -340,18 +339,18 @@ class Scene:
 
     @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
-        """Returns what reading has revealed since this was called last, or since the scene was opened; and jumps."""
+        """Returns the notes on reading since the last call, or since the scene was opened, and given jumps."""
         parts, messages = self._noted
         self._noted = len(self._parts), len(self._messages)
         return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
 
     @one_at_a_time
     def note(self, index: int, notes: ReadingNotes) -> None:
-        """Records what reading an interval has revealed in another process, as if this scene had read it.
+        """Records notes on reading an interval in another process, as if this scene had read it.
 
         Args:
             index: Number of the interval.
-            notes: What has been revealed. That of all intervals before must have been recorded.
+            notes: The notes. Those of all previous intervals must have been recorded.
         """
         for part in notes.left_out:
             self._left_out.reasons.append(part.reason)
@@ -362,7 +361,7 @@ class Scene:
 
     @one_at_a_time
     def _read(self, index) -> Interval:
-        """Reads an interval, with all that reading has revealed since notes were taken last."""
+        """Returns an interval, with the notes on reading since the last call of :meth:`take_notes`."""
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
@@ -370,7 +369,7 @@ class Scene:
 
     @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Reads the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
+        """Returns the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
         start, end = self.times[index : index + 2]
         with self._collecting(self._messages, self.path):
             while True:
@@ -392,11 +391,11 @@ class Scene:
             raise TypeError(f"{name} must be an integer, not {given(index)}")
         if not 0 <= int(index) <= last:
             number = given(int(index))
-            raise IndexError(f"{self.path}: {name}: there is no interval {number}, they go from 0 to {len(self) - 1}")
+            raise IndexError(f"{name}: {self.path} has no interval {number}, only 0 to {len(self) - 1}")
         return int(index)
 
     def _contents(self) -> tuple:
-        """Returns facts of the scene that another process must find, too."""
+        """Returns facts of the scene that must be the same in another process."""
         return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
 
     def _check_meshes(self, is_selection):
@@ -408,7 +407,7 @@ class Scene:
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _leave_out(self, error, index):
-        """Leaves out the mesh of an error from the interval on in which it breaks, or from ``index`` on if later."""
+        """Leaves out the mesh of an error from the interval in which it breaks, or from ``index`` if that is later."""
         since = max(index, self.times.index(error.time) - 1)
         self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
         self._apply(LeftOutMesh(error.mesh, since, self.left_out[-1]))
@@ -417,7 +416,7 @@ class Scene:
             raise error
 
     def _apply(self, part: LeftOutMesh) -> None:
-        """Removes a mesh from an interval on."""
+        """Leaves out a mesh from an interval on."""
         self._parts.append(part)
         since = part.since
         mesh = next(mesh for mesh in self._usd_meshes if mesh.name == part.name)
@@ -425,8 +424,8 @@ class Scene:
         first, last = next(span for span in self._spans if span[0] <= since < span[1])
         self._welds.pop((first, last), None)
         if first < since:
-            place = self._spans.index((first, last))
-            self._spans[place : place + 1] = [(first, since), (since, last)]
+            number = self._spans.index((first, last))
+            self._spans[number : number + 1] = [(first, since), (since, last)]
         self._span = None
         self._jumps.forget()
 
@@ -435,8 +434,8 @@ def _open_again(path, options, revealed, versions, contents) -> Scene:
     """Opens a scene that another process has opened.
 
     Raises:
-        OSError: If there is no such file here.
-        ValueError: If it is not the same scene here.
+        OSError: If the file does not exist here.
+        ValueError: If the file or the scene differs here.
     """
     scene = Scene.__new__(Scene)
     scene._open(path, options, revealed)

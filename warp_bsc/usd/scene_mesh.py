@@ -1,4 +1,4 @@
-"""The part of a segment that one mesh of the scene is."""
+"""The part of a segment that one mesh of the scene becomes."""
 
 from dataclasses import dataclass, field
 
@@ -9,15 +9,15 @@ __all__ = ["SceneMesh"]
 
 @dataclass(frozen=True)
 class SceneMesh:
-    """The part of a segment that one mesh of the scene is, or the curves or points of one prim.
+    """The part of a segment that one mesh of the scene, or the curves or points of a prim, becomes.
 
     Attributes:
         path: The prim's path.
-        name: The same, with the number of the instance if a point instancer places it.
+        name: The path, with the number of the instance if a point instancer places it.
         display_name: Display name in the file, empty if there is none.
         moves: Whether its points or its transform change with time.
-        deforms: Whether its points do, relative to each other, so that it may collide with itself.
-        vertices: Its vertices, among those of all meshes before they were welded.
+        deforms: Whether its points move relative to each other, so that it may collide with itself.
+        vertices: Its vertices among those of all meshes, numbered before welding.
         faces: Its faces, among those of all meshes.
         points: Index of each vertex among the prim's points, shape [len(vertices)].
         point_count: Number of the prim's points.

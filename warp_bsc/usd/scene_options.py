@@ -1,4 +1,4 @@
-"""The options of a scene and what reading it has revealed: with the path, all that another process needs to open it."""
+"""The options of a scene and the results of reading it with which another process opens it again."""
 
 from dataclasses import dataclass, field
 
@@ -25,7 +25,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class Revealed:
-    """What reading a scene has revealed: the meshes left out, and the welds of segments, by the span of intervals."""
+    """The meshes left out while reading a scene, and the welds of its segments by their span of intervals."""
 
     left_out: tuple[LeftOutMesh, ...] = ()
     welds: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)

@@ -42,10 +42,10 @@ class UnreadableError(ValueError):
 
 
 class LeftOut:
-    """The parts of a scene that cannot be read and are left out.
+    """The parts of a scene that are left out because they cannot be read.
 
     Attributes:
-        is_strict: Whether leaving out is forbidden.
+        is_strict: Whether leaving out a part is an error.
         reasons: The parts left out and why, a sentence each.
         notes: The parts that are missing and allowed to be, a sentence each.
     """
@@ -55,7 +55,7 @@ class LeftOut:
 
         Args:
             file: The file.
-            is_strict: Whether leaving out is forbidden.
+            is_strict: Whether leaving out a part is an error.
             allow_missing: As of :class:`~warp_bsc.usd.scene.Scene`.
         """
         self._prefix = f"{file}: "

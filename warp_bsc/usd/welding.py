@@ -1,4 +1,4 @@
-"""Finds vertices that are in the same place at every time."""
+"""Groups vertices that have the same position."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ def group_by_position(positions: np.ndarray) -> np.ndarray:
 
 
 def split_by_position(groups: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Splits groups by position: returns for each vertex the first of its group that is in the same place, shape [n].
+    """Returns for each vertex the first one of its group that has the same position, shape [n].
 
     Args:
         groups: The first vertex of each vertex's group, shape [n].
@@ -28,5 +28,5 @@ def split_by_position(groups: np.ndarray, positions: np.ndarray) -> np.ndarray:
         keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         groups = groups.copy()
-        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
+        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 returns another shape
     return groups
