@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from boxes import CORNERS, SIDES
 from chromium import CHROMIUM, Browser
 from pxr import Usd, UsdGeom
+from replay_files import Page
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
-from test_intersections import CORNERS, SIDES
-from test_replay_outputs import Page
 
 import warp_bsc as bsc
 from warp_bsc import checker

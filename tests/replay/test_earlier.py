@@ -8,7 +8,7 @@ import sys
 import time
 
 import pytest
-from test_replay_interrupted import OUTPUTS, options, write_old, write_scene
+from waving_sheets import OUTPUTS, options, write_old, write_scene
 
 from warp_bsc._atomic_file import OutputFile, unfinished_path
 from warp_bsc.cli import replay as replay_command
