@@ -8,7 +8,6 @@ _OPTIONS = {
     name: f"--{name.replace('_', '-')}"
     for name in (
         "allow_missing",
-        "baseline",
         "between",
         "clearance",
         "count",
@@ -17,9 +16,9 @@ _OPTIONS = {
         "ignore",
         "ignore_initial",
         "intersections",
+        "kind",
         "method",
         "min_distance",
-        "overlay",
         "prims",
         "subdivide",
         "validate",

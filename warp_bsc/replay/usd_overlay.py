@@ -11,7 +11,7 @@ import numpy as np
 
 from .._atomic_file import OutputFile
 from ..usd.layer import just_before, layer_metadata, unused_path
-from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, write_binary_layer, write_text_layer
+from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, PrimKind, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from .outputs import without_last_eighth
@@ -58,7 +58,7 @@ _ELEMENTS = {
     "primvars:elementB": "int2[]",
 }
 _CONTACTS = _MARKERS | {"primvars:toi": "float[]"} | _ELEMENTS
-_PARTS: dict[str, tuple[str, dict[str, str]]] = {
+_PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
     "Polygons": (
         "Mesh",
         _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},

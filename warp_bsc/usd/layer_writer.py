@@ -13,7 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["SHAPES", "LayerContent", "LayerPrim", "write_binary_layer", "write_text_layer"]
+__all__ = ["SHAPES", "LayerContent", "LayerPrim", "PrimKind", "write_binary_layer", "write_text_layer"]
+
+PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
+"""The types of prims in a layer."""
 
 SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
@@ -35,7 +38,7 @@ class LayerPrim:
     """
 
     name: str
-    kind: Literal["Mesh", "PointInstancer", "BasisCurves"]
+    kind: PrimKind
     attributes: dict[str, str]
     color: tuple[float, float, float]
     width: float = 0.0

@@ -88,8 +88,8 @@ class ShapePolygons:
 
         Args:
             prim: The prim.
-            segments: Number of edges around a capsule, cylinder or cone. A sphere is an icosahedron whose edges are halved
-                log2(segments / 4) times, rounded.
+            segments: Number of edges around a capsule, cylinder or cone. A sphere is an icosahedron whose edges are
+                halved log2(segments / 4) times, rounded.
         """
         self._segments = segments
         self._type = prim.GetTypeName()
