@@ -320,7 +320,7 @@ def test_a_vertex_that_is_welded_to_another_mesh_is_still_its_own_meshs(stage):
         list(range(6)),
     )
     found = find(stage)
-    assert "vertices in one place at all times were welded: 1" in found["warnings"]
+    assert "vertices with the same position at all times were welded: 1" in found["warnings"]
     assert hits(found) == []
 
 

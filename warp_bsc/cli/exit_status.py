@@ -20,7 +20,7 @@ class ExitStatus(IntEnum):
 _TEXTS = {
     ExitStatus.DONE: "done",
     ExitStatus.FOUND: "done, and found what --fail-on names",
-    ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error says what and where",
+    ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error names it and its place",
     ExitStatus.DISAGREES: "replay --validate found a wrong decision",
     ExitStatus.LEFT_OUT: "replay is done, but parts of the scene that may hold geometry could not be read and were "
     "left out; replay --strict ends with 2 instead",

@@ -125,7 +125,7 @@ def distance(text: str) -> float:
     """Returns the distance that a text holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no number, not finite or less than 2^-1021, as 0 is.
+        argparse.ArgumentTypeError: If it is not a number, not finite or less than 2^-1021, for example 0.
     """
     try:
         number = float(text)
@@ -140,7 +140,7 @@ def positive(text: str) -> int:
     """Returns the integer that a text holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no integer or not in [1, 2^31).
+        argparse.ArgumentTypeError: If it is not an integer in [1, 2^31).
     """
     return _integer(text, 1)
 
@@ -149,7 +149,7 @@ def natural(text: str) -> int:
     """Returns the integer that a text holds, which may be 0.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no integer or not in [0, 2^31).
+        argparse.ArgumentTypeError: If it is not an integer in [0, 2^31).
     """
     return _integer(text, 0)
 

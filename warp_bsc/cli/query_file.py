@@ -126,7 +126,7 @@ def _read_rows(path: Path) -> np.ndarray:
             raise ValueError(f"{path}:{number}: {len(row)} columns, but {width} on the lines before")
         rows.append(row)
     if len(rows) % 8:
-        raise ValueError(f"{path}:{len(rows)}: the file ends within a query: {len(rows)} rows are no multiple of 8")
+        raise ValueError(f"{path}:{len(rows)}: the file ends within a query: {len(rows)} rows are not a multiple of 8")
     try:
         return np.array(rows, dtype=np.int64)
     except OverflowError:

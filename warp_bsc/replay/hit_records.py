@@ -305,7 +305,7 @@ def read_interval(line: bytes) -> dict[str, Any]:
 
 
 def needs_following(fields: dict[str, Any]) -> bool:
-    """Returns whether only the fields of the next interval say what was found at the end of an interval."""
+    """Returns whether the findings at the end of an interval are only in the fields of the next interval."""
     lists = "edges_through_faces", "proximity_pairs"
     return any(name in fields and f"{name}{_AT_END}" not in fields for name in lists)
 
@@ -378,10 +378,10 @@ def _intersection_counts(found: IntersectionSummary) -> dict[str, Any]:
 
 
 def mesh_pairs_to_list(mesh_pairs: Iterable[tuple[tuple[str, str], int]]) -> list[dict[str, Any]]:
-    """Returns numbers of colliding pairs by two meshes as a list of objects."""
+    """Returns numbers of colliding pairs, given by two meshes, as a list of objects."""
     return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]
 
 
 def _mesh_pairs_from_list(mesh_pairs: list[dict[str, Any]]) -> dict[tuple[str, str], int]:
-    """Returns the numbers that such a list holds."""
+    """Returns the numbers in a list of :func:`mesh_pairs_to_list`, by two meshes."""
     return {(first, second): pair["hits"] for pair in mesh_pairs for first, second in [pair["meshes"]]}

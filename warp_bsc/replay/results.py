@@ -294,8 +294,8 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     order = np.argsort(found.distance, kind="stable")
     _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
     nearest = []
-    for place in np.argsort(firsts).tolist():
-        row = int(order[firsts[place]])
+    for group in np.argsort(firsts).tolist():
+        row = int(order[firsts[group]])
         rows = slice(row, row + 1)
         x, y, z = found.position[row].tolist()
         nearest.append(
@@ -305,7 +305,7 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
                 found.time,
                 float(found.distance[row]),
                 (x, y, z),
-                int(numbers[place]),
+                int(numbers[group]),
             )
         )
     return ProximitySummary(found.time, len(found), tuple(nearest))

@@ -23,7 +23,7 @@ Surfaces that cross at neither time touch within the interval, or pass through e
 
 @dataclass(frozen=True)
 class SceneContacts(ScenePairs):
-    """The pairs that collide in one interval, with places and times: arrays with a row for each pair.
+    """The pairs that collide in one interval, with positions and times: arrays with a row for each pair.
 
     Attributes:
         interval: The interval.
@@ -237,8 +237,8 @@ def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: Sc
         for weight, intersections in ((2, start), (1, end)):
             if len(tangled := intersections.tangled_vertices):
                 keys = intersections.pair_keys(pairs).reshape(6, -1)
-                places = np.searchsorted(tangled, keys)
-                phase[rows] += weight * (tangled[np.minimum(places, len(tangled) - 1)] == keys).any(axis=0)
+                found = np.searchsorted(tangled, keys)
+                phase[rows] += weight * (tangled[np.minimum(found, len(tangled) - 1)] == keys).any(axis=0)
     return replace(contacts, separate=separate, phase=phase)
 
 

@@ -65,7 +65,7 @@ class IntersectionSpan:
         becomes: The state of the meshes at the next time, "inside" or "crosses"; empty if they do not intersect then.
         first: Number of parts that are inside, or of edges that pass through faces or touch them, at the first time.
         last: That number at the last time.
-        most: The largest such number of all times.
+        most: The largest of these numbers at all times.
         most_at: The first time with that number.
         crossings: Largest number of edges that pass through faces at a time; 0 if the meshes only touch, or are inside.
     """

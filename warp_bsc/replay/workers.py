@@ -208,7 +208,7 @@ class Cluster:
 
     def result(self, future: Any) -> Any:
         """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
-        with self._connected(*self._disconnected):  # of which only a lost scheduler cancels a future that is read
+        with self._connected(*self._disconnected):  # a lost scheduler cancels its futures
             return future.result()
 
     def close(self) -> None:

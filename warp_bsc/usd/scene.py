@@ -249,7 +249,7 @@ class Scene:
         warnings += self._warnings
         warnings += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
-            warnings.append(f"vertices in one place at all times were welded: {self._welded}")
+            warnings.append(f"vertices with the same position at all times were welded: {self._welded}")
         return warnings
 
     @property

@@ -103,7 +103,7 @@ def reading(
     time: float | None = None,
     errors: tuple[type[Exception], ...] = (ValueError, *_DAMAGE),
 ) -> Iterator[None]:
-    """Turns the errors of many types that damaged data raise in OpenUSD into one that says where the damage is.
+    """Turns the errors of many types that damaged data raise in OpenUSD into one that names the file and the prim.
 
     Args:
         where: File and prim.
