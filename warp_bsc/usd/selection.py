@@ -4,16 +4,19 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
 from .._arguments import checked_choice, checked_flag, checked_strings, given
 
-__all__ = ["PURPOSES", "NamedMesh", "Selection"]
+__all__ = ["PURPOSES", "NamedMesh", "Purpose", "Selection"]
 
-PURPOSES = ("default", "render", "proxy", "guide")
-"""The purposes of prims in USD."""
+Purpose = Literal["default", "render", "proxy", "guide"]
+"""A purpose of prims in USD."""
+
+PURPOSES: tuple[str, ...] = get_args(Purpose)
+"""All purposes."""
 
 
 class NamedMesh(Protocol):
@@ -53,7 +56,7 @@ class Selection:
     exclude: tuple[str, ...] = ()
     self_collisions: bool = True
     between: tuple[str, str] | None = None
-    purposes: tuple[str, ...] = ("default", "render")
+    purposes: tuple[Purpose, ...] = ("default", "render")
     ignore: tuple[tuple[str, str], ...] = ()
     ignored_names: frozenset[tuple[str, str]] = frozenset()
     ignored_inside: frozenset[tuple[str, str]] = frozenset()
