@@ -24,7 +24,7 @@ from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, 
 import warp_bsc as bsc
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
-from warp_bsc.replay import checking, workers
+from warp_bsc.replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
 FRAMES, SIDE = 24, 5
@@ -254,12 +254,12 @@ class Inline:
 
 def test_a_chunk_that_takes_long_is_cut(troubled, monkeypatch):
     """So that results do not wait long for others, until a kill loses them; what reading reveals is not lost either."""
-    monkeypatch.setattr(workers, "_local", (0, 1))
-    monkeypatch.setattr(workers, "_opened", None)
+    monkeypatch.setattr(worker, "_local", (0, 1))
+    monkeypatch.setattr(worker, "_opened", None)
     checks = checking.Checks(bsc.Selection(), "exact", "cpu", True, None, 0)
     found, calls = [], []
     for seconds in (1000.0, 0.0):
-        monkeypatch.setattr(workers, "_CHUNK_SECONDS", seconds)
+        monkeypatch.setattr(worker, "_CHUNK_SECONDS", seconds)
         scene, inline = bsc.Scene(troubled), Inline()
         results = list(workers.check_in_workers(scene, checks, inline))
         sums = [result.summary for result in results]
@@ -381,7 +381,7 @@ def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
     ],
 )
 def test_each_local_worker_has_a_gpu(name, number, gpus, device):
-    assert workers.device_of_worker(name, number, gpus) == device
+    assert worker.device_of_worker(name, number, gpus) == device
 
 
 def test_no_cluster(capsys, monkeypatch, waves):
