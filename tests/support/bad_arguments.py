@@ -329,11 +329,10 @@ def calls_of_scenes() -> dict[str, Call]:
                 "device": without(DEVICES, "unknown", "empty"),  # of the machine that checks
                 "intersections": FLAGS,
                 "ignore_initial": FLAGS,
-                "min_distance": without(POSITIVE, "None"),
-                "validate_most": without(NOT_COUNT, "None"),
+                "clearance": without(POSITIVE, "None"),
+                "validate": {**NOT_COUNT, "word": "some", "empty": ""},
                 "earlier": {"None": None, "number": 3},
-                "workers": {**NOT_COUNT, "zero": 0},
-                "scheduler": {"number": 3, "list": ["tcp://head"]},
+                "workers": {**NOT_COUNT, "zero": 0, "word": "head", "no host": "tcp://", "list": ["tcp://head"]},
             },
         ),
     }
@@ -543,10 +542,12 @@ def rows() -> list[Row]:
 NUMERIC = ["", "x", "nan", "inf", "-1", "0", "0.5", "1e400", "1e-320", "True", "10" * 20]
 NUMBERS_OF: dict[Any, list[str]] = {positive: NUMERIC, natural: [text for text in NUMERIC if text != "0"]}
 VALUES: dict[str, list[str]] = {
+    "--clearance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--min-distance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--fail-on": ["", "x", "collisions,x"],
     "--frames": ["", "x", "1", "3:1", "1:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
     "--validate": [*NUMERIC, "ALL"],
+    "--workers": [*NUMERIC, "head:8786", "tcp://", "://head:8786"],
     "--modes": ["", "x", "plain,x"],
 }
 
@@ -594,7 +595,6 @@ TEXTS = {
     "--csv",
     "--baseline",
     "--allow-missing",
-    "--scheduler",
     "--device",
 }
 """Options whose text is looked up where it is used: patterns, files, devices and addresses."""

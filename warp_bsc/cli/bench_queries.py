@@ -16,7 +16,6 @@ from .options import (
     add_json,
     add_repeat,
     add_threads,
-    naming_options,
     positive,
 )
 from .tables import Console
@@ -54,8 +53,7 @@ def add_to(commands: Commands) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.count is not None:
-        with naming_options("count"):
-            check_query_count(arguments.count)
+        check_query_count(arguments.count)
     device = find_device(arguments.device)
     options = {"device": device, "repeat": arguments.repeat}
     with limited_threads(arguments.threads):
