@@ -8,7 +8,7 @@ import math
 import reprlib
 from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +36,8 @@ LEAST_DISTANCE = 2.0**-1021
 _LEAST_BITS = int(np.float64(LEAST_DISTANCE).view(np.int64))
 
 _LARGEST_COUNT = 2**31 - 1
+
+_Choice = TypeVar("_Choice", bound=str)
 
 
 def given(value: object) -> str:
@@ -96,7 +98,7 @@ def checked_flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
+def checked_choice(value: Any, name: str, choices: Sequence[_Choice]) -> _Choice:
     """Returns one of some strings.
 
     Raises:
@@ -105,9 +107,10 @@ def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
     """
     if not isinstance(value, str):
         raise TypeError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
-    return value
+    for choice in choices:
+        if value == choice:
+            return choice
+    raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
 
 
 def checked_strings(values: Any, name: str) -> tuple[str, ...]:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.collisions import CapturedCollisions, Collisions, DetectionStats, StageCounts
+from ..detection.collisions import DetectionStats, StageCounts
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..detection.settings import Method
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from .scenes import BenchmarkScene
 from .timing import replay_graph
@@ -78,7 +79,7 @@ class DetectorBenchmark:
 def benchmark_detector(
     scene: BenchmarkScene,
     *,
-    method: str = "conservative",
+    method: Method = "conservative",
     device: wp.DeviceLike = None,
     repeat: int = 5,
     compare: bool = False,
@@ -107,7 +108,6 @@ def benchmark_detector(
     collisions = detector.detect(x0, x1)
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None
 
-    assert isinstance(collisions, Collisions)  # nothing is captured here
     stats = collisions.stats
     detect, read, stages = [], [], []
     for _ in range(repeat):
@@ -116,7 +116,6 @@ def benchmark_detector(
         collisions = detector.detect(x0, x1)
         wp.synchronize_device(device)
         detect.append(1e3 * (time.perf_counter() - start))
-        assert isinstance(collisions, Collisions)
         stats = collisions.stats  # reads everything else with it
         read.append(1e3 * (time.perf_counter() - start))
         stages.append(stats.milliseconds)
@@ -141,8 +140,8 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     """Median time of a replay of the detection as a CUDA graph [ms]."""
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
-        captured = detector.detect(x0, x1)
-    assert capture.graph and isinstance(captured, CapturedCollisions)
+        captured = detector.capture(x0, x1)
+    assert capture.graph is not None
     milliseconds = replay_graph(capture.graph, device, replays=_GRAPH_REPLAYS)
     found = captured.read().stats
     if (found.vertex_face, found.edge_edge) != (stats.vertex_face, stats.edge_edge):

@@ -9,7 +9,7 @@ import numpy as np
 
 from .contact_buffer import ContactRows, HostContacts, empty_contacts
 from .differentiable import CollisionArrays
-from .settings import Counts, DistanceKind, PairCounts
+from .settings import Counts, DistanceKind, Method, PairCounts
 from .stage_timer import StageTimer
 
 __all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts", "add_stats"]
@@ -103,7 +103,7 @@ class Collisions:
     certified: bool
     overflows: tuple[str, ...]
     arrays: CollisionArrays | None
-    _method: str = field(repr=False)
+    _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
     _timer: StageTimer = field(repr=False)

@@ -24,7 +24,7 @@ from .kernels import PairStages
 from .launch import launch, launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings
-from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
+from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind, Method
 from .stage_timer import StageTimer
 
 __all__ = [
@@ -259,7 +259,7 @@ def run_distance_phases(
     radius: wp.array,
     rings: Rings,
     *,
-    method: str,
+    method: Method,
     timed: bool = True,
     tolerance: float = TOLERANCE,
     timer: StageTimer,

@@ -17,7 +17,7 @@ from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
 from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
 from .launch import launch, launch_over, launch_over_queue, most_blocks
-from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
+from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
 __all__ = ["NarrowPhase", "decide_on_host", "run_narrow_phases"]
@@ -104,7 +104,7 @@ class NarrowPhase:
         x1: wp.array,
         elements: wp.array,
         *,
-        method: str,
+        method: Method,
         timed: bool = True,
         tolerance: float = TOLERANCE,
         timer: StageTimer,
@@ -186,7 +186,7 @@ def run_narrow_phases(
     x0: wp.array,
     x1: wp.array,
     *,
-    method: str,
+    method: Method,
     timed: bool = True,
     tolerance: float = TOLERANCE,
     timer: StageTimer,

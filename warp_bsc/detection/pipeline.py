@@ -11,7 +11,17 @@ from .launch import launch, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
 from .rings import Rings, make_rings
-from .settings import METHODS, NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, checked_tolerance
+from .settings import (
+    METHODS,
+    NO_GRADIENTS,
+    TOLERANCE,
+    Counters,
+    Counts,
+    DistanceKind,
+    Method,
+    PairKind,
+    checked_tolerance,
+)
 from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
@@ -97,7 +107,7 @@ class DetectionPipeline:
         self,
         mesh: CollisionMesh,
         *,
-        method: str = "conservative",
+        method: Method = "conservative",
         tolerance: float = TOLERANCE,
         min_distance: float = 0.0,
         rings: int = 1,
@@ -128,7 +138,7 @@ class DetectionPipeline:
         tolerance, rings = checked_tolerance(tolerance), checked_integer(rings, "rings")
         min_distance = checked_distance(min_distance, "min_distance")
         self.mesh = mesh
-        self.method = method
+        self.method: Method = method
         self.tolerance = tolerance
         self.generation = 0
         self._checked_vertices = mesh.device_vertices if only_used_vertices else None

@@ -12,7 +12,7 @@ from .distance_phase import decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
 from .rings import Rings
-from .settings import METHODS, TOLERANCE, Count, DistanceKind, PairCounts, PairKind, checked_tolerance
+from .settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from .stage_timer import StageTimer
 from .start import checked_device
 
@@ -47,7 +47,7 @@ def query_vertex_face(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -79,7 +79,7 @@ def query_edge_edge(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -111,7 +111,7 @@ def query_vertex_edge(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -141,7 +141,7 @@ def query_vertex_vertex(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -171,7 +171,7 @@ def _query(
     kind: DistanceKind,
     points: np.ndarray | wp.array,
     min_distance: float | np.ndarray,
-    method: str,
+    method: Method,
     timed: bool,
     tolerance: float,
     device: wp.DeviceLike,
@@ -216,7 +216,7 @@ def _query(
     radius = radius.ravel()
     device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
-    def solve(method: str) -> tuple[HostContacts, np.ndarray]:
+    def solve(method: Method) -> tuple[HostContacts, np.ndarray]:
         """The contacts by a method, and the query of each."""
         # exactly also the times of certified hits that floating point could not find within the tolerance
         stages = "exact" if method == "conservative" and timed else method

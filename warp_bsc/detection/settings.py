@@ -2,6 +2,7 @@
 
 import enum
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -19,15 +20,19 @@ __all__ = [
     "Counters",
     "Counts",
     "DistanceKind",
+    "Method",
     "PairCounts",
     "PairKind",
     "capacity_for",
     "checked_tolerance",
 ]
 
-METHODS = ("float", "conservative", "exact")
+Method = Literal["float", "conservative", "exact"]
 """What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
 arithmetic decides."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
+"""The methods."""
 
 TOLERANCE = 2.0**-20
 """Default tolerance of the time of impact, as a share of the step."""
