@@ -38,12 +38,13 @@ PACKAGES = {
     "_arguments": set(),
     "_atomic_file": set(),
     "_one_thread": set(),
+    "_private_names": set(),
     "checker": {"_arguments"},
-    "detection": {"kernels", "checker", "_arguments", "_one_thread"},
-    "response": {"detection", "kernels", "_arguments", "_one_thread"},
+    "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
+    "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
     "usd": {"_arguments", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file"},
-    "bench": {"detection", "kernels", "usd", "checker", "response"},
+    "bench": {"detection", "kernels", "usd", "checker", "response", "_private_names"},
     "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file"},
     "__main__": {"cli"},
     "__init__": {"checker", "detection", "replay", "response", "usd"},  # for type checkers alone
@@ -58,7 +59,7 @@ LIBRARIES = {
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
     "trimesh": {"bench", "usd"},
-    "warp": {"kernels", "detection", "response", "bench", "cli"},
+    "warp": {"kernels", "detection", "response", "bench", "cli", "_private_names"},
 }
 """Who may import a library: packages, or single files."""
 

@@ -27,6 +27,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .._private_names import replace_name
+
 __all__ = [
     "CPU_FRAMES",
     "FOLDERS",
@@ -427,9 +429,10 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
             raise _NotApplicable(f"no solver with particles is one of {', '.join(_SOLVERS)}")
         measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
 
-    newton.examples.run = run
+    replace_name(newton.examples, "run", run)
     if not request["download"]:
-        newton.utils.download_asset = newton.examples.download_external_git_folder = _refuse_download
+        replace_name(newton.utils, "download_asset", _refuse_download)
+        replace_name(newton.examples, "download_external_git_folder", _refuse_download)
     if request["mode"] == "stage":
         _stage_solvers(stages)
     options = ["--viewer", "null", "--quiet", "--device", request["device"], *request["options"]]
@@ -483,7 +486,7 @@ def _stage_solvers(stages: list[Any]) -> None:
     for name in _SOLVERS:
         solver = getattr(newton.solvers, name)
         names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages}
-        setattr(newton.solvers, name, _StagedType(name, (solver,), names))
+        replace_name(newton.solvers, name, _StagedType(name, (solver,), names))
 
 
 def _measure_frames(

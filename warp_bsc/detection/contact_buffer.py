@@ -2,7 +2,7 @@
 
 import weakref
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import warp as wp
@@ -110,14 +110,14 @@ def read_contacts(buffer: ContactBuffer, count: int) -> HostContacts:
                 wp.copy(host, array, count=count)
         return host.numpy()
 
-    return HostContacts(**{name: read(getattr(buffer, name)) for name in ContactBuffer.vars})
+    return HostContacts(**{field.name: read(getattr(buffer, field.name)) for field in fields(HostContacts)})
 
 
 def contacts_from_host(contacts: HostContacts, device: wp.Device) -> ContactBuffer:
     """Returns contacts of the host in a buffer on a device."""
     buffer = make_contact_buffer(len(contacts.pairs), device)
-    for name in ContactBuffer.vars:
-        getattr(buffer, name).assign(getattr(contacts, name))
+    for field in fields(HostContacts):
+        getattr(buffer, field.name).assign(getattr(contacts, field.name))
     return buffer
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from .._private_names import cpu_graph
 from .launch import launch
 
 __all__ = ["run_on_host"]
@@ -104,7 +105,7 @@ def run_on_host(function: Callable[[], object], device: wp.Device) -> None:
     if not (device.is_cpu and device.is_capturing):
         function()
         return
-    graph = wp._src.context.runtime._apic_graph  # Warp has no public access to it
+    graph = cpu_graph()
     if graph.apic:
         raise RuntimeError("a graph that is to be saved cannot hold this: it runs Python at each replay")
     if graph not in _failures:

@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
+from .._private_names import may_run_in_threads
+
 __all__ = [
     "GrowingBuffers",
     "cores",
@@ -92,18 +94,6 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
 
 
-def _may_share(kernel: wp.Kernel) -> bool:
-    """Whether several threads may run a kernel at once.
-
-    Warp's kernels on a CPU share a pointer to the stack of the thread that set it last, for their tiles. A kernel
-    without tiles does not follow it, once it is optimized.
-    """
-    options = kernel.module.options
-    mode, level = options["mode"] or wp.config.mode, options["optimization_level"]
-    level = wp.config.optimization_level if level is None else level
-    return mode == "release" and level != 0
-
-
 def most_blocks(device: wp.Device, block_dim: int) -> int:
     """Returns the most blocks of a launch over a queue, so that a capacity costs next to nothing beside what is filled.
 
@@ -158,7 +148,7 @@ def launch_over(
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
     if not count:
         return
-    threads = _threads.get() if _may_share(kernel) else 1
+    threads = _threads.get() if may_run_in_threads(kernel) else 1
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
     # Threads only run what this one has prepared: Warp loads a kernel and packs its arguments for one thread at a time.
     options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
