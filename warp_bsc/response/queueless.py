@@ -4,13 +4,9 @@ import functools
 
 import warp as wp
 
-from ..detection.broad_phase_hierarchy import (
-    BroadPhaseHierarchy,
-    FaceHierarchy,
-    overlapping_edges,
-    overlapping_vertices,
-    traversal_kernel,
-)
+from ..detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from ..detection.element_pairs import overlapping_edges, overlapping_vertices
+from ..detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ..detection.settings import TOLERANCE
 from ..kernels.ccd import impact_at_distance
 from ..kernels.classification import classify
