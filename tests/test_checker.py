@@ -271,7 +271,8 @@ def test_filter_agrees_with_exact_arithmetic(kind, name, monkeypatch):
         monkeypatch.undo()
         filtered = COLLIDES[kind](points)
         monkeypatch.setattr(
-            queries, "triangles_may_touch", lambda points, pairs: np.ones((len(points), len(pairs)), dtype=bool)
+            "warp_bsc.checker.queries.triangles_may_touch",
+            lambda points, pairs: np.ones((len(points), len(pairs)), dtype=bool),
         )
         assert np.array_equal(filtered, COLLIDES[kind](points))
 

@@ -52,7 +52,11 @@ PACKAGES = {
 """Whom a package of ours, or a module beside them, may import; the names that it exports import what they need."""
 
 LIBRARIES = {
-    "newton": {"response", "warp_bsc/bench/newton_examples.py"},  # a benchmark of Newton's examples runs them
+    "newton": {
+        "response",
+        "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
+        "warp_bsc/bench/newton_process.py",  # runs them
+    },
     "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
     "rich": {"cli"},
     "argparse": {"cli"},

@@ -10,7 +10,7 @@ import newton.utils
 import pytest
 import warp as wp
 
-from warp_bsc.bench import newton_examples
+from warp_bsc.bench import newton_examples, newton_process
 from warp_bsc.bench.newton_examples import WARM_UP, NewtonExample, describe_needs, find_examples, measure_example
 
 # A triangle stands above a pinned sheet and moves down by 1 cm a frame, its tip from 5.5 cm: after the sixth frame two
@@ -105,14 +105,14 @@ def in_this_process(monkeypatch, tmp_path):
         (newton.examples, "download_external_git_folder"),
         (newton.utils, "download_asset"),
         (sys, "argv"),
-        *((newton.solvers, name) for name in newton_examples._SOLVERS),
+        *((newton.solvers, name) for name in newton_process.SOLVERS),
     ):
         monkeypatch.setattr(module, name, getattr(module, name))
 
     def replies(request, errors):
         given = []
         with wp.ScopedDevice(request["device"]):
-            newton_examples._serve(request, given.append)
+            newton_process.serve(request, given.append)
         yield from given
 
     monkeypatch.setattr(newton_examples, "_replies", replies)
