@@ -52,7 +52,7 @@ _QUARTIC_ERROR = wp.constant(wp.float64(40.0))
 
 @wp.func
 def norm_bound(x: wp.vec3d) -> wp.float64:
-    """Returns an upper bound of the norm of a vector whose largest component is about 1, or of its size at least."""
+    """Returns an upper bound of the norm of a vector, apart from the underflow of squares."""
     return wp.sqrt(wp.dot(x, x)) * _INFLATED
 
 

@@ -22,7 +22,7 @@ import warp as wp
 
 from .closest import between
 from .distance import nearest_pair
-from .gradients import LEAST_SQUARE_LENGTH, SQUARE_SINE
+from .gradients import MIN_SQUARE_LENGTH, SQUARE_SINE
 from .motion import all_finite, relative_motion
 from .polynomials import VERTEX_FACE, Motion
 from .signs import FREE
@@ -67,7 +67,7 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
         normal = gap / size
         velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
         speed = wp.dot(normal, velocity)
-        slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), LEAST_SQUARE_LENGTH)
+        slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), MIN_SQUARE_LENGTH)
         approach = speed / wp.max(speed * speed, slowest)
         reach.weights = wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
         if motion.kind != VERTEX_FACE:
@@ -99,11 +99,11 @@ def with_distance_gradients(
     c1: wp.vec3d,
     d1: wp.vec3d,
     distance: wp.float64,
-    # what was found
+    # first contact
     found: Impact,
     tolerance: wp.float64,
 ) -> Impact:
-    """Returns the answer to a query with a minimum distance, its time as a differentiable function of the points.
+    """Returns the first contact of a query with a minimum distance, with a time that is differentiable by the points.
 
     Args:
         kind: VERTEX_FACE or EDGE_EDGE; points of a vertex and an edge are p a b a, of two vertices p q q q.
@@ -116,11 +116,11 @@ def with_distance_gradients(
         c1: Third point at the end.
         d1: Fourth point at the end.
         distance: The minimum distance.
-        found: The answer.
+        found: First contact of these points.
         tolerance: Tolerance of its time of impact.
 
     Returns:
-        The answer ``found``, with ``grazing``. Its time has gradients, coordinates and normal have none.
+        The contact ``found``, with ``grazing``; its time has gradients, its coordinates and normal have none.
     """
     result = found
     result.grazing = 0
@@ -147,7 +147,7 @@ def _adjoint_of_with_distance_gradients(
     c1: wp.vec3d,
     d1: wp.vec3d,
     distance: wp.float64,
-    # what was found
+    # first contact
     found: Impact,
     tolerance: wp.float64,
     adj_ret: Impact,

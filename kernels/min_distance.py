@@ -123,7 +123,7 @@ def _is_within(motion: Motion, gap: wp.vec3d, distance: wp.float64) -> bool:
 
 @wp.func
 def _underflow(roundoff: wp.float64) -> wp.float64:
-    """Returns more than a norm loses to the underflow of its squares; 0 for a roundoff of 0."""
+    """Returns an upper bound of the underflow of the squares in a norm; 0 for a roundoff of 0."""
     return wp.where(roundoff > _ZERO, UNDERFLOW, _ZERO)
 
 
@@ -152,14 +152,14 @@ def closest_at(kind: int, motion: Motion, time: wp.float64):
 
 @wp.struct
 class Search:
-    """How far the search through a step is."""
+    """The state of the search through a step."""
 
-    near: wp.float64  # what is at most this far apart is a HIT
-    far: wp.float64  # what is farther apart is free
+    near: wp.float64  # features at most this far apart are a HIT
+    far: wp.float64  # features farther apart are free
     length: wp.float64  # tolerance of the time of impact
-    start: wp.float64  # of the part that is next: what is before is free
+    start: wp.float64  # of the next part; all before it is free
     width: wp.float64  # of that part
-    limit: wp.float64  # end of what is to be searched
+    limit: wp.float64  # end of the times to search
     found: bool  # whether the distance is certainly reached at the limit
     aimed: bool  # whether the part ends within the tolerance before the limit
     time: wp.float64  # that advancement evaluates next; less than the start if it is to be found
@@ -228,7 +228,7 @@ def _lowest_at(
     w: wp.vec2d,
     time: wp.float64,
 ) -> wp.float64:
-    """Returns the least product of a corner of the polygon with a direction at a time."""
+    """Returns the smallest product of a corner of the polygon with a direction at a time."""
     both = wp.vec2d(_ONE - time, time)
     a = wp.dot(u, both)
     b = wp.dot(v, both)
@@ -388,7 +388,7 @@ def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, bef
 
 @wp.func
 def end_search(kind: int, motion: Motion, search: Search) -> Impact:
-    """Returns what a search that has ended has found."""
+    """Returns the first contact that a search has found, once it has ended."""
     result = Impact()
     if search.status == FREE:
         result.status = FREE

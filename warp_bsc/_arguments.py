@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 __all__ = [
-    "LEAST_DISTANCE",
+    "SMALLEST_DISTANCE",
     "as_numpy",
     "check_finite",
     "check_instance",
@@ -30,10 +30,10 @@ __all__ = [
     "given",
 ]
 
-LEAST_DISTANCE = 2.0**-1021
+SMALLEST_DISTANCE = 2.0**-1021
 """Least distance or radius that is not 0: half of it is a normal number, which a processor may not take for 0."""
 
-_LEAST_BITS = int(np.float64(LEAST_DISTANCE).view(np.int64))
+_LEAST_BITS = int(np.float64(SMALLEST_DISTANCE).view(np.int64))
 
 _LARGEST_COUNT = 2**31 - 1
 
@@ -209,7 +209,7 @@ def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
     Raises:
         TypeError: If they are no numbers.
         ValueError: If they have another shape, are masked, negative or not finite, or are less than
-            :data:`LEAST_DISTANCE` and not 0.
+            :data:`SMALLEST_DISTANCE` and not 0.
     """
     what = "one number or an array of numbers"
     values = as_numpy(distances, name, what)

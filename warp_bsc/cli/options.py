@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterator
 
-from .._arguments import LEAST_DISTANCE
+from .._arguments import SMALLEST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
@@ -134,7 +134,7 @@ def distance(text: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not LEAST_DISTANCE <= number < math.inf:
+    if not SMALLEST_DISTANCE <= number < math.inf:
         raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
     return number
 

@@ -5,20 +5,21 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels.pipeline.hierarchy import WIDTH, count_places, lowest_place
+from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
 from .element_pairs import PAIRS_OF_THREAD, pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
-from .launch import launch, most_blocks
+from .launch import launch, max_blocks
 from .mesh import CollisionMesh
 from .settings import capacity_for
 
 __all__ = ["BroadPhaseHierarchy"]
 
 _WARPS_OF_MULTIPROCESSOR = 64
-"""Warps that a multiprocessor of a GPU should have at least in a traversal."""
-_MOST_WARPS_OF_CLUSTER = 8
+"""Number of warps to aim at for a multiprocessor of a GPU in a traversal."""
+_MAX_WARPS_OF_CLUSTER = 8
 _TRAVERSAL_BLOCK = 64
+"""Threads of a block of a traversal."""
 
 
 @wp.struct
@@ -31,9 +32,9 @@ class _FacePairs:
 
 @wp.func
 def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
-    slot = take_slots(queue.count, 0, count_places(found))
+    slot = take_slots(queue.count, 0, count_set_bits(found))
     while found != wp.uint32(0):
-        write(wp.vec2i(place, first + lowest_place(found)), queue.pairs, slot)
+        write(wp.vec2i(place, first + lowest_set_bit(found)), queue.pairs, slot)
         found = found & (found - wp.uint32(1))
         slot += wp.int64(1)
 
@@ -78,8 +79,8 @@ class BroadPhaseHierarchy:
         self._groups = group_count(places)
         self._warps_of_cluster = 1
         if device.is_cuda and self._clusters:
-            wanted = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
-            self._warps_of_cluster = max(1, min(_MOST_WARPS_OF_CLUSTER, wanted))
+            warps = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
+            self._warps_of_cluster = max(1, min(_MAX_WARPS_OF_CLUSTER, warps))
         capacity = 8 * len(mesh.cells) if capacity is None else capacity
         self._face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
 
@@ -151,7 +152,7 @@ class BroadPhaseHierarchy:
         Args:
             x0: Positions at the start, array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all.
+            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all.
         """
         inputs, outputs = [x0, x1, changed, self._checked, self._padding, self.hierarchy], [self._not_finite]
         kernel = box_elements_kernel(x0.dtype, self._padding is not None)
@@ -180,5 +181,5 @@ class BroadPhaseHierarchy:
 
     def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
-        blocks = most_blocks(self._device, 256)
+        blocks = max_blocks(self._device, 256)
         launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)

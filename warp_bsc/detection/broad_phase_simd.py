@@ -14,11 +14,11 @@ __all__ = ["BroadPhaseSimd"]
 
 
 class BroadPhaseSimd:
-    """The broad phase by wide BVHs, one a kind of element; a :class:`warp_bsc.detection.broad_phase.BroadPhase`.
+    """The broad phase by wide BVHs, one for each kind of element, see :class:`.broad_phase.BroadPhase`.
 
     It pairs elements directly, and has no queue for pairs of faces. Points and the edges that no face has, whose pairs
-    count with a minimum distance only, have trees of their own. Where only pairs with these edges and with vertices
-    that no face has are wanted, only their trees are paired with the others.
+    count with a minimum distance only, have trees of their own. For a mesh with ``only_free``, only the trees of these
+    edges and of vertices that no face has are paired with the others.
     """
 
     buffers: tuple[wp.array, ...] = ()

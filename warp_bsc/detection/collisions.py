@@ -22,7 +22,7 @@ class StageCounts:
     Attributes:
         candidates: Pairs that share no vertex and whose swept boxes overlap.
         survivors: Candidates that no cull decides.
-        free: Candidates certified free, by the culls or later.
+        free: Candidates that are certified free, by the culls or later.
         hits: Candidates certified to collide.
         unsure: Candidates that floating point could not certify either way.
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
@@ -87,8 +87,8 @@ def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
 class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
-    They are in arrays of their own, on the device until they are first read, and stay as they are whatever is detected
-    later. A detector uses these arrays again once no reference to the result is left.
+    They are in arrays of their own, on the device until they are first read, which later detections do not change. A
+    detector reuses these arrays once no reference to the result is left.
 
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides

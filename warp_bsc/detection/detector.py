@@ -34,14 +34,14 @@ class CollisionDetector:
     Run one detection first to size the buffers. After that :meth:`capture` adds a detection to a CUDA graph, where it
     allocates nothing and does not synchronize, and which is replayed on new positions in the same arrays.
 
-    Threads may share a detector: each detection waits for the one before, and its results stay as they are. To detect
-    at the same time, make a detector for each thread; they may share the mesh.
+    Threads may share a detector: each detection waits for the one before, and its results do not change. To detect at
+    the same time, make a detector for each thread; they may share the mesh.
 
     Attributes:
         mesh: The mesh.
         method: The method.
-        tolerance: Of the times of impact, as a share of the step.
-        min_distance: The minimum distance.
+        tolerance: Tolerance of the times of impact, as a share of the step.
+        min_distance: The minimum distance, in the unit of the positions.
     """
 
     def __init__(
@@ -57,19 +57,19 @@ class CollisionDetector:
 
         Args:
             mesh: The mesh.
-            method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it
-                computes, "conservative" counts them as hits, "exact" decides them exactly.
+            method: How to decide pairs that floating point cannot certify: "float" by the signs that it computes,
+                "conservative" as hits, "exact" by exact arithmetic.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, beside the radii of the mesh, in the unit of the
                 positions: 0, or from 2^-1021 to 2^1000. With 0 and without radii pairs collide that touch.
-            rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
-                a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
-                rest has no collisions at a distance below half of its shortest edge; triangles much thinner than their
-                edges are long need more. At most so many that vertices have 256 others within these on average.
+            rings: With a minimum distance, pairs are excluded if a vertex of one is within this number of edges of the
+                mesh of a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat
+                grid at rest has no collisions at a distance below half of its shortest edge; triangles much thinner
+                than their edges are long need more. Vertices must not have more than 256 others within it on average.
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
+            ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
         """
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self.mesh = mesh
@@ -123,7 +123,7 @@ class CollisionDetector:
         with timer.stage("sort"):
             contacts = self._ordered_contacts(counts, recycle=not differentiable)
         if self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
-            with timer.stage("exact"):  # now, while the positions are what they were
+            with timer.stage("exact"):  # now, while the arrays hold these positions
                 for narrow_phase in self._pipeline.narrow_phases:
                     kind = DistanceKind(narrow_phase.kind)
                     contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
@@ -186,9 +186,9 @@ class CollisionDetector:
 
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
-                vertices that take no part may be anything.
+                vertices that no element uses may be anything.
             distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
-            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
+            rings: Pairs are excluded if a vertex of one is within this number of edges of a vertex of the other.
 
         Raises:
             TypeError: If an argument has another type.
@@ -210,19 +210,19 @@ class CollisionDetector:
         return x0, x1
 
     def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
-        """Returns the sorted contacts of each kind of pair, as far as the buffers held them.
+        """Returns the sorted contacts of each kind of pair, without those that overflowed.
 
         Args:
             counts: The counts of the detection.
-            recycle: Whether to take buffers of earlier results that are garbage, and to let later results take these;
-                not where others refer to the arrays. Otherwise the buffers are new, with no row to spare.
+            recycle: Whether to use buffers of earlier results that are garbage, and to let later results use these;
+                not where others refer to the arrays. Otherwise the buffers are new, without spare rows.
         """
         contacts = {}
         for narrow_phase in self._pipeline.narrow_phases:
             kind = DistanceKind(narrow_phase.kind)
             count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
             if recycle:
-                rows = self._result_buffers.take(count)
+                rows = self._result_buffers.acquire(count)
             else:
                 rows = ContactRows(make_contact_buffer(count, self.mesh.device), count)
             narrow_phase.ordered_contacts(count, rows.buffer)
@@ -230,7 +230,7 @@ class CollisionDetector:
         return contacts
 
     def _decide_on_host(self, kind: DistanceKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
-        """Returns the contacts without those that the host refutes, and with what it finds of the others."""
+        """Returns the contacts without those that the host refutes; the others get its times and points."""
         contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
         elements, radius = self.mesh.device_elements(kind), self._pipeline.radius

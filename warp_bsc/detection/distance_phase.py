@@ -36,8 +36,8 @@ __all__ = [
 _BLOCK = 64
 """Threads of a block that searches."""
 _ADVANCING, _SUBDIVIDING = 384, 256
-"""Threads of a multiprocessor that search, as many as their registers allow, each one pair after another. On a CPU a
-thread has one."""
+"""Threads of a multiprocessor that search, limited by their registers, each for one pair after another. On a CPU, each
+thread searches for one pair."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -272,9 +272,10 @@ def run_distance_phases(
         x1: Positions at its end, of the same type.
         radius: Radius of each vertex, array of float64.
         rings: Vertices whose elements are excluded.
-        method: One of :data:`METHODS`; with "exact" pairs left undecided go to :func:`decide_distances_on_host`.
+        method: One of :data:`METHODS`; with "exact", pairs that stay UNSURE are left to
+            :func:`decide_distances_on_host`.
         timed: Whether to find times of impact within the tolerance.
-        tolerance: Of the times of impact, as a share of the step.
+        tolerance: Tolerance of the times of impact, as a share of the step.
         timer: Measures the stages.
     """
     kernels = _kernels(x0.dtype)

@@ -4,7 +4,7 @@ import warp as wp
 
 from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box
-from ..kernels.pipeline.hierarchy import WIDTH, count_places
+from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits
 from ..kernels.pipeline.pairs import owns_edge, owns_vertex
 from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
 from .face_hierarchy import FaceHierarchy
@@ -151,13 +151,13 @@ def pair_elements(
             vertices = overlapping_vertices(mesh, face, other, keep_separated)
             vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
             edges = overlapping_edges(mesh, face, other, keep_separated)
-            candidates[0] += count_places(wp.uint32(vertices & 455))
-            candidates[1] += count_places(wp.uint32(edges & 511))
+            candidates[0] += count_set_bits(wp.uint32(vertices & 455))
+            candidates[1] += count_set_bits(wp.uint32(edges & 511))
             # of the rest only what no axis separates
             vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
             edges = edges >> 9
-            queued[0] += count_places(wp.uint32(vertices))
-            queued[1] += count_places(wp.uint32(edges))
+            queued[0] += count_set_bits(wp.uint32(vertices))
+            queued[1] += count_set_bits(wp.uint32(edges))
             found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
     raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
     raise_count(edge_edge_counts, _CANDIDATES, candidates[1])

@@ -16,10 +16,10 @@ from ..kernels.pipeline.boxes import BoxRows, lowered, raised, rounded, write_bo
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
+    bits_from,
     changed_children,
     fit_parent,
-    from_place,
-    lowest_place,
+    lowest_set_bit,
     overlapping_children,
     overlapping_faces,
 )
@@ -266,15 +266,15 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
             if mesh.groups.lowers:
                 groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
             else:
-                groups = ~from_place(count - first_group)
+                groups = ~bits_from(count - first_group)
             while groups != wp.uint32(0):
-                group = first_group + lowest_place(groups)
+                group = first_group + lowest_set_bit(groups)
                 groups = groups & (groups - wp.uint32(1))
                 clusters = overlapping_children(mesh.clusters, cluster, low, high, mesh.clusters, group * _WIDTH)
                 if group == own_group:
-                    clusters = clusters & from_place(cluster % _WIDTH)
+                    clusters = clusters & bits_from(cluster % _WIDTH)
                 while clusters != wp.uint32(0):
-                    first = (group * _WIDTH + lowest_place(clusters)) * _WIDTH
+                    first = (group * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
                     clusters = clusters & (clusters - wp.uint32(1))
                     if turn % warps_of_cluster == part:
                         faces = overlapping_children(mesh.clusters, cluster, low, high, mesh.places, first)

@@ -2,8 +2,8 @@
 
 Warp captures a graph on the CPU as a list of kernel launches with their dimensions, and runs no kernel while it
 captures. A function that reads numbers between launches (the length of a queue, whether to go on) cannot be captured as
-such a list: its branches and dimensions would stay those of the capture. Here the list holds one kernel, which calls
-the function.
+this list: its branches and dimensions would stay those of the capture. Here the list holds one kernel, which calls the
+function.
 """
 
 import ctypes

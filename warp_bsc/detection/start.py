@@ -29,7 +29,7 @@ def checked_device(device: wp.DeviceLike) -> wp.Device:
 
     Raises:
         TypeError: If it is neither a device nor the name of one.
-        ValueError: If there is no such device.
+        ValueError: If the device does not exist.
     """
     if device is not None:
         check_instance(device, "device", (str, wp.Device), "a Warp device or its name")
@@ -43,14 +43,14 @@ def find_device(name: str | None) -> wp.Device:
     """Returns the Warp device of a name, Warp's preferred one for None.
 
     Raises:
-        ValueError: If there is no such device.
+        ValueError: If the device does not exist.
     """
     start_warp()
     if name is None:
         return wp.get_preferred_device()
     known = [device.alias for device in wp.get_devices()] + ["cuda"] * wp.is_cuda_available()
     if name not in known:
-        raise ValueError(f"{name}: there is no such device here, only {', '.join(known)}")
+        raise ValueError(f"{name}: this machine has no such device, only {', '.join(known)}")
     return wp.get_device(name)
 
 

@@ -21,15 +21,16 @@ _CODE_BITS = 10
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LOOSE = 1.5
-"""Trees are sorted anew where their packets are so many times larger, in sum, than when they were sorted."""
+"""Trees are sorted again if the sum of the sizes of their packets has grown by this factor since they were sorted."""
 _LARGEST_CELL = wp.constant(wp.float64((1 << _CODE_BITS) - 1))
 
 
 @wp.func
 def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
-    """Returns the place of a cell along a Hilbert curve: its bits are those of the three numbers, taken in turns.
+    """Returns the position of a cell along a Hilbert curve: its bits alternate between those of the three numbers.
 
-    J. Skilling, Programming the Hilbert Curve, AIP Conference Proceedings 707, 2004, doi:10.1063/1.1751381.
+    John Skilling. "Programming the Hilbert Curve." AIP Conference Proceedings 707 (2004).
+    https://doi.org/10.1063/1.1751381.
     """
     for level in range(_CODE_BITS - 1):
         bit = _CODE_BITS - 1 - level
@@ -252,7 +253,7 @@ class WideTree:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the boxes fitted last are so much larger than those after sorting that sorting is worth its time."""
+        """Whether the boxes fitted last are larger than those after sorting by more than a factor of :data:`_LOOSE`."""
         return self._size > _LOOSE * self._sorted_size
 
     def sort(self, x0: wp.array, x1: wp.array, low: np.ndarray, scale: np.ndarray) -> None:

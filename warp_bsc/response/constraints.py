@@ -4,7 +4,7 @@ import warp as wp
 
 from ..detection.approach_phase import distances_of_pair
 from ..kernels.pipeline.pairs import points_of_pair
-from ..kernels.pipeline.queues import take_place
+from ..kernels.pipeline.queues import take_slot_int
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from .buffers import Constraints, Motion, Progress, Vertices
 from .exclusion import Connectivity, is_movable, met_at_start
@@ -12,7 +12,6 @@ from .exclusion import Connectivity, is_movable, met_at_start
 __all__ = [
     "EDGE_EDGE_CONTACT",
     "EDGE_EDGE_PROXIMITY",
-    "LEAST_DISTANCE",
     "MAX_DIVISIONS",
     "MAX_ITERATIONS",
     "MAX_SLOW_ITERATIONS",
@@ -22,6 +21,7 @@ __all__ = [
     "NO_CONSTRAINT",
     "PLANE_CONTACT",
     "RESTING",
+    "SMALLEST_DISTANCE",
     "TIME_UNITS",
     "TOUCH",
     "VERTEX_FACE_CONTACT",
@@ -102,7 +102,7 @@ _REST = wp.constant(wp.float64(0.25))
 further apart than it comes in a step does not collide in the next, and falls freely every few steps."""
 _ROUNDING = wp.constant(wp.float64(2.0**-20))
 """Least distance of what rests, as a share of its coordinates: 16 times their rounding, which closes smaller ones."""
-LEAST_DISTANCE = wp.constant(wp.float64(0.1))
+SMALLEST_DISTANCE = wp.constant(wp.float64(0.1))
 """Least distance of other slow elements as a share of the separation, however short their paths are: a distance that is
 nearly 0 is closed again by the rounding of positions."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -347,7 +347,7 @@ def feasible(
     """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
     path = longest_path(motion, corners)
     before = start
-    least = LEAST_DISTANCE * separation
+    least = SMALLEST_DISTANCE * separation
     if _may_rest(motion, corners):
         before = wp.min(start, _REST * path)
         x = to_double(motion.x1[corners[0]])
@@ -438,7 +438,7 @@ def add_constraint(
     least: wp.float64,
 ) -> int:
     """Adds a constraint with a position multiplier if it fits; counts it in any case, and returns its place."""
-    i = take_place(constraints.count)
+    i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = corners
         constraints.weights[i] = weights

@@ -461,7 +461,7 @@ class ContactLayer:
         self._layer = layer = _Layer()
         layer.thickness, layer.distances, layer.restitution = thickness, distances, restitution
         pairs_per_face = None if mesh.device.is_cpu else _PAIRS_PER_FACE
-        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=distances)
+        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=distances)
         n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=self._device)
         self._share_sums = wp.zeros(n, dtype=wp.int64, device=self._device)

@@ -14,9 +14,9 @@ References:
 
 import warp as wp
 
-from ..kernels.pipeline.queues import take_place
+from ..kernels.pipeline.queues import take_slot_int
 from .buffers import Motion, Vertices
-from .constraints import LEAST_DISTANCE, inverse_mass_of, relative, to_double, to_single
+from .constraints import SMALLEST_DISTANCE, inverse_mass_of, relative, to_double, to_single
 from .proximities import closest_direction, closest_vector
 
 __all__ = [
@@ -115,7 +115,7 @@ def add_plane(
         margin: Least distance from it after projection, beside ``half`` [m].
         half: Half of the distance that both sides keep from each other [m].
     """
-    plane = take_place(planes.count)
+    plane = take_slot_int(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal
@@ -246,7 +246,7 @@ def add_dividing_plane(
             if movable[j] >= 0:
                 _add_node(planes, movable[j], _INCOMPLETE)
         return False
-    margin = wp.where(distance < LEAST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
+    margin = wp.where(distance < SMALLEST_DISTANCE * separation, _NEAR_MARGIN, _MARGIN) * distance
     least = margin + _ROOM * distance
     share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
     offset = above.end + share * (-below.end - above.end)

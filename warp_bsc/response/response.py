@@ -158,7 +158,7 @@ class Response:
         self.device = device = mesh.device
         self._keeps_distances = mesh.distances is not None
         pairs_per_face = None if device.is_cpu else _PAIRS_PER_FACE
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=mesh.distances)
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.separation, self.restitution = separation, restitution
         self._tolerance = 0.0 if differentiable else _TOLERANCE * separation
         self._differentiable = differentiable
