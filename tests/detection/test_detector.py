@@ -206,7 +206,7 @@ def test_bad_meshes_are_refused():
         ([[0, 1, 2**32]], r"faces\[0\]"),
         (np.zeros((0, 4), int), r"shape \(n, 3\)"),
         (np.zeros((3, 0), int), r"shape \(n, 3\)"),
-        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 faces"),
+        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 rows"),
     ]:
         with pytest.raises(ValueError, match=message):
             bsc.CollisionMesh(faces, 4)

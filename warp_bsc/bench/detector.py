@@ -137,7 +137,7 @@ def benchmark_detector(
 
 
 def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, stats: DetectionStats) -> float:
-    """Median time of a replay of the detection as a CUDA graph [ms]."""
+    """Returns the median time of a replay of the detection as a CUDA graph [ms]."""
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
         captured = detector.capture(x0, x1)

@@ -115,8 +115,8 @@ class StageTotals:
 class ExampleMeasurement:
     """Times of an example's frames, and its crossings.
 
-    A crossing is an edge that meets a face of which it shares no vertex, found in exact arithmetic; at least one of the
-    two belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not seen.
+    A crossing is an edge that meets a face without a common vertex, found in exact arithmetic; at least one of the two
+    belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not counted.
 
     Attributes:
         device: The Warp device.
@@ -263,12 +263,12 @@ def measure_example(
         device: Name of the Warp device.
         frames: Number of frames, more than :data:`WARM_UP`; default: the number that the example sets, otherwise
             :data:`FRAMES`; on the CPU at most :data:`CPU_FRAMES`.
-        check_every: Crossings are counted at the end of every so many frames, and of the last.
+        check_every: Number of frames after which crossings are counted again; those of the last frame are as well.
         download: Whether the example may download assets.
         progress: Called with the number of frames done and the number of all.
 
     Returns:
-        The measurement, or the reason why there is none; an error of the example, or a crash, is such a reason.
+        The measurement, or the reason why there is none, such as an error of the example or a crash.
 
     Raises:
         ValueError: If the mode or a number is out of range.
@@ -276,9 +276,9 @@ def measure_example(
     if mode not in MODES:
         raise ValueError(f"mode must be one of {', '.join(MODES)}, not {mode!r}")
     if frames is not None and frames <= WARM_UP:
-        raise ValueError(f"the number of frames must be more than {WARM_UP}, whose times are left out, not {frames}")
+        raise ValueError(f"frames must be more than {WARM_UP}, as the times of these are left out, not {frames}")
     if check_every < 1:
-        raise ValueError(f"crossings must be counted every frame or every few frames, not every {check_every}")
+        raise ValueError(f"check_every must be at least 1, not {check_every}")
     needs = describe_needs(example, download=download)
     if needs:
         return ExampleRun(example.title, mode, problem=needs[0])
@@ -309,7 +309,7 @@ def measure_example(
 
 
 def describe_needs(example: NewtonExample, *, download: bool = False) -> list[str]:
-    """Returns what an example needs and has not, a line each, as far as its source says.
+    """Returns the packages and downloads that an example lacks by its source, a line each.
 
     Args:
         example: The example.
@@ -351,14 +351,14 @@ def _replies(request: dict[str, Any], errors) -> Iterator[dict[str, Any]]:
 
 
 def _last_line(errors) -> str:
-    """The last line of a file that is not blank, "" if there is none."""
+    """Returns the last line of a file that is not blank, "" if there is none."""
     errors.seek(0)
     lines = errors.read().decode(errors="replace").split("\n")
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 def _describe_end(status: int, line: str) -> str:
-    """How a process ended that gave no result."""
+    """Returns how a process ended that gave no result."""
     if status < 0:
         with contextlib.suppress(ValueError):  # a signal without a name
             return f"failed: the process was ended by {signal.Signals(-status).name}"

@@ -34,18 +34,18 @@ class _NeedsDownload(Exception):
 
 
 def _describe_error(error: BaseException) -> str:
-    """The type of an error and the first line of its message."""
+    """Returns the type of an error and the first line of its message."""
     line = _first_line(error)
     return line if line == type(error).__name__ else f"{type(error).__name__}: {line}"
 
 
 def _first_line(error: BaseException) -> str:
-    """The first line of an error's message, its type if there is none."""
+    """Returns the first line of an error's message, its type if there is none."""
     return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> None:
-    """Serves a request of :func:`measure_example` in this process, which is good for no other one afterwards."""
+    """Serves a request of :func:`measure_example` in this process, which must not serve another one."""
     try:
         measured = _measure_here(request, lambda frame, frames: reply({"frame": frame, "frames": frames}))
     except _NotApplicable as reason:
@@ -121,7 +121,7 @@ class _StagedType(type):
         return stage
 
     def __instancecheck__(cls, instance):
-        """Whether an instance, or the solver before a stage, is of the class."""
+        """Returns whether an instance, or the solver before a stage, is of the class."""
         from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
         return super().__instancecheck__(instance.solver if isinstance(instance, SolverCCD) else instance)
@@ -148,7 +148,7 @@ def _measure_frames(
     Args:
         example: The example, constructed.
         frames: Number of frames.
-        check_every: Crossings are counted at the end of every so many frames, and of the last.
+        check_every: Number of frames after which crossings are counted again; those of the last frame are as well.
         stages: The stages behind its solvers.
         progress: Called with the number of frames done and the number of all.
     """
@@ -204,8 +204,8 @@ class _Test:
     """A test of an example, by name.
 
     Attributes:
-        result: "ok", the first line of the message if it failed, None if the example has no such test or it did not
-            run.
+        result: "ok", the first line of the message if it failed, None if the example has no test of this name, or
+            it did not run.
     """
 
     def __init__(self, example: Any, name: str):
@@ -253,13 +253,13 @@ class _Crossings:
         )
 
     def count(self) -> int:
-        """Number of crossings that an edge or a face of cloth or of a soft body takes part in."""
+        """Returns the number of crossings that an edge or a face of cloth or of a soft body takes part in."""
         self._read_positions()
         edges, faces = self._detector.find_intersections(self._x).T
         return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())
 
     def are_finite(self) -> bool:
-        """Whether the positions of all vertices of faces are finite."""
+        """Returns whether the positions of all vertices of faces are finite."""
         self._read_positions()
         return bool(np.isfinite(self._x.numpy()[self._mesh.vertices]).all())
 

@@ -1,4 +1,4 @@
-"""Measures how many elementary queries a second are answered; queries and answers stay on the device."""
+"""Measures how many elementary queries a second are decided; queries and results stay on the device."""
 
 import functools
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
-"""The modes that are measured, with the bytes of a query and its answer.
+"""The modes that are measured, with the bytes of a query and its result.
 
 - ``status``: finds the status, one thread a query.
 - ``impact``: finds the time of impact, coordinates and normal as well.
@@ -55,13 +55,13 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 
 @dataclass(frozen=True)
 class QueryBenchmark:
-    """Answers to the queries of one kind, and the times to find them.
+    """Results of the queries of one kind, and the times to find them.
 
     Attributes:
         kind: Kind of pair.
-        status: The answers, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
+        status: Status of each query, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
         survivors: Number of queries that no cull decides.
-        milliseconds: Median time to answer all queries, by mode [ms].
+        milliseconds: Median time to decide all queries, by mode [ms].
     """
 
     kind: PairKind
@@ -96,13 +96,13 @@ class QueryBenchmark:
 
     @property
     def bytes_per_second(self) -> dict[str, float]:
-        """Bytes of queries read and of answers written, by mode [1/s]."""
+        """Bytes of queries read and of results written, by mode [1/s]."""
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
 
 @wp.kernel(**_KERNEL)
 def _generate_queries(first: int, seed: int, miss: float, first_points: int, points: wp.array2d[wp.vec3]):
-    """Two features of unit size that fly at each other from a random distance, and deform a little on the way."""
+    """Writes two features of unit size that fly at each other from a random distance and deform a little."""
     i = first + wp.tid()
     random = wp.rand_init(seed, i)
     apart = 2.0 * wp.sample_unit_cube(random)
@@ -119,7 +119,7 @@ def _generate_queries(first: int, seed: int, miss: float, first_points: int, poi
 
 @wp.func
 def _rounded(x: wp.vec3) -> wp.vec3:
-    """The nearest multiples of 2^-8."""
+    """Returns the nearest multiples of 2^-8."""
     return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
 
 
@@ -141,7 +141,7 @@ def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
 
 @functools.cache
 def _kernels(kind: PairKind):
-    """The kernels for one kind of query, each in a module of its own."""
+    """Returns the kernels for one kind of query, each in a module of its own."""
     vertex_face = kind == PairKind.VERTEX_FACE
     number = int(kind)
     ccd = ccd_vertex_face if vertex_face else ccd_edge_edge
@@ -215,11 +215,11 @@ def _kernels(kind: PairKind):
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
         y = coplanarity(motion)
-        answer = classify(motion, y)
-        if answer == UNSURE:
-            result = impact(motion, y, answer, tolerance)
-            answer = result.status
-        status[i] = wp.int8(answer)
+        certified = classify(motion, y)
+        if certified == UNSURE:
+            result = impact(motion, y, certified, tolerance)
+            certified = result.status
+        status[i] = wp.int8(certified)
 
     decide = decide_in(1)
 
@@ -256,7 +256,7 @@ def check_query_count(count: int) -> None:
 
 
 def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Random queries, the same on every device; a larger number begins with the queries of a smaller one.
+    """Returns random queries, the same on every device; a larger number begins with the queries of a smaller one.
 
     Args:
         kind: Kind of pair.
@@ -275,7 +275,7 @@ def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None
 
 
 def generate_touching_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Random queries whose first point touches an edge at half time: floating point can certify almost none.
+    """Returns random queries whose first point touches an edge at half time: floating point can certify almost none.
 
     Arguments and result: as of :func:`generate_queries`, whose queries they are made from.
     """
@@ -300,7 +300,7 @@ def benchmark_queries(
 
     Raises:
         ValueError: If there are too few or too many queries.
-        RuntimeError: If two modes find different answers, or exact arithmetic misses features that touch.
+        RuntimeError: If two modes find different results, or exact arithmetic misses features that touch.
     """
     device = wp.get_device(device)
     if count is None:
@@ -309,7 +309,7 @@ def benchmark_queries(
     find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
     touching = generate_touching_queries(kind, count, device=device)
-    # no answer is -1
+    # no status is -1
     status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
     toi = wp.empty(count, dtype=wp.float64, device=device)
     coordinates, normal = (wp.empty(count, dtype=wp.vec3d, device=device) for _ in range(2))
@@ -336,17 +336,17 @@ def benchmark_queries(
 
     runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
     milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
-    answers = {mode: array.numpy() for mode, array in status.items()}
-    missed = int((answers["exact"] != HIT).sum())
+    results = {mode: array.numpy() for mode, array in status.items()}
+    missed = int((results["exact"] != HIT).sum())
     if missed:
         raise RuntimeError(f"{missed} of {count} touching {kind.display_name} queries were found to be free")
     for mode in runs.keys() - {"exact"}:
-        different = int((answers[mode] != answers["status"]).sum())
+        different = int((results[mode] != results["status"]).sum())
         if different:
             raise RuntimeError(
                 f"{different} of {count} {kind.display_name} queries were answered differently by mode {mode}"
             )
-    return QueryBenchmark(kind, answers["status"].copy(), int(counts.numpy()[0]), milliseconds)
+    return QueryBenchmark(kind, results["status"].copy(), int(counts.numpy()[0]), milliseconds)
 
 
 def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:

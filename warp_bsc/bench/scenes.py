@@ -45,7 +45,7 @@ class BenchmarkScene:
 
 
 def default_scenes() -> list[str]:
-    """The scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
+    """Returns the scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
     scene = Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
     return [*([str(scene)] if scene.exists() else []), "cloth:5000", "cloth:50000"]
 
@@ -59,8 +59,9 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
         interval: Number of the interval between time samples of a USD file, from 0.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If a file is broken, the two meshes do not fit together, or there is no such generator or interval.
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is broken, the two meshes do not fit together, or a generator or an interval does not
+            exist.
     """
     generated = re.fullmatch(r"(\w+):([^/\\]*)", name)
     if generated:
@@ -114,7 +115,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
 
 
 def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mesh and the motion of a generated scene."""
+    """Returns the mesh and the motion of a generated scene."""
     if generator not in GENERATORS:
         raise ValueError(f"{name}: there is no generator {generator}, only {', '.join(GENERATORS)}")
     if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _FEWEST_TRIANGLES <= int(triangles) <= _MOST_TRIANGLES:
@@ -125,7 +126,7 @@ def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarr
 
 
 def _load_pair(name: str) -> BenchmarkScene:
-    """A step from the vertices of one mesh file to those of another."""
+    """Returns a step from the vertices of one mesh file to those of another."""
     paths = name.split(",")
     if len(paths) != 2:
         raise ValueError(f"{name}: expected two files joined by a comma, got {len(paths)}")
@@ -158,7 +159,7 @@ def _read_mesh(path):
 
 
 def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A wrinkled sheet, folded in half, that closes until the wrinkles of its two layers meet.
+    """Returns a wrinkled sheet, folded in half, that closes until the wrinkles of its two layers meet.
 
     Args:
         triangles: Approximate number of triangles.
@@ -178,7 +179,7 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     wrinkles = 0.01 * wrinkles + 0.1 / rows * noise[2]
 
     def fold(radius):
-        """Two straight layers, joined by half a circle."""
+        """Returns two straight layers, joined by half a circle."""
         straight = 0.5 * (1.0 - np.pi * radius)
         turn = np.clip((along - straight) / radius, 0.0, np.pi)
         layer = np.where(turn < 0.5 * np.pi, along - straight, 1.0 - straight - along)
@@ -190,7 +191,7 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def generate_crash(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A square tube of thin sheet, crushed along its axis and pushed aside; every second fold just closes.
+    """Returns a square tube of thin sheet, crushed along its axis and pushed aside; every second fold just closes.
 
     A fold has 16 triangles, and no vertex moves further than a few of them, so that candidates and hits grow in
     proportion to the number of triangles.
@@ -240,7 +241,7 @@ def _grid_shape(quads: int) -> tuple[int, int]:
 
 
 def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
-    """Two triangles for each four vertices of a grid; in a closed grid the first column is next to the last."""
+    """Returns two triangles for each four vertices of a grid; in a closed grid the first column is next to the last."""
     vertex = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     if closed:
         vertex = np.column_stack([vertex, vertex[:, 0]])
@@ -249,7 +250,7 @@ def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
 
 
 def _noise(*shape: int) -> np.ndarray:
-    """Random numbers in [-1, 1), the same each time, so that no two features are aligned exactly."""
+    """Returns random numbers in [-1, 1), the same each time, so that no two features are aligned exactly."""
     return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
 

@@ -20,7 +20,7 @@ _LOOKS = 3
 _SUSPECTS = 24
 _FEWEST_COPIES, _MOST_COPIES = 256, 2**16
 _GPU_COPIES = 2**18
-_CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would take too many copies
+_CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would need too many copies
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str,
 
 
 def adversarial_queries(kind: PairKind, count: int, *, seed: int = 0) -> Queries:
-    """Random degenerate queries, whose coordinates are small integers, so that many polynomials are exactly zero.
+    """Returns random degenerate queries: coordinates are small integers, so that many polynomials are exactly zero.
 
     A third of them move in one plane, a third start in one plane and leave it, and a third have points anywhere: these
     touch at corners and edges, rest, or turn back from zero.
@@ -94,7 +94,7 @@ def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
 
 
 def _time_alone(method: str, kind: PairKind, points: np.ndarray, device: wp.Device, repeat: int) -> float:
-    """Time of a query [ns] among copies of itself."""
+    """Returns the time of a query [ns] among copies of itself."""
     if device.is_cuda:
         copies = _GPU_COPIES
     else:

@@ -10,15 +10,15 @@ distance d of each other.
 
 One question
 ------------
-Every query asks whether a moving triangle with corners x(t), y(t), z(t) contains the origin:
+Every query is whether a moving triangle with corners x(t), y(t), z(t) contains the origin:
 
 - vertex-face: p is in the triangle a b c when the origin is in the triangle a-p, b-p, c-p;
 - edge-edge: the differences of points of ab and of cd fill the parallelogram a-c, b-c, b-d, a-d. Its diagonal cuts it
   into two triangles, and the segments meet when one of these contains the origin;
 - an edge meets a face when a vertex that runs along the edge meets the face at rest.
 
-The answer at one time
-----------------------
+The test at one time
+--------------------
 Let X = y x z, Y = z x x, Z = x x y (cross products), n = X + Y + Z (the normal) and volume = x.X.
 
 - When the triangle contains the origin, volume = 0. Let it be so.
@@ -45,7 +45,7 @@ changes of sign as f has distinct roots between them with q > 0, less those with
 A minimum distance
 ------------------
 The differences of the points of two features fill a moving polygon: one point for two vertices, a segment for a vertex
-and an edge, a triangle for a vertex and a face, a parallelogram for two edges. The query asks whether its distance from
+and an edge, a triangle for a vertex and a face, a parallelogram for two edges. The query is whether its distance from
 the origin is at most d at some time. With corners q and r of a side, e = r - q and the polygon's normal n, the polygon
 is within d at one time exactly when
 
@@ -54,7 +54,7 @@ is within d at one time exactly when
   |q x r|^2 <= d^2 e.e;
 - or the plane is, with the foot inside: n != 0, n.(q x r) >= 0 for all sides, and (q.n)^2 <= d^2 n.n.
 
-Each is a polynomial of degree at most 6. At the first time t* > 0 of the closed set of such times the distance is d,
+Each is a polynomial of degree at most 6. At the first time t* > 0 of the closed set of these times the distance is d,
 and the closest point is a corner, or inside a side with e != 0, or inside the polygon with n != 0, because a polygon
 without a normal is the union of its sides, and a side without length is a corner. In each case the line's last
 condition is an equation at t*. Its polynomial is not identically zero: the foot moves continuously, so that it would be

@@ -35,7 +35,7 @@ def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:
 def edges_pass_faces(edges: ArrayLike, faces: ArrayLike, across: ArrayLike) -> np.ndarray:
     """Returns which edges pass through which faces, pair by pair, at one moment.
 
-    The ends of such an edge are strictly on different sides of the face's plane, and it meets the inside of the face.
+    The ends of the edge are strictly on different sides of the face's plane, and it meets the inside of the face.
     Or it meets the inside of a side that the face shares with a neighbour, and its ends are strictly on different sides
     of the surface that both are. All other edges only touch their face: they end in it, or pass its border.
 
@@ -75,7 +75,7 @@ def rays_pass_faces(points: ArrayLike, faces: ArrayLike) -> np.ndarray:
     """Returns how rays from points along +x pass through faces, pair by pair.
 
     Each ray is moved off by (0, e, e^2) for an infinitely small e > 0. It then meets no edge and no vertex, so that for
-    all faces of a closed, oriented surface the answers add up to the number of times that the surface winds around the
+    all faces of a closed, oriented surface the results add up to the number of times that the surface winds around the
     point, if the point is not on the surface. Points on a face count as if the face were behind them.
 
     Args:
@@ -94,15 +94,15 @@ def rays_pass_faces(points: ArrayLike, faces: ArrayLike) -> np.ndarray:
     if len(points) != len(faces):
         raise ValueError(f"points and faces must have the same length, got {len(points)} points and {len(faces)} faces")
     corners = np.concatenate([faces, points[:, None]], axis=1)
-    answer, is_certain = _ray_signs(corners.astype(np.float64), is_exact=False)
+    signs, is_certain = _ray_signs(corners.astype(np.float64), is_exact=False)
     (unsure,) = np.nonzero(~is_certain)
     if len(unsure):
-        answer[unsure], _ = _ray_signs(as_integers(corners[unsure]), is_exact=True)
-    return answer
+        signs[unsure], _ = _ray_signs(as_integers(corners[unsure]), is_exact=True)
+    return signs
 
 
 def _ray_signs(corners, is_exact):
-    """Returns the answers of :func:`rays_pass_faces`, and which are certain, for corners a, b, c and the point.
+    """Returns the results of :func:`rays_pass_faces`, and which are certain, for corners a, b, c and the point.
 
     In floating point, differences are off by one rounding, a turn by less than 4, a volume by less than 8 roundings of
     the sum of its absolute values.
@@ -133,7 +133,7 @@ def _ray_signs(corners, is_exact):
 
 
 def _checked_pairs(edges, faces):
-    """Returns edges and faces as arrays; raises ValueError if they are none, or no pairs."""
+    """Returns edges and faces as arrays; raises ValueError if they are not, or their lengths differ."""
     edges = checked_coordinates(edges, (2, 3), "edges")
     faces = checked_coordinates(faces, (3, 3), "faces")
     if len(edges) != len(faces):

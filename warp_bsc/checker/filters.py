@@ -61,7 +61,7 @@ def polygons_near(points, pairs, distance):
 
     The bound, u = 2^-53: coordinates and d are scaled to at most 1, and the components of g are at most 1. A corner is
     the difference of two coordinates, interpolated: off by less than 10 u in each component, and a product with g by
-    less than 100 u. A point of the polygon has weights that add up to 1 but for 4 u, and is off by less than 40 u.
+    less than 100 u. The weights of a point of the polygon add up to 1 within 4 u, so that it is off by less than 40 u.
     """
     scaled = scale_to_floats(*decompose_with_distance(points, distance))
     corners, limit = corners_of(scaled[:, :-1].reshape(points.shape), pairs), scaled[:, -1]
@@ -89,13 +89,13 @@ def polygons_near(points, pairs, distance):
 
 def _nearest_point(polygons):
     """Returns about the nearest point to the origin of each polygon, shape (n, corners, 3): one of its points."""
-    best, least = polygons[:, 0], (polygons[:, 0] ** 2).sum(axis=1)
+    best, smallest = polygons[:, 0], (polygons[:, 0] ** 2).sum(axis=1)
 
     def compare(candidates):
-        nonlocal best, least
+        nonlocal best, smallest
         square = (candidates**2).sum(axis=1)
-        best = np.where((square < least)[:, None], candidates, best)
-        least = np.minimum(least, square)
+        best = np.where((square < smallest)[:, None], candidates, best)
+        smallest = np.minimum(smallest, square)
 
     n = polygons.shape[1]
     with np.errstate(divide="ignore", invalid="ignore"):

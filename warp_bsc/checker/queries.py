@@ -56,7 +56,7 @@ def vertex_face(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
         ValueError: If a shape or a type is wrong, entries are masked, a coordinate is not finite, or a distance is out
             of range.
     """
-    return _answer(collides, "vertex_face", points, min_distance)
+    return _decide(collides, "vertex_face", points, min_distance)
 
 
 def edge_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -72,7 +72,7 @@ def edge_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(collides, "edge_edge", points, min_distance)
+    return _decide(collides, "edge_edge", points, min_distance)
 
 
 def vertex_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -88,7 +88,7 @@ def vertex_edge(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(collides, "vertex_edge", points, min_distance)
+    return _decide(collides, "vertex_edge", points, min_distance)
 
 
 def vertex_vertex(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -104,7 +104,7 @@ def vertex_vertex(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarra
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(collides, "vertex_vertex", points, min_distance)
+    return _decide(collides, "vertex_vertex", points, min_distance)
 
 
 def vertex_face_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -121,7 +121,7 @@ def vertex_face_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndar
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(_earliest, "vertex_face", points, min_distance)
+    return _decide(_earliest, "vertex_face", points, min_distance)
 
 
 def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -137,7 +137,7 @@ def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarra
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(_earliest, "edge_edge", points, min_distance)
+    return _decide(_earliest, "edge_edge", points, min_distance)
 
 
 def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -153,7 +153,7 @@ def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndar
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(_earliest, "vertex_edge", points, min_distance)
+    return _decide(_earliest, "vertex_edge", points, min_distance)
 
 
 def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -169,28 +169,28 @@ def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.nd
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _answer(_earliest, "vertex_vertex", points, min_distance)
+    return _decide(_earliest, "vertex_vertex", points, min_distance)
 
 
-def _answer(
+def _decide(
     decide: Callable[[Iterable, np.ndarray], np.ndarray], kind: str, points: ArrayLike, min_distance: ArrayLike
 ) -> np.ndarray:
-    """Returns what ``decide`` makes of the queries of a kind; raises ValueError as :func:`vertex_face`."""
+    """Returns the results of :func:`collides` or :func:`_earliest` for queries of a kind; errors as :func:`vertex_face`."""
     points = checked_coordinates(points, (2 * (_POLYGONS[kind].max() + 1), 3), "points")
     distance = np.broadcast_to(checked_distances(min_distance, "min_distance", len(points)), len(points))
-    answer = np.zeros(len(points), dtype=bool) if decide is collides else np.full((len(points), 2), np.nan)
+    result = np.zeros(len(points), dtype=bool) if decide is collides else np.full((len(points), 2), np.nan)
     triangles = {"vertex_face": VERTEX_FACE, "edge_edge": _EDGE_EDGE}.get(kind)
     touching = (distance == 0.0) & (triangles is not None)
     if touching.any():
-        answer[touching] = decide(undecided_triangles(points[touching], triangles), answer[touching])
+        result[touching] = decide(undecided_triangles(points[touching], triangles), result[touching])
     which = np.flatnonzero(~touching)
     near, hit = polygons_near(points[which], _POLYGONS[kind], distance[which])
     if decide is collides:
-        answer[which[hit]] = True
+        result[which[hit]] = True
         near &= ~hit
     which = which[near]
-    answer[which] = decide(_polygons(points[which], _POLYGONS[kind], distance[which]), answer[which])
-    return answer
+    result[which] = decide(_polygons(points[which], _POLYGONS[kind], distance[which]), result[which])
+    return result
 
 
 def collides(undecided, hit):

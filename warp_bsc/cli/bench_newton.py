@@ -85,7 +85,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _modes(text: str) -> tuple[str, ...]:
-    """The modes that an argument lists, each once."""
+    """Returns the modes that an argument lists, each once."""
     modes = tuple(dict.fromkeys(text.split(",")))
     for mode in modes:
         if mode not in MODES:

@@ -115,7 +115,7 @@ def _needs_assets(names: list[str]) -> bool:
 
 
 def _outputs(arguments: argparse.Namespace) -> dict[str, str]:
-    """The files to write by option; they are opened before anything is measured, so that no result is lost."""
+    """Returns the files to write by option, opened before anything is measured, so that no result is lost."""
     outputs = {"json": None if arguments.json == STDOUT else arguments.json, "figure": arguments.figure}
     return {option: path for option, path in outputs.items() if path}
 

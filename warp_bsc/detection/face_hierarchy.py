@@ -288,7 +288,7 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
 
 
 def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
-    """Allocates a level of nodes; worlds: the least and the greatest of each, int, shape [2, count], or None."""
+    """Allocates a level of nodes; worlds: the lowest and the highest of each, int, shape [2, count], or None."""
     level = HierarchyLevel()
     level.lowers = wp.empty(count, dtype=wp.vec3, device=device)
     level.uppers = wp.empty(count, dtype=wp.vec3, device=device)
@@ -299,7 +299,7 @@ def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> Hierarch
 
 
 def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
-    """Returns the least and the greatest world of each parent, from those of the children, shape [2, n]."""
+    """Returns the lowest and the highest world of each parent, from those of the children, shape [2, n]."""
     if worlds is None:
         return None
     first, last = (np.pad(w, (0, -len(w) % WIDTH), mode="edge").reshape(-1, WIDTH) for w in worlds)

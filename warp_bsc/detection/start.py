@@ -50,7 +50,7 @@ def find_device(name: str | None) -> wp.Device:
         return wp.get_preferred_device()
     known = [device.alias for device in wp.get_devices()] + ["cuda"] * wp.is_cuda_available()
     if name not in known:
-        raise ValueError(f"{name}: this machine has no such device, only {', '.join(known)}")
+        raise ValueError(f"{name}: there is no such device here, only {', '.join(known)}")
     return wp.get_device(name)
 
 
