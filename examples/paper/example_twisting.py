@@ -24,7 +24,12 @@ CENTRE = wp.constant(wp.vec3(0.0, 0.0, HEIGHT))
 
 
 @wp.kernel(enable_backward=False)
-def turn_ball(time: wp.array[float], body_q: wp.array[wp.transform]):
+def turn_ball(
+    # in
+    time: wp.array[float],
+    # out
+    body_q: wp.array[wp.transform],
+):
     """Turns the ball about the upright axis."""
     t = wp.max(time[0] - START_TIME, 0.0)
     # the speed grows linearly, then stays

@@ -219,9 +219,9 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
 
     Returns:
-        Device function for the CPU. It takes the positions at both ends, the vertices of the elements, a queue of
-        pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
-        returns a bit for each pair, set where no cull decides the pair. It checks no index.
+        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
+        of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
+        returns a bit for each pair, set where no cull decides the pair. Indices are not checked.
     """
     single = dtype is wp.vec3
     snippet = _SNIPPET.format(
@@ -236,12 +236,15 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
 
     @wp.func_native(f"    constexpr bool vertex_face = {'true' if vertex_face else 'false'};\n{snippet}")
     def cull_batch(
+        # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
+        # batch
         pairs: wp.array[wp.vec2i],
         first: int,
         count: int,
+        # rounding
         roundoff: wp.float64,
     ) -> wp.uint64: ...
 

@@ -1,7 +1,7 @@
 """The methods that the paper's benchmarks compare.
 
-All methods read the same arrays, positions by the vertices of a pair's elements, as a detector does, and answer the
-same question: do the two features meet? They differ as follows:
+All methods read the same arrays, positions by the vertices of a pair's elements, as a detector does, and decide whether
+the two features meet. They differ as follows:
 
 - ``float``, ``conservative``, ``exact``: the detector's own narrow phase,
   :class:`~warp_bsc.detection.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the results of the
@@ -201,7 +201,7 @@ def _kernels(kind: PairKind, dtype: type):
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         decided = _AXIS_BOXES
         if solves_cubic:
-            # any stage: what counts is that the status is computed
+            # any stage: only the time counts, and the status must be computed
             decided = wp.int32(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
         elif not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -244,7 +244,7 @@ class Queries:
 
     @classmethod
     def of_points(cls, kind: PairKind, points: np.ndarray) -> "Queries":
-        """Queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
+        """Returns queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
         n = len(points)
         x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
         vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
@@ -253,7 +253,7 @@ class Queries:
         return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
 
     def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
-        """Points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
+        """Returns the points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
         return query_points(self.elements, self.pairs[which], self.x0, self.x1)
 
     def __len__(self) -> int:

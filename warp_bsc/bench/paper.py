@@ -1,7 +1,7 @@
 """The paper's benchmarks: time and errors of each method on the candidate pairs of five scenes.
 
 Queries are the candidate pairs of the broad phase in some of a scene's intervals: pairs that share no vertex and whose
-swept boxes overlap. Where there are too many, a random part of them is measured. All methods get the same arrays.
+swept boxes overlap. If there are too many, a random part of them is measured. All methods read the same arrays.
 
 The exact checker checks every query that any method calls a collision, which includes all that are UNSURE and all that
 the methods disagree about, and a random sample of the others.
@@ -40,12 +40,15 @@ __all__ = [
 
 SEED = 0
 _TURNS = 8  # of timing all methods
-_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # in a launch at least: fewer are repeated, so that its start does not count
+_CPU_QUERIES, _GPU_QUERIES = (
+    2**18,
+    2**22,
+)  # smallest launches: fewer queries are repeated
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """The amount of measurements.
 
     Attributes:
         intervals: Number of intervals of a scene, evenly spaced.
@@ -76,7 +79,7 @@ class Effort:
 
 @dataclass(frozen=True)
 class Place:
-    """Where methods are timed.
+    """A device, and the number of its cores, on which methods are timed.
 
     Attributes:
         device: Warp device.
@@ -245,7 +248,7 @@ def benchmark_scene(
 
 
 def _gather(
-    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, most: int
+    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, max_queries: int
 ) -> tuple[dict[PairKind, Queries], int]:
     """Returns the candidate pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
@@ -256,7 +259,7 @@ def _gather(
         found = _find_candidates(scene, device)
         number = sum(len(kind_pairs) for _, kind_pairs in found.values())
         candidates += number
-        share = min(1.0, most / len(intervals) / max(number, 1))
+        share = min(1.0, max_queries / len(intervals) / max(number, 1))
         for kind, (kind_elements, kind_pairs) in found.items():
             before = [
                 vertices if kind == PairKind.VERTEX_FACE else sum(map(len, elements[kind])),
@@ -274,7 +277,7 @@ def _gather(
 
 
 def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
-    """Vertices of the elements, and the candidate pairs, by kind."""
+    """Returns the vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     pipeline = DetectionPipeline(mesh)
     x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))

@@ -43,7 +43,7 @@ MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 SEED = 0
 """Seed of the random numbers."""
 
-_MOST_QUERIES = 2**26
+_MAX_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
 _MISSES = {PairKind.VERTEX_FACE: 1.32, PairKind.EDGE_EDGE: 2.33}
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
@@ -101,7 +101,15 @@ class QueryBenchmark:
 
 
 @wp.kernel(**_KERNEL)
-def _generate_queries(first: int, seed: int, miss: float, first_points: int, points: wp.array2d[wp.vec3]):
+def _generate_queries(
+    first: int,
+    # in
+    seed: int,
+    miss: float,
+    first_points: int,
+    # out
+    points: wp.array2d[wp.vec3],
+):
     """Writes two features of unit size that fly at each other from a random distance and deform a little."""
     i = first + wp.tid()
     random = wp.rand_init(seed, i)
@@ -124,7 +132,13 @@ def _rounded(x: wp.vec3) -> wp.vec3:
 
 
 @wp.kernel(**_KERNEL)
-def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
+def _make_touch(
+    first: int,
+    # in
+    other: int,
+    # in and out
+    points: wp.array2d[wp.vec3],
+):
     """Moves the first point of each query onto the edge from point ``other`` to the next, at half time.
 
     After rounding, all numbers are small multiples of 2^-11, so that this is exact.
@@ -154,7 +168,13 @@ def _kernels(kind: PairKind):
         return p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7]
 
     @wp.kernel(**_KERNEL)
-    def find_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+    def find_status(
+        first: int,
+        # in
+        points: wp.array2d[wp.vec3],
+        # out
+        status: wp.array[wp.int8],
+    ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         status[i] = wp.int8(ccd(a0, b0, c0, d0, a1, b1, c1, d1))
@@ -162,8 +182,10 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def find_impact(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
         tolerance: wp.float64,
+        # out
         status: wp.array[wp.int8],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
@@ -180,15 +202,18 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def cull(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
+        # out
         status: wp.array[wp.int8],
         survivors: wp.array[int],
+        # in and out
         counts: wp.array[wp.int64],
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         status[i] = wp.int8(FREE)
-        # the points are known to be finite
+        # all points are finite
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
@@ -202,10 +227,12 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def classify_survivors(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
         tolerance: wp.float64,
         survivors: wp.array[int],
         counts: wp.array[wp.int64],
+        # out
         status: wp.array[wp.int8],
     ):
         slot = first + wp.tid()
@@ -228,7 +255,13 @@ def _kernels(kind: PairKind):
         return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
 
     @wp.kernel(**_KERNEL)
-    def find_exact_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+    def find_exact_status(
+        first: int,
+        # in
+        points: wp.array2d[wp.vec3],
+        # out
+        status: wp.array[wp.int8],
+    ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         time = decide(
@@ -251,8 +284,8 @@ def _kernels(kind: PairKind):
 
 def check_query_count(count: int) -> None:
     """Raises ValueError if there are too few or too many queries."""
-    if not 1 <= count <= _MOST_QUERIES:
-        raise ValueError(f"count must be in [1, {_MOST_QUERIES}], not {count}")
+    if not 1 <= count <= _MAX_QUERIES:
+        raise ValueError(f"count must be in [1, {_MAX_QUERIES}], not {count}")
 
 
 def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
@@ -344,7 +377,7 @@ def benchmark_queries(
         different = int((results[mode] != results["status"]).sum())
         if different:
             raise RuntimeError(
-                f"{different} of {count} {kind.display_name} queries were answered differently by mode {mode}"
+                f"{different} of {count} {kind.display_name} queries were decided differently by mode {mode}"
             )
     return QueryBenchmark(kind, results["status"].copy(), int(counts.numpy()[0]), milliseconds)
 

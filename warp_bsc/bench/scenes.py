@@ -24,7 +24,7 @@ __all__ = [
 PAPER_SCENES = ("twisting", "funnel", "dancer", "flamenco", "crashing")
 """Names of the scenes of the paper's benchmarks (Sec. 5.2)."""
 
-_FEWEST_TRIANGLES, _MOST_TRIANGLES = 1000, 20_000_000
+_MIN_TRIANGLES, _MAX_TRIANGLES = 1000, 20_000_000
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarr
     """Returns the mesh and the motion of a generated scene."""
     if generator not in GENERATORS:
         raise ValueError(f"{name}: there is no generator {generator}, only {', '.join(GENERATORS)}")
-    if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _FEWEST_TRIANGLES <= int(triangles) <= _MOST_TRIANGLES:
+    if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _MIN_TRIANGLES <= int(triangles) <= _MAX_TRIANGLES:
         raise ValueError(
-            f"{name}: the number of triangles must be in [{_FEWEST_TRIANGLES}, {_MOST_TRIANGLES}], not {triangles!r}"
+            f"{name}: the number of triangles must be in [{_MIN_TRIANGLES}, {_MAX_TRIANGLES}], not {triangles!r}"
         )
     return GENERATORS[generator](int(triangles))
 
@@ -232,7 +232,7 @@ GENERATORS: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def _grid_shape(quads: int) -> tuple[int, int]:
-    """Rows and columns of a nearly square grid of about this number of quads."""
+    """Returns rows and columns of a nearly square grid of about this number of quads."""
     side = int(quads**0.5)
     rows = np.arange(int(0.8 * side), side + 1)
     columns = np.round(quads / rows).astype(int)

@@ -175,7 +175,7 @@ def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.nd
 def _decide(
     decide: Callable[[Iterable, np.ndarray], np.ndarray], kind: str, points: ArrayLike, min_distance: ArrayLike
 ) -> np.ndarray:
-    """Returns the results of :func:`collides` or :func:`_earliest` for queries of a kind; errors as :func:`vertex_face`."""
+    """Returns the results of :func:`collides` or :func:`_earliest` for queries; errors as :func:`vertex_face`."""
     points = checked_coordinates(points, (2 * (_POLYGONS[kind].max() + 1), 3), "points")
     distance = np.broadcast_to(checked_distances(min_distance, "min_distance", len(points)), len(points))
     result = np.zeros(len(points), dtype=bool) if decide is collides else np.full((len(points), 2), np.nan)

@@ -136,7 +136,7 @@ def _print_worst(console: Console, rows: _Rows, adversarial: list[tuple[Place, d
 
 def _print_errors(console: Console, rows: _Rows) -> None:
     table = make_table(
-        "Wrong answers",
+        "Wrong results",
         "Checked",
         *_HEADERS.values(),
         caption="False positives + false negatives, of all collisions by any method and a random sample.",

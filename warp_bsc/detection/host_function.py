@@ -85,7 +85,13 @@ def _call_native(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _call_kernel(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
+def _call_kernel(
+    # in
+    call: wp.uint64,
+    number: wp.int64,
+    # in and out
+    failed: wp.array[int],
+):
     _call_native(call, number, failed)
 
 
