@@ -1,4 +1,4 @@
-"""A wide BVH of a CPU: packets of eight boxes, compared with SIMD instructions.
+"""A wide BVH for the CPU: packets of eight boxes, compared with SIMD instructions.
 
 Elements sorted along a space-filling curve are cut into packets of eight. Eight packets have a node, eight nodes have
 one of the next level, up to one root: a tree whose links are arithmetic. The same coordinate of all eight lies side by
@@ -10,7 +10,7 @@ side, so that one box is compared with eight at once.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
 - ``node_worlds``, int32, 16 a node: the first and the last world of the children.
 
-Where there are fewer than eight, the boxes of the others are empty, which overlap nothing.
+Missing elements and children have empty boxes, which overlap none.
 """
 
 import functools
@@ -287,8 +287,8 @@ def fit_packet_of(dtype: type) -> wp.Function:
         Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
         ends, the number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach
         beyond each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which
-        elements have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an element with
-        a position that is not finite is empty. No index is checked.
+        elements have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an
+        element with a position that is not finite is empty. Indices are not checked.
     """
     snippet = _FIT_SNIPPET.format(scalar="float" if dtype is wp.vec3 else "double")
 
