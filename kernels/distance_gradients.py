@@ -5,17 +5,17 @@ between them and the unit normal N = x / |x|. As the points are closest, moving 
 in the second order only. So with their weights w_i in x = sum w_i p_i held fixed (in a vertex and a face 1 and minus
 the barycentric coordinates), and with the velocity e of the one point relative to the other,
 
-    dt = -N . sum w_i dp_i / (N . e),
+    dt = -N . sum w_i dp_i / (N . e).
 
-of which a point's start has the share 1 - t and its end t. The returned time is a lower bound; gradients are those at
-the root of |x| = d within the tolerance after it, which Newton's method finds. Where several pairs of points are
-closest, as of parallel edges, gradients are those of one pair.
+The start of a point has the share 1 - t of dp_i, its end the share t. The returned time is a lower bound; gradients are
+those at the root of |x| = d within the tolerance after it, which Newton's method finds. Where several pairs of points
+are closest, as on parallel edges, gradients are those of one pair.
 
 **Grazing.** Gradients grow without bound where N . e goes to zero. As in :mod:`.gradients`, 1 / (N . e) becomes
 N . e / max((N . e)^2, (sigma max(|e|, f))^2), with sigma = 2^-10 and f = 2^-22 of the largest coordinate of the
 relative motion. Where this has an effect ``grazing`` is 1, and also where the root is not certain to be within the
-tolerance, or is not found there. Of features that are nearer than the distance from the start, whose time is 0 whatever
-the points, gradients are zero.
+tolerance, or is not found there. Features that are nearer than the distance at the start have the time 0, and gradients
+of zero.
 """
 
 import warp as wp

@@ -239,7 +239,7 @@ def _lowest_at(
 
 @wp.func
 def _first_below(corner: wp.vec2d, needed: wp.float64, before: wp.float64) -> wp.float64:
-    """Returns about when the product of a corner with a direction falls to what is needed, if that is before a time."""
+    """Returns about when the product of a corner with a direction falls below a bound, or a given time if earlier."""
     if corner[1] < needed:
         return wp.min(before, (corner[0] - needed) / (corner[0] - corner[1]))
     return before

@@ -44,7 +44,7 @@ PACKAGES = {
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
     "usd": {"_arguments", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file"},
-    "bench": {"detection", "kernels", "usd", "checker", "response", "_private_names"},
+    "bench": {"detection", "kernels", "usd", "checker", "response", "_arguments", "_private_names"},
     "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file"},
     "__main__": {"cli"},
     "__init__": {"checker", "detection", "replay", "response", "usd"},  # for type checkers alone

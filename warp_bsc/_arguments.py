@@ -41,7 +41,7 @@ _Choice = TypeVar("_Choice", bound=str)
 
 
 def given(value: object) -> str:
-    """Returns what was given, as errors show it."""
+    """Returns a value in the form in which errors show it."""
     text = reprlib.repr(value)
     return text if isinstance(value, str | Real | None) else f"{type(value).__name__} {text}"
 

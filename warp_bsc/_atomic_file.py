@@ -24,7 +24,7 @@ def unfinished_path(path: str | os.PathLike) -> Path:
 
 @contextlib.contextmanager
 def naming(what: str | os.PathLike) -> Iterator[None]:
-    """Puts the name of a file before the system's message on what is wrong with it.
+    """Puts the name of a file before the system's message in errors of the context.
 
     Raises:
         OSError: If one is raised in the block.

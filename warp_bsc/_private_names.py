@@ -38,8 +38,8 @@ def cpu_graph() -> Any:
     says whether the graph is to be saved.
 
     Raises:
-        RuntimeError: If this version of Warp has no such graph: nothing that reads results on the host can then be
-            captured on the CPU. Graphs on CUDA do not need it.
+        RuntimeError: If this version of Warp has no graph of that name: operations that read results on the host then
+            cannot be captured on the CPU. Graphs on CUDA do not need it.
     """
     warn_if_untested("warp-lang")
     try:
@@ -88,7 +88,7 @@ def replace_name(module: ModuleType, name: str, value: object) -> None:
     ``newton.examples.download_external_git_folder``, and make the solvers that :mod:`newton.solvers` names.
 
     Raises:
-        RuntimeError: If the module has no such name, so that its replacement would have no effect.
+        RuntimeError: If the module does not have the name, so that the replacement would have no effect.
     """
     warn_if_untested("newton")
     if not hasattr(module, name):

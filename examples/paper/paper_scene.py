@@ -1,7 +1,7 @@
 """Base of the five scenes of the paper: options, a solver that moves bodies, checks, and parts to build scenes from.
 
 A scene is a class ``Example`` that derives from :class:`PaperScene`: ``build`` adds its parts, ``motion`` moves its
-bodies, ``measure`` and ``test_scene`` say what it should have become.
+bodies, ``measure`` and ``test_scene`` check its final state.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Measures the detector on a scene: the time of a detection, and what it finds."""
+"""Measures the detector on a scene: the time of a detection, and its counts."""
 
 import statistics
 import time
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_integer
 from ..detection.collisions import DetectionStats, StageCounts
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
@@ -96,8 +97,11 @@ def benchmark_detector(
         compare: Whether to measure the IPC Toolkit as well.
 
     Raises:
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``repeat`` is less than 1, or the method is unknown.
         RuntimeError: If a CUDA graph found other pairs than the detection outside it.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     counts_memory = device.is_cuda and wp.is_mempool_enabled(device)
     dtype = wp.vec3 if scene.x0.dtype == np.float32 else wp.vec3d

@@ -22,8 +22,8 @@ __all__ = [
     "CCD_CLASSES",
     "IpcQueryTiming",
     "IpcToolkitBenchmark",
-    "answer_queries",
     "benchmark_ipc_toolkit",
+    "decide_queries",
     "is_installed",
     "time_queries",
     "version",
@@ -96,7 +96,7 @@ def version() -> str | None:
     return importlib.metadata.version("ipctk") if is_installed() else None
 
 
-def answer_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
+def decide_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
     """Returns whether each query collides by a method of the IPC Toolkit, bool, shape [n].
 
     Args:

@@ -218,7 +218,7 @@ def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
 
 
 def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> NewtonExample:
-    """Reads an example's source for what it needs."""
+    """Reads an example's source for its packages and downloads."""
     specification = importlib.util.find_spec(module)
     assert specification is not None and specification.origin is not None
     tree = ast.parse(Path(specification.origin).read_text(encoding="utf-8"))
@@ -329,7 +329,7 @@ def describe_download(asset: str) -> str:
 def _replies(request: dict[str, Any], errors) -> Iterator[dict[str, Any]]:
     """Starts a process that serves a request, and yields its replies; the last is its exit status, or its result.
 
-    The process ends with the iteration, whatever ends it.
+    The process ends with the iteration, also where an error ends that.
     """
     command = [sys.executable, "-m", f"{__package__}.newton_process", json.dumps(request)]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True)

@@ -253,7 +253,7 @@ class _Crossings:
         )
 
     def count(self) -> int:
-        """Returns the number of crossings that an edge or a face of cloth or of a soft body takes part in."""
+        """Returns the number of crossings of an edge or a face of cloth or of a soft body."""
         self._read_positions()
         edges, faces = self._detector.find_intersections(self._x).T
         return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())

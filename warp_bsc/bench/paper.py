@@ -21,7 +21,7 @@ from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import PairKind
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
-from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
+from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .scenes import BenchmarkScene
 from .timing import count_threads
@@ -414,6 +414,6 @@ def _time_ipc_toolkit(
         call += called * share
         indices, truth = truths[kind]
         part = random.permutation(len(indices))[: int(np.ceil(effort.ipc_queries * share))]
-        hit, truth = answer_queries(method, kind, found.points(indices[part])), truth[part]
+        hit, truth = decide_queries(method, kind, found.points(indices[part])), truth[part]
         wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
     return IpcQueryTiming(number, nanoseconds, call, *map(int, wrong))

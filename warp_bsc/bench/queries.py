@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_integer
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.settings import TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -332,9 +333,11 @@ def benchmark_queries(
         repeat: Number of repetitions; their medians count.
 
     Raises:
-        ValueError: If there are too few or too many queries.
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``count`` or ``repeat`` is out of range.
         RuntimeError: If two modes find different results, or exact arithmetic misses features that touch.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     if count is None:
         count = 2**24 if device.is_cuda else 2**18
@@ -388,7 +391,12 @@ def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     Args:
         device: Warp device; default: Warp's default.
         repeat: Number of repetitions; their median counts.
+
+    Raises:
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``repeat`` is less than 1.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)
     target = wp.empty_like(source)

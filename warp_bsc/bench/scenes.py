@@ -68,7 +68,7 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
         return BenchmarkScene(name, *_find_generator(name, *generated.groups()))
     if "," in name:
         return _load_pair(name)
-    scene = Scene(name, sample_turns=False)  # what was recorded
+    scene = Scene(name, sample_turns=False)  # samples as they were recorded
     if not 0 <= interval < len(scene):
         raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene) - 1}")
     motion = scene.interval(interval)
@@ -101,7 +101,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     """
     if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
         return [(0, load_scene(name))]
-    scene = Scene(name, sample_turns=False)  # what was recorded
+    scene = Scene(name, sample_turns=False)  # samples as they were recorded
     count = len(scene)
     if count < 1:
         raise ValueError(f"{name}: there is no interval, its meshes never move")
@@ -136,7 +136,7 @@ def _load_pair(name: str) -> BenchmarkScene:
     if not np.array_equal(first.faces, second.faces):
         raise ValueError(f"{name}: the two have different faces")
     x0, x1 = np.array(first.vertices), np.array(second.vertices)
-    # trimesh returns double precision, whatever the file has
+    # trimesh returns double precision for any file
     singles = [x.astype(np.float32) for x in (x0, x1)]
     if all(np.array_equal(x, single) for x, single in zip((x0, x1), singles, strict=True)):
         x0, x1 = singles

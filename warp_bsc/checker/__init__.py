@@ -39,8 +39,9 @@ The times of contact form a closed set, so there is a first one, t*. It is 0, or
   So the origin is on an edge at t*: Z = 0 and x.y <= 0 there, and just before t* one of the two is not so.
 
 A root of f is held between two times that are not roots, and the sign of q there comes from the theorem of Sturm and
-Tarski: from the first time to the second, the sequence of signed remainders that starts with f and f' q loses as many
-changes of sign as f has distinct roots between them with q > 0, less those with q < 0. With q = 1 it counts the roots.
+Tarski: from the first time to the second, the number of changes of sign along the sequence of signed remainders that
+starts with f and f' q falls by the number of distinct roots of f between them with q > 0, less those with q < 0. With
+q = 1 it counts the roots.
 
 A minimum distance
 ------------------

@@ -10,7 +10,7 @@ from .queries import VERTEX_FACE, collides, undecided_triangles
 __all__ = ["edge_face_crossings", "edges_pass_faces", "rays_pass_faces"]
 
 _RAY_ERROR = 2.0**-49  # relative to sums of absolute values: more than 8 roundings of 2^-53, see _ray_signs
-_RAY_UNDERFLOW = 2.0**-900  # more than what underflows there
+_RAY_UNDERFLOW = 2.0**-900  # more than the underflow there
 
 
 def edge_face_crossings(edges: ArrayLike, faces: ArrayLike) -> np.ndarray:

@@ -14,16 +14,16 @@ _DISTANCE_MARGIN = 1e-12  # more than the error of any value in it, see polygons
 
 
 def triangles_may_touch(points, pairs):
-    """Returns which triangles of which queries need exact arithmetic, bool (n, triangles): False is proven to be free.
+    """Returns which triangles of queries need exact arithmetic, bool (n, triangles): False is proven to be free.
 
     A triangle stays clear of the origin when along some axis its corners have one strict sign at both ends, thus
     always; or when in each piece of the step its volume has one strict sign, or one of n.X, n.Y and n.Z is negative.
 
     The bound, u = 2^-53: coordinates are scaled to at most 1, and in a piece each is mid + half s, |s| <= 1, with mid
-    and half at most 1 and off by at most 4 u. Written out, the volume has 6 * 2^3 products of three such numbers, which
-    pass through less than 24 roundings: it is off by less than 48 (3 * 4 + 24) u < 1e-12. A weight has 3 * 24 * 8 = 576
-    products of four and less than 48 roundings: it is off by less than 576 (4 * 4 + 48) u < 1e-11. Both leave room
-    within _MARGIN for the rounding of the sums of absolute values.
+    and half at most 1 and off by at most 4 u. Written out, the volume has 6 * 2^3 products of three of these numbers,
+    with less than 24 roundings each: it is off by less than 48 (3 * 4 + 24) u < 1e-12. A weight has 3 * 24 * 8 = 576
+    products of four, with less than 48 roundings each: it is off by less than 576 (4 * 4 + 48) u < 1e-11. The rest of
+    _MARGIN is for the rounding of the sums of absolute values.
     """
     # |points| <= 1 cannot overflow. What underflows here is off by less than 2^-1022, nothing beside a size of 2^-500.
     corners = corners_of(scale_to_floats(*decompose(flattened(points))).reshape(points.shape), pairs)

@@ -31,7 +31,7 @@ def print_examples(console: Console, examples: list[NewtonExample]) -> None:
 
 
 def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.Device, partial: bool) -> None:
-    """Prints the times, the crossings and the tests of examples, a row a run, and what the stage reports.
+    """Prints the times, the crossings and the tests of examples, a row a run, and the reports of the stage.
 
     Args:
         console: The terminal or file to print to.
@@ -66,7 +66,7 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     sizes |= {run.example: run.measured for run in runs if run.measured and run.measured.stage}
     if sizes:
         console.print()
-        headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "Uncer-\ntified", "Trun-\ncated", "Stand-\ning")
+        headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
         caption = "Steps of the stage: all, not certified, with paths truncated, with vertices frozen."
         table = make_table("Example", *headers, caption=caption)
         for name, took in sizes.items():

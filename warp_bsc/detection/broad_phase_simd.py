@@ -130,7 +130,7 @@ class BroadPhaseSimd:
     def _build(
         self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
     ) -> None:
-        """Builds trees for a motion; or refits their boxes, and sorts only if they have become loose."""
+        """Builds trees for a motion; with ``refit``, keeps their order unless the boxes have become loose."""
         if refit:
             for tree in trees:
                 tree.fit(x0, x1, changed)

@@ -27,7 +27,7 @@ class StageCounts:
         unsure: Candidates that floating point could not certify either way.
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
         host: Candidates whose exponents are too far apart for that, or that may come within a minimum distance only for
-            a moment of the step. The host decides them, but not in a CUDA graph, where they stay unsure.
+            a moment of the step. The host decides them, except in a CUDA graph, where they stay unsure.
     """
 
     candidates: int = 0
@@ -247,7 +247,7 @@ class CapturedCollisions:
     _read: Callable[[], Collisions] = field(repr=False)
 
     def read(self) -> Collisions:
-        """Returns what the last replay found; on CUDA what the detector found last, in a graph or not.
+        """Returns the collisions of the last replay; on CUDA those of the detector's last detection, in a graph or not.
 
         Raises:
             RuntimeError: If the graph must be captured again, as the detector's buffers have been replaced since, or on

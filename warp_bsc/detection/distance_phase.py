@@ -185,7 +185,7 @@ def _kernels(dtype: type) -> _Kernels:
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
-        # the threads of a warp advance together, whatever the pairs
+        # the threads of a warp advance together, each with a pair of its own
         while i < filled:
             at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, int(i), roundoff, tolerance)
             at.search = advance(at.motion, at.distance, timed, at.search)

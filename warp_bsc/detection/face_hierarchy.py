@@ -3,7 +3,7 @@
 The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
 compact however a mesh moves. A run only fits its boxes. Edges that no face has and points have places as well, as faces
 that have collapsed: the cells of the mesh are its faces, then these edges, then the points. Cells without neighbours
-have no such order, and are compared by brute force in the worst case, 1,024 pairs of cells at a time.
+are in no order, and in the worst case are compared by brute force, 1,024 pairs of cells at a time.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class FaceHierarchy:
         order: Cell at each place, -1 for none.
         faces: Vertices of the face at each place.
         face_edges: Edges of the face at each place.
-        owned: What the face at each place is the representative of.
+        owned: The elements whose representative the face at each place is.
         edges: Vertices of each edge.
         vertex_rows: Row of each vertex in ``vertex_boxes``, -1 if no face uses it.
         edge_rows: Row of each edge in ``edge_boxes``.
@@ -243,9 +243,9 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
     :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
 
     Args:
-        visit: Function of Warp, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
+        visit: Device function, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
             overlaps the face at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
-            together, each for its own face of one cluster, some of them with no bits. A thread may be called for many
+            together, each for its own face of one cluster, some of them with no bits. A thread may call it for many
             ``first``, or for none.
         arguments_type: Type of the last argument, a struct of Warp.
     """

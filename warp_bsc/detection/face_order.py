@@ -308,7 +308,7 @@ def _component_places(sizes: np.ndarray) -> np.ndarray:
     small = sizes < _MIN_OWN_CLUSTER
     joins = np.zeros(len(sizes), dtype=bool)
     joins[1:] = small[1:] & small[:-1]
-    # runs of components without a gap, each of which starts at a cluster
+    # runs of components without a gap; each run starts at a cluster
     run = np.cumsum(~joins) - 1
     run_sizes = np.bincount(run, weights=sizes).astype(np.int64)
     run_places = np.concatenate([[0], np.cumsum(-(-run_sizes // CLUSTER) * CLUSTER)])

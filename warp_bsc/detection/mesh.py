@@ -1,4 +1,4 @@
-"""The collision mesh: the faces, edges and vertices that take part in collision detection."""
+"""The collision mesh: the faces, edges and vertices for collision detection."""
 
 import functools
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ __all__ = ["CollisionMesh"]
 class CollisionMesh:
     """The faces, edges and vertices of a mesh whose positions change and whose connectivity does not.
 
-    Vertices that no face uses (the inner particles of a soft body, say) take no part, unless they are ends of given
+    Vertices that no face uses (such as the inner particles of a soft body) are excluded, unless they are ends of given
     edges (ropes, strands) or given points. Several bodies make one mesh: their faces index one array of positions.
 
     Attributes:
@@ -57,9 +57,9 @@ class CollisionMesh:
         Args:
             faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
-            edges: Vertex indices of edges that take part although no face has them, integers, shape [n, 2], NumPy or
+            edges: Vertex indices of edges that are included although no face has them, integers, shape [n, 2], NumPy or
                 Warp array. Edges of faces among them are not counted twice.
-            points: Vertices that take part although no face has them, integers, shape [n], NumPy or Warp array.
+            points: Vertices that are included although no face has them, integers, shape [n], NumPy or Warp array.
             radius: Radius of each vertex, in the unit of the positions, 0 or at least 2^-1021, float, shape
                 [vertex_count], NumPy or Warp array; or one for all. A pair collides if it comes within the sum of its
                 two radii.

@@ -25,7 +25,7 @@ class QueryResult:
 
     Attributes:
         hit: Whether the query collides, by the method, bool, shape [n].
-        status: What floating point could certify, whatever the method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
+        status: Certified status by floating point, for any method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
         toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
             for a query without times.
         coordinates: Where they touch or come within the minimum distance, float64, shape [n, 3]: barycentric
@@ -233,7 +233,7 @@ def _query(
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
         contacts = contacts.rows(contacts.status != FREE)
         if method == "conservative":
-            contacts.decided[:] = HIT  # whatever the exact stage has decided
+            contacts.decided[:] = HIT  # also those that the exact stage has refuted
         if method != "float":
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":
