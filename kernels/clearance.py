@@ -30,7 +30,7 @@ import warp as wp
 
 from .closest import unit_scale
 from .culling import gaps_along
-from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX, Motion, coplanarity, cross_middle
+from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX, Motion, coplanarity, cross_middle, cross_size
 from .signs import UNDERFLOW
 
 _ZERO = wp.constant(wp.float64(0.0))
@@ -63,12 +63,6 @@ def sum_of_size(x: wp.vec3d) -> wp.float64:
 
 
 @wp.func
-def _cross_size(x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
-    """Returns bounds on the components of a cross product, from the sizes of the components of its factors."""
-    return wp.vec3d(x[1] * y[2] + x[2] * y[1], x[2] * y[0] + x[0] * y[2], x[0] * y[1] + x[1] * y[0])
-
-
-@wp.func
 def direction_clears(part: Motion, direction: wp.vec3d, distance: wp.float64) -> bool:
     """Returns whether a direction keeps the features of a part farther apart than a distance."""
     low, high, bound = gaps_along(part, direction)
@@ -85,7 +79,7 @@ def plane_clears(part: Motion, distance: wp.float64) -> bool:
     """
     y = coplanarity(part)
     error = (
-        _NORMAL_ERROR * part.roundoff * sum_of_size(_cross_size(part.u_size, part.v_size)) + part.roundoff * UNDERFLOW
+        _NORMAL_ERROR * part.roundoff * sum_of_size(cross_size(part.u_size, part.v_size)) + part.roundoff * UNDERFLOW
     )
     start = norm_bound(y.n0) + error
     middle = norm_bound(y.nh) + error
@@ -132,7 +126,7 @@ def _side_clears(
     ch = cross_middle(q0, q1, e0, e1)
     c1 = wp.cross(q1, e1)
     direction = unit_scale(c0 + _TWO * ch + c1)
-    c_size = _cross_size(size, e_size)
+    c_size = cross_size(size, e_size)
     slack = part.roundoff * UNDERFLOW
     bound = _CROSS_ERROR * part.roundoff * wp.dot(wp.abs(direction), c_size) + slack
     error = _SIDE_ERROR * part.roundoff * sum_of_size(e_size) + slack
@@ -150,7 +144,7 @@ def _side_clears(
     k0 = wp.cross(i0, e0)
     kh = cross_middle(i0, i1, e0, e1)
     k1 = wp.cross(i1, e1)
-    away = _QUARTIC_ERROR * part.roundoff * wp.dot(c_size, _cross_size(i_size, e_size)) + slack
+    away = _QUARTIC_ERROR * part.roundoff * wp.dot(c_size, cross_size(i_size, e_size)) + slack
     return (
         wp.dot(c0, k0) >= away
         and _HALF * (wp.dot(c0, kh) + wp.dot(ch, k0)) >= away
