@@ -26,7 +26,7 @@ __all__ = [
     "main",
 ]
 
-MIN_TRIANGLES = 1000
+MIN_TRIANGLES, MAX_TRIANGLES = 1000, 20_000_000
 RECORDED_FPS = 60
 """Frames per second of a recording; a scene that has more is shown in slow motion."""
 
@@ -116,8 +116,8 @@ class PaperScene(ExampleBase):
     carried = ()
 
     def __init__(self, viewer, args):
-        if args.triangles < MIN_TRIANGLES:
-            raise ValueError(f"--triangles must be at least {MIN_TRIANGLES}, not {args.triangles}")
+        if not MIN_TRIANGLES <= args.triangles <= MAX_TRIANGLES:
+            raise ValueError(f"--triangles must be in [{MIN_TRIANGLES}, {MAX_TRIANGLES}], not {args.triangles}")
         self.frame_dt = 1.0 / self.fps
         self.sim_substeps = self.count_substeps(args.triangles)
         super().__init__(viewer, args)
@@ -181,7 +181,7 @@ class PaperScene(ExampleBase):
     def create_parser(cls):
         """Returns the options."""
         parser = super().create_parser()
-        parser.add_argument("--triangles", type=int, default=cls.triangles, help="About how many triangles.")
+        parser.add_argument("--triangles", type=int, default=cls.triangles, help="Approximate number of triangles.")
         return parser
 
 
