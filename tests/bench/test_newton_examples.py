@@ -153,7 +153,11 @@ def test_finds_examples_by_name_with_their_options():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"mode": "both"}, "both"), ({"frames": WARM_UP}, "frames must be more than"), ({"check_every": 0}, "every 0")],
+    [
+        ({"mode": "both"}, "both"),
+        ({"frames": WARM_UP}, "frames must be more than"),
+        ({"check_every": 0}, "check_every must be at least 1, not 0"),
+    ],
 )
 def test_wrong_options(options, message):
     example = NewtonExample("gone", "gone")
