@@ -1,6 +1,6 @@
 """What the package uses of Warp and Newton without a public interface, with the installed versions and without it."""
 
-import importlib.metadata
+import importlib
 import types
 import warnings
 
@@ -16,7 +16,7 @@ def versions(monkeypatch):
     """Sets the version of a package that seems to be installed."""
 
     def set_version(package, version):
-        monkeypatch.setattr(importlib.metadata, "version", {package: version}.__getitem__)
+        monkeypatch.setattr(importlib.import_module(package), "__version__", version)
 
     for cached in (private.warn_if_untested, private._warn_of_one_thread):
         cached.cache_clear()
