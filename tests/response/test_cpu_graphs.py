@@ -117,7 +117,7 @@ def test_a_detection_reads_the_positions_of_the_replay(dtype):
     vector = wp.vec3 if dtype is np.float32 else wp.vec3d
     x0, x1 = (wp.array(x.astype(dtype), dtype=vector, device=CPU) for x in (START, START))
     with wp.ScopedCapture(CPU) as capture:
-        collisions = detector.detect(x0, x1)
+        collisions = detector.capture(x0, x1)
     with pytest.raises(RuntimeError, match="not been launched"):
         collisions.read()
     for end, expected in ((START, []), (END, [[3, 0], [4, 0], [5, 0]]), (START, [])):
@@ -135,7 +135,7 @@ def test_queues_grow_in_a_replay():
     x0.assign(np.arange(60)[:, None] * np.float32([10.0, 1.0, 0.1]))
     x1.assign(x0)
     with wp.ScopedCapture(CPU) as capture:
-        collisions = detector.detect(x0, x1)
+        collisions = detector.capture(x0, x1)
     start = rng.uniform(-1.0, 1.0, (60, 3)).astype(np.float32)
     end = -start
     x0.assign(start)
@@ -149,6 +149,13 @@ def test_queues_grow_in_a_replay():
     assert collisions.certified and not collisions.overflowed
 
 
+def test_a_capture_outside_a_graph_is_refused():
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, device=CPU))
+    x = wp.array(START, dtype=wp.vec3, device=CPU)
+    with pytest.raises(RuntimeError, match=r"captures no graph: call capture\(x0, x1\) within wp.ScopedCapture"):
+        detector.capture(x, x)
+
+
 def test_what_returns_arrays_of_the_host_is_refused():
     detector = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, device=CPU))
     points = np.zeros((3, 8, 3))
@@ -157,8 +164,9 @@ def test_what_returns_arrays_of_the_host_is_refused():
         (lambda: detector.find_intersections(x), RuntimeError),
         (lambda: bsc.query_vertex_face(points, device=CPU), RuntimeError),
         (lambda: bsc.query_edge_edge(points, device=CPU), RuntimeError),
-        (lambda: detector.detect(x, x), ValueError),
-        (lambda: detector.detect(START, END), ValueError),
+        (lambda: detector.detect(x, x), RuntimeError),
+        (lambda: detector.capture(x, x), ValueError),
+        (lambda: detector.capture(START, END), ValueError),
     ):
         with pytest.raises(error, match="graph"), wp.ScopedCapture(CPU):
             call()

@@ -210,6 +210,15 @@ def calls() -> dict[str, Call]:
     found["CollisionDetector.detect"] = Call(
         detector.detect, {"x0": X, "x1": X}, {"x0": COORDINATES, "x1": COORDINATES}
     )
+
+    def capture(x0, x1):
+        with wp.ScopedCapture("cpu"):
+            detector.capture(x0, x1)
+
+    on_device = wp.array(X, dtype=wp.vec3d, device="cpu")
+    found["CollisionDetector.capture"] = Call(
+        capture, {"x0": on_device, "x1": on_device}, {"x0": COORDINATES, "x1": COORDINATES}, raises=detector.capture
+    )
     found["CollisionDetector.find_intersections"] = Call(detector.find_intersections, {"x": X}, {"x": COORDINATES})
     found["CollisionDetector.find_proximities"] = Call(
         detector.find_proximities,

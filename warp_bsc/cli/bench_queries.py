@@ -1,4 +1,4 @@
-"""The command ``warp-bsc bench queries``: measures how many elementary queries a second are answered."""
+"""The command ``warp-bsc bench queries``: measures how many elementary queries a second are decided."""
 
 import argparse
 import json
@@ -23,9 +23,9 @@ from .tables import Console
 __all__ = ["add_to"]
 
 _DESCRIPTION = """\
-Measure how many elementary queries a second are answered. The queries are
+Measure how many elementary queries a second are decided. The queries are
 random and the same on every device; a third of them survive the culls. Queries
-and answers stay on the device. On a GPU, replays of a CUDA graph are timed by
+and results stay on the device. On a GPU, replays of a CUDA graph are timed by
 events."""
 
 _EPILOG = f"""\

@@ -12,6 +12,7 @@ from ..detection import start
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
+from ..detection.settings import Method
 from .tables import Console
 
 __all__ = ["find_device", "load_detector", "loading_kernels"]
@@ -44,7 +45,7 @@ def loading_kernels(device: wp.Device) -> Iterator[None]:
 
 
 def load_detector(
-    method: str,
+    method: Method,
     dtype: npt.DTypeLike,
     device: wp.Device,
     *,

@@ -4,7 +4,7 @@ import argparse
 import math
 from collections.abc import Callable
 
-from .._arguments import LEAST_DISTANCE
+from .._arguments import SMALLEST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
@@ -131,7 +131,7 @@ def distance(text: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not LEAST_DISTANCE <= number < math.inf:
+    if not SMALLEST_DISTANCE <= number < math.inf:
         raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
     return number
 

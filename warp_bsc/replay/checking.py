@@ -17,6 +17,7 @@ from ..detection.detector import CollisionDetector
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import Proximities, ProximityFinder
+from ..detection.settings import Method
 from ..detection.start import is_cpu
 from ..usd.interval import Interval
 from ..usd.scene import Scene
@@ -48,7 +49,7 @@ class Checks:
     """
 
     selection: Selection
-    method: Literal["float", "conservative", "exact"]
+    method: Method
     device: str | None
     intersections: bool
     clearance: float | None
@@ -183,7 +184,6 @@ class _SegmentDetector:
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)
-        assert isinstance(collisions, Collisions)  # nothing is captured here
         of_strands = self.strands.detect(interval) if self.strands and not self._is_still else None
         intersections = None
         if start:
@@ -343,9 +343,7 @@ class _StrandChecker:
 
     def detect(self, interval: Interval) -> Collisions:
         """Returns the collisions of curves and points in an interval."""
-        collisions = self._detector.detect(interval.x0, interval.x1)
-        assert isinstance(collisions, Collisions)  # nothing is captured here
-        return collisions
+        return self._detector.detect(interval.x0, interval.x1)
 
     def with_intersections(self, found: Intersections, x: np.ndarray, *, is_end: bool) -> Intersections:
         """Returns intersections of meshes followed by those of curves, with the edges numbered as in :attr:`mesh`.

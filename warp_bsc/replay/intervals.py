@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from .._arguments import check_instance, checked_choice, checked_distance, checked_flag, checked_integer, given
-from ..detection.settings import METHODS
+from ..detection.settings import METHODS, Method
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
@@ -18,7 +18,7 @@ __all__ = ["replay"]
 def replay(
     scene: Scene,
     *,
-    method: Literal["float", "conservative", "exact"] = "exact",
+    method: Method = "exact",
     device: Any = None,
     intersections: bool = True,
     ignore_initial: bool = False,

@@ -31,7 +31,7 @@ class FrameRange:
         for name in ("start", "end", "step"):
             value = getattr(self, name)
             if value is not None:
-                limits = {"least": 0.0, "above": True} if name == "step" else {}
+                limits = {"minimum": 0.0, "above": True} if name == "step" else {}
                 object.__setattr__(self, name, checked_number(value, name, **limits))
         if self.start is not None and self.end is not None and self.end <= self.start:
             raise ValueError(f"end must be after the start, {self.start:g}, not {self.end:g}")
