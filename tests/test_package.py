@@ -1,6 +1,7 @@
 """The package: what of a checkout can be imported as a part of it."""
 
 import ast
+import functools
 import importlib.util
 import os
 import shutil
@@ -69,8 +70,10 @@ LIBRARIES = {
 """Who may import a library: packages, or single files."""
 
 
+@functools.cache
 def imports():
     """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
+    found = []
     for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
         for path in sorted(folder.rglob("*.py")):
             relative = path.relative_to(folder)
@@ -85,8 +88,8 @@ def imports():
                     modules = [[*base, alias.name] for alias in node.names]
                 else:
                     continue
-                for module in modules:
-                    yield str(path.relative_to(ROOT)), package, module
+                found += [(str(path.relative_to(ROOT)), package, module) for module in modules]
+    return found
 
 
 def test_packages_import_only_what_the_layout_allows():
