@@ -1,4 +1,4 @@
-"""Contacts passed on to steps in substeps: the inner solver gets those that the stage does not resolve, and no others."""
+"""Contacts passed on to steps in substeps: the inner solver gets those that the stage does not resolve, no others."""
 
 import newton
 import numpy as np
