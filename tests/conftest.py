@@ -28,8 +28,9 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Sets what must be set before any kernel is loaded or array made, and signals as a terminal has them."""
-    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-        if signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
+    for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number and signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
             signal.signal(number, handler)
     if config.getoption("--sanitize"):
         if not sanitizers_available():
