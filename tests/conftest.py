@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
+from compile_once import compile_kernels_once
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
@@ -15,6 +16,7 @@ import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variabl
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
+compile_kernels_once()
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
 hypothesis.settings.load_profile("repeatable")
 
