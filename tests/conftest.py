@@ -1,5 +1,6 @@
 """Settings of the test run: one device for all tests, what tests need, quiet Warp, repeatable hypothesis."""
 
+import gc
 import os
 import signal
 
@@ -64,6 +65,12 @@ def pytest_collection_modifyitems(items):
         for marker, skip in missing.items():
             if item.get_closest_marker(marker):
                 item.add_marker(skip)
+
+
+def pytest_collection_finish():
+    """Keeps what the imports have made, which lives as long as the run, out of every later collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

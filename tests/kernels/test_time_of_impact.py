@@ -268,11 +268,25 @@ def test_points_that_are_all_the_same_are_in_contact_from_the_start(kind):
 # --- Any tolerance, any scale ---
 
 
+@functools.cache
+def aimed(kind):
+    """Queries that aim at trouble, and the times between which their first contact is, shape (n, 2)."""
+    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
+    return points, TRUTH[kind](points)
+
+
+@functools.cache
+def random(kind):
+    """Queries of which many pass through each other, and the times between which their first contact is."""
+    rng = np.random.default_rng(8)
+    points = np.concatenate([generator(rng, 300, kind, np.float64) for generator in (mostly_hits, uniform)])
+    return points, TRUTH[kind](points)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tolerance", [-np.inf, -1.0, 0.0, 1e-300, np.nan, 2.0**-38])
 def test_tolerances_that_are_too_small_are_the_smallest(kind, tolerance):
-    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
-    times = TRUTH[kind](points)
+    points, times = aimed(kind)
     found = impacts(kind, points, tolerance)
     expected = impacts(kind, points, 2.0**-38)
     for name, values in vars(found).items():
@@ -286,9 +300,7 @@ def test_tolerances_that_are_too_small_are_the_smallest(kind, tolerance):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tolerance", [2.0**-2, 0.3, 0.5, 1.0, 2.0, np.inf])
 def test_features_meet_at_the_coordinates_also_where_the_tolerance_is_the_step(kind, tolerance):
-    rng = np.random.default_rng(8)
-    points = np.concatenate([generator(rng, 300, kind, np.float64) for generator in (mostly_hits, uniform)])
-    times = TRUTH[kind](points)
+    points, times = random(kind)
     found = impacts(kind, points, tolerance)
     hits = ~np.isnan(times[:, 0])
     assert hits[found.status == HIT].all()
