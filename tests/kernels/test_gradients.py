@@ -426,6 +426,7 @@ def test_detections_of_one_tape_do_not_disturb_one_another(device):
     for c in held:
         c.arrays.edge_edge_toi.grad.fill_(1.0)
     tape.backward()
+    assert all(gradient.any() for gradient in alone)
     for (start, _), expected in zip(positions, alone, strict=True):
         np.testing.assert_allclose(start.grad.numpy(), expected, rtol=0.0, atol=1e-5 * np.abs(expected).max())
 
