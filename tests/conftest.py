@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
-from compile_once import compile_kernels_once
+from compilation import compile_kernels_once
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 

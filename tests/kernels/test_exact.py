@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 from benchmark_data import load_cloth_funnel_queries, load_queries
 from certify import KINDS
+from compilation import QUICK
 from exact_queries import decide_exactly
 from generators import GENERATORS, _weights, _with_gap
 from hypothesis import given, settings
@@ -202,7 +203,7 @@ def stages_kernel(limbs):
     def cross_component_of(polygon: wp.array[one], first: int, second: int, axis: int):
         return cross_component(polygon, first, second, axis)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=QUICK)
     def compute(
         kind: int,
         points: wp.array2d[wp.vec3d],

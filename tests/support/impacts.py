@@ -3,6 +3,7 @@
 import functools
 
 import warp as wp
+from compilation import QUICK
 
 from warp_bsc.kernels import impact_edge_edge, impact_vertex_face
 
@@ -11,9 +12,9 @@ __all__ = ["impact_kernel"]
 
 @functools.cache
 def impact_kernel(dtype):
-    """The kernel for one type of point, with gradients, in a module with the options that modules have by default."""
+    """The kernel for one type of point, with gradients; its module may fuse multiply and add, as modules do."""
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", module_options=QUICK)
     def find_impacts(
         edges: bool,
         tolerance: wp.float64,

@@ -1,4 +1,4 @@
-"""Lets processes that need the same kernels at the same time compile them once: one compiles, the others wait."""
+"""Compilation of the tests' kernels: options that make it quick, and no module compiled by two processes at once."""
 
 import functools
 import os
@@ -11,7 +11,11 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["compile_kernels_once"]
+__all__ = ["QUICK", "compile_kernels_once"]
+
+QUICK = {"cpu_compiler_flags": "-march=native"}
+"""Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take twice as
+long to compile. Such kernels are slower, which does not matter in tests."""
 
 
 def compile_kernels_once() -> None:
