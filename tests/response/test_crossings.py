@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_crossing_sheets, add_patch, crossing_sheets, status
+from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_crossing_sheets, add_patch, crossing_sheets
 from stage_stress import SCENES, Stress
 
 import warp_bsc as bsc
@@ -42,8 +42,8 @@ def test_crossing_sheets(pull, steps, device):
     for _ in range(steps):
         rollout.step()
         assert rollout.solver.report.certified
-        assert status(rollout.solver, "crossings") == len(before)
-        excluded += status(rollout.solver, "excluded")
+        assert rollout.solver.report.crossings == len(before)
+        excluded += rollout.solver.report.excluded
         before = check_new_crossings(rollout, before)
         counts.append(len(before))
     assert counts[0] > 20
@@ -53,8 +53,9 @@ def test_crossing_sheets(pull, steps, device):
         assert counts[-1] > 0 and excluded > 0
     else:
         assert set(counts) == {counts[0]}
-    assert (rollout.collisions, report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0, 0)
-    assert (report.total_excluded, report.total_remaining) == (excluded, 0)
+    totals = report.totals
+    assert (rollout.collisions, totals.truncated_steps, totals.frozen_steps, totals.uncertified_steps) == (0, 0, 0, 0)
+    assert (report.totals.excluded, report.totals.remaining) == (excluded, 0)
     assert (f"contacts: 0 remained, {excluded} excluded" in str(report)) == (excluded > 0)
 
 
@@ -86,11 +87,11 @@ def test_the_count_is_that_of_exact_detection(device):
             rollout.states[0].particle_q.assign(moved)
         expected = len(rollout.find_crossings(rollout.positions))
         rollout.step()
-        assert status(rollout.solver, "crossings") == expected
+        assert rollout.solver.report.crossings == expected
         assert rollout.solver.report.certified and rollout.collisions == 0
         counts.append(expected)
     assert [count > 0 for count in counts] == [bool(int(digit)) for digit in "001110010"]
-    assert rollout.solver.report.frozen_steps == rollout.solver.report.truncated_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == rollout.solver.report.totals.truncated_steps == 0
 
 
 def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):
@@ -105,7 +106,7 @@ def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):
     for _ in range(5):
         rollout.step()
         assert rollout.solver.report.certified
-        assert status(rollout.solver, "crossings") > 0
+        assert rollout.solver.report.crossings > 0
         hits += rollout.solver.report.hits
     assert rollout.collisions == 0 and hits > 100
     assert rollout.velocities[-49:, 2].mean() > -20.0
@@ -124,7 +125,7 @@ def test_a_vertex_on_a_face(velocity, device):
     rollout.step()
     assert rollout.solver.report.certified and rollout.collisions == 0
     assert rollout.solver.report.frozen == 0
-    assert status(rollout.solver, "crossings") == 0
+    assert rollout.solver.report.crossings == 0
     if velocity[2] > 0.0:
         assert rollout.positions.tobytes() == wanted.tobytes()
     assert np.abs(rollout.positions - wanted)[-3:].max() < 0.1 * DT
@@ -206,7 +207,7 @@ def test_cloth_on_a_roller_without_common_vertices(device):
         assert rollout.solver.report.certified
         assert rollout.positions[cloth:].tobytes() == turned.tobytes()
     assert rollout.collisions == 0 and touched > 0
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
     assert rollout.positions[:cloth, 0].mean() > 1e-3  # at the start it is 0
 
 
@@ -220,7 +221,7 @@ def test_a_sheet_that_folds_within_its_plane_is_stopped(device):
     assert rollout.find_collisions(start, folded)
     rollout.step()
     assert rollout.solver.report.certified and rollout.collisions == 0
-    assert status(rollout.solver, "excluded") == status(rollout.solver, "crossings") == 0
+    assert rollout.solver.report.excluded == rollout.solver.report.crossings == 0
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -8,7 +8,7 @@ from newton_scenes import DT, Changed, Rollout, add_patch, add_plates, place_pla
 
 import warp_bsc as bsc
 from warp_bsc.response.inside import InsideFinder
-from warp_bsc.response.model_mesh import ModelMesh
+from warp_bsc.response.state.mesh import ModelMesh
 
 TURN = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.3, 1.0, 0.1)), 0.7)
 
@@ -251,7 +251,7 @@ def test_the_report_names_what_solids_have_swallowed(device):
         certified.append(report.certified)
         inside.append(set(report.inside.particles.tolist()))
     everything = set(range(model.particle_count))
-    assert certified == [True, False, True, True] and report.uncertified_steps == 1
+    assert certified == [True, False, True, True] and report.totals.uncertified_steps == 1
     assert inside == [set(), everything, everything, everything] and report.crossings == 0
-    assert report.total_remaining > 0 and f"{report.total_remaining} remained" in str(report)
+    assert report.totals.remaining > 0 and f"{report.totals.remaining} remained" in str(report)
     assert set(report.inside.shapes.tolist()) == {0, 1} and (report.inside.soft_bodies == -1).all()

@@ -9,8 +9,8 @@ import trimesh
 import warp as wp
 
 import warp_bsc as bsc
-from warp_bsc.response import model_mesh
-from warp_bsc.response.model_mesh import ModelMesh
+from warp_bsc.response.state import mesh as model_mesh
+from warp_bsc.response.state.mesh import ModelMesh
 
 BOX = newton.Mesh.create_box(1.0, 1.0, 1.0)  # with the vertices of each side for itself
 

@@ -8,7 +8,7 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.distance_phase import pair_distances
 from warp_bsc.detection.settings import DistanceKind
-from warp_bsc.response.model_mesh import ModelMesh
+from warp_bsc.response.state.mesh import ModelMesh
 
 __all__ = [
     "DT",
@@ -23,7 +23,6 @@ __all__ = [
     "bullet",
     "crossing_sheets",
     "place_plates",
-    "status",
 ]
 
 DT = 1.0 / 240.0
@@ -138,11 +137,6 @@ def place_plates(state, gap):
 def plate_heights(gap):
     """Heights of two plates that are this far apart."""
     return -_HALF_PLATE - 0.5 * gap, _HALF_PLATE + 0.5 * gap
-
-
-def status(solver, name):
-    """A number of the stage's last step: ``crossings``, ``excluded`` contacts, or ``lost`` vertices."""
-    return int(getattr(solver._response.status, name).numpy()[0])
 
 
 class Rollout:

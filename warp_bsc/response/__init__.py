@@ -1,1 +1,1 @@
-"""Newton: the collision stage, which makes the motion of a solver free of collisions. Newton is imported only here."""
+"""Collision response behind Newton's solvers: step.py reads as one step, schedule.py says when it does what."""

@@ -11,9 +11,7 @@ from newton import BodyFlags, ParticleFlags
 from ..detection.body_parts import connect_cells
 from ..detection.containment import ContainmentFinder
 from ..detection.mesh import CollisionMesh
-from .model_mesh import ModelMesh, sides_of
-
-__all__ = ["Inside", "InsideFinder"]
+from .state.mesh import ModelMesh, sides_of
 
 _ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in ``planes.signed_distance``
 
@@ -120,14 +118,14 @@ class InsideFinder:
         has_movable = np.bincount(soft[(soft >= 0) & movable[: len(soft)]], minlength=len(soft)) > 0
         is_movable = np.where(solids.shape < 0, np.append(has_movable, False)[solids.soft_body], moves[solids.body])
 
-        def are_wanted(pairs):
+        def are_candidates(pairs):
             particle, body = particles[pairs[:, 0]], pairs[:, 1]
-            wanted = holds[body] & (world[particle] == solids.world[body])
-            wanted &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
-            return wanted & (movable[particle] | is_movable[body])
+            found = holds[body] & (world[particle] == solids.world[body])
+            found &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
+            return found & (movable[particle] | is_movable[body])
 
         x = np.where(finite[:, None], x, 0.0)
-        found = solids.finder.find_points(x, x[particles], are_wanted)
+        found = solids.finder.find_points(x, x[particles], are_candidates)
         return np.stack([particles[found[:, 0]], solids.shape[found[:, 1]], solids.soft_body[found[:, 1]]], axis=1)
 
     def _find_behind_planes(self, x, particles, planes, movable, moves):

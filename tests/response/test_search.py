@@ -1,0 +1,127 @@
+"""Detection without queues: where they are too small and cannot grow, every contact is found all the same."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import DT, SOLVERS, STIFF, Rollout, bullet, crossing_sheets
+from sheets import crumpled
+
+import warp_bsc as bsc
+from warp_bsc.detection import pipeline
+from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.response.state.structs import NEVER
+from warp_bsc.response.step import inspect
+
+CAPACITY = 4
+
+
+def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, padding=None):
+    """The broad phase of a GPU, which stages on the CPU get here too."""
+    assert checked_vertices is None
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, padding=padding)
+
+
+def stage(model, monkeypatch, *, tiny, inner="vbd", **options):
+    """A stage, with queues for four pairs that cannot grow if it is ``tiny``: those of a CUDA graph cannot."""
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline, "make_broad_phase", make_hierarchy)
+        solver = bsc.SolverCCD(SOLVERS[inner](model), **options)
+    if tiny:
+        detector = solver._work.detector
+        detector.broad_phase._face_pairs = wp.empty(CAPACITY, dtype=wp.vec2i, device=detector.mesh.device)
+        detector.capacities = detector._device_capacities()
+        detector.grow = lambda: False
+    return solver
+
+
+@pytest.mark.parametrize("speed", [10.0, 60.0])
+def test_a_bullet(speed, device, monkeypatch):
+    """It is stopped, every step is certified, and a second run has the same bits."""
+    model = bullet(speed, device=device)
+    ends = []
+    for _ in range(2):
+        rollout = Rollout(model, stage(model, monkeypatch, tiny=True))
+        hits = 0
+        for _ in range(12 if speed < 50.0 else 8):
+            rollout.step()
+            hits += rollout.solver.report.hits
+            assert rollout.solver.report.certified and not rollout.solver.report.undetected
+        assert rollout.collisions == 0 and hits > 50
+        assert rollout.solver.report.totals.frozen_steps == 0
+        ends.append(rollout.positions.tobytes() + rollout.velocities.tobytes())
+    assert ends[0] == ends[1]
+
+
+def test_crossing_sheets(device, monkeypatch):
+    """What crosses at the start comes apart without queues too."""
+    model = crossing_sheets(3.0, device=device)
+    rollout = Rollout(model, stage(model, monkeypatch, tiny=True))
+    excluded = 0
+    for _ in range(50):
+        rollout.step()
+        excluded += rollout.solver.report.excluded
+        assert rollout.solver.report.certified
+    assert excluded > 0 and rollout.collisions == 0
+    assert not rollout.find_crossings(rollout.positions)
+
+
+def crumpled_cloth(seed, device):
+    """A model of a sheet before it passes through itself, and its positions after that."""
+    start, end, faces = crumpled(seed, 16)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    at = {"pos": wp.vec3(), "rot": wp.quat_identity(), "scale": 1.0, "vel": wp.vec3()}
+    points = [wp.vec3(*point) for point in start.tolist()]
+    builder.add_cloth_mesh(**at, vertices=points, indices=faces.ravel().tolist(), density=0.1, **STIFF)
+    builder.color()
+    return builder.finalize(device=device), end
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch):
+    """As many, with the same vertices at the same times."""
+    model, end = crumpled_cloth(seed, device)
+    found = []
+    for tiny in (False, True):
+        solver = stage(model, monkeypatch, tiny=tiny, max_iterations=0)  # so that first contacts are found at once
+        work, motion = solver._work, solver._motion
+        motion.set_start(model.particle_q, None)
+        motion.set_end(wp.array(end, dtype=wp.vec3, device=device), model.particle_qd, None, DT)
+        results = inspect(work, motion).status.results
+        keys = work.vertices.first_contact.numpy()
+        times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
+        numbers = [
+            int(getattr(results, name).numpy()[0])
+            for name in ("remaining", "first_hits", "excluded", "undetected", "certified")
+        ]
+        found.append((times, numbers, work._dividing_planes.count.numpy()[0], work.vertices.changed.numpy()))
+    queued, queueless = found
+    assert queued[1] == queueless[1] and queued[1][0] > 100
+    assert queued[2] == queueless[2] > 0
+    np.testing.assert_array_equal(queued[3], queueless[3])
+    np.testing.assert_array_equal(queued[0], queueless[0])
+
+
+@pytest.mark.gpu
+def test_a_graph_captured_before_anything_touches(device, monkeypatch):
+    """Its queues hold four pairs of faces, and yet each of its replays is certified."""
+    if not wp.is_conditional_graph_supported():
+        pytest.skip("needs conditional nodes")
+    model = bullet(60.0, device=device)
+    rollout = Rollout(model, stage(model, monkeypatch, tiny=True))
+    start, end = rollout.states
+    rollout.step()  # loads kernels
+    rollout.states = start, end = model.state(), model.state()
+    with wp.ScopedCapture(device) as capture:
+        start.clear_forces()
+        rollout.solver.step(start, end, rollout.control, None, DT)
+    hits = 0
+    for _ in range(12):
+        before = rollout.vertices(start)
+        wp.capture_launch(capture.graph)
+        assert not rollout.find_collisions(before, rollout.vertices(end))
+        assert rollout.solver.report.certified and not rollout.solver.report.undetected
+        hits += rollout.solver.report.hits
+        wp.copy(start.particle_q, end.particle_q)
+        wp.copy(start.particle_qd, end.particle_qd)
+    assert hits > 100

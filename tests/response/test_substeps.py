@@ -1,0 +1,566 @@
+"""Coupled steps: the inner solver takes substeps against the contacts, and nothing else of a step changes."""
+
+import importlib.metadata
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import DT, SOFT, SOLVERS, STIFF, Rollout, add_patch, bullet
+
+import warp_bsc as bsc
+from warp_bsc.response.substeps.strain import edges_at_rest
+
+
+def drape(device):
+    """A cloth of 0.6 m above a fixed sphere."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.15, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5))
+    cells = {"dim_x": 12, "dim_y": 12, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.001}
+    builder.add_cloth_grid(pos=wp.vec3(-0.3, -0.3, 0.16), rot=wp.quat_identity(), vel=wp.vec3(), **cells, **SOFT)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def largest_stretch(model, dt, duration=0.4, **options):
+    """The largest stretch of an edge of a cloth on a sphere, averaged over the last tenth of a second."""
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), friction=0.5, **options)
+    rollout = Rollout(model, solver)
+    edges = rollout.mesh.edges[rollout.mesh.edges[:, 1] < model.particle_count]
+
+    def lengths():
+        return np.linalg.norm(rollout.positions[edges[:, 0]] - rollout.positions[edges[:, 1]], axis=1)
+
+    rest, largest = lengths(), []
+    for _ in range(round(duration / dt)):
+        rollout.states[0].clear_forces()
+        solver.step(*rollout.states, rollout.control, None, dt)
+        rollout.states = rollout.states[::-1]
+        largest.append((lengths() / rest).max() - 1.0)
+    assert solver.report.totals.uncertified_steps == 0
+    return np.mean(largest[-round(0.1 / dt) :]), solver.report
+
+
+def test_a_coupled_step_stretches_as_little_as_small_steps(device):
+    """At 1/60 s, coupled cloth stretches as at 1/480 s; without substeps, it stretches several times as much.
+
+    That is so with a number of substeps, and where the stage chooses.
+    """
+    model = drape(device)
+    reference, _ = largest_stretch(model, 1.0 / 480.0)
+    plain, report = largest_stretch(model, 1.0 / 60.0)
+    assert report.totals.substepped_steps == 0
+    assert plain > 3.0 * reference
+    for substeps in (8, "auto"):
+        coupled, report = largest_stretch(model, 1.0 / 60.0, substeps=substeps)
+        assert report.totals.substepped_steps > 0.5 * report.totals.steps
+        assert coupled < 1.2 * reference
+
+
+def test_auto_is_the_least_number_that_keeps_the_strain_small(device):
+    """Each step is that with the number of substeps that the report names, bit by bit; a resting patch takes none."""
+    model = drape(device)
+    state, ends, control = model.state(), [model.state() for _ in range(2)], model.control()
+    inner = newton.solvers.SolverVBD(model, iterations=5)
+    solvers = {n: bsc.SolverCCD(inner, friction=0.5, substeps=n) for n in (None, 2, 4, 8, 16, 32, "auto")}
+    chosen = []
+    for dt in (1.0 / 480.0, 1.0 / 60.0):
+        state.assign(model.state())
+        for _ in range(round(0.15 / dt)):
+            start = wp.clone(state.particle_q), wp.clone(state.particle_qd)
+            solvers["auto"].step(state, ends[0], control, None, dt)
+            chosen.append(solvers["auto"].report.substeps)
+            state.particle_q.assign(start[0])
+            state.particle_qd.assign(start[1])
+            solvers[chosen[-1] or None].step(state, ends[1], control, None, dt)
+            for name in ("particle_q", "particle_qd"):
+                auto, fixed = (getattr(end, name).numpy().tobytes() for end in ends)
+                assert auto == fixed
+            state.assign(ends[0])
+    assert len(set(chosen)) >= 3
+    assert solvers["auto"].report.totals.substepped_steps == np.count_nonzero(chosen)
+
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.001))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps="auto"))
+    for _ in range(10):
+        rollout.step()
+    assert rollout.solver.report.totals.substepped_steps == 0
+    assert 0.0 < rollout.positions[:, 2].max() < 0.001  # it lies
+
+
+def test_soft_bodies_are_coupled_where_they_are_compressed(device):
+    """A plate presses a block at once by a tenth of a cell: cloth would buckle, but a solid is strained by a tenth."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_box(body, hx=0.2, hy=0.2, hz=0.05)
+    material = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 0.0, "particle_radius": 0.002}
+    cells = {"dim_x": 2, "dim_y": 2, "dim_z": 2, "cell_x": 0.05, "cell_y": 0.05, "cell_z": 0.05}
+    at = wp.vec3(-0.05, -0.05, 0.051)
+    builder.add_soft_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **material)
+    builder.color()
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverVBD(model, iterations=5, integrate_with_external_rigid_solver=True)
+    solver = bsc.SolverCCD(inner, substeps="auto")
+    start, end = model.state(), model.state()
+    end.body_q.assign(np.float32([[0.0, 0.0, 0.006, 0.0, 0.0, 0.0, 1.0]]))
+    solver.step(start, end, model.control(), None, DT)
+    assert solver.report.certified and solver.report.substeps >= 8
+
+
+def test_lengths_at_rest_are_those_of_the_material(device):
+    """Edges of cloth and of a soft body, apart from where they are now."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 1.0))
+    sizes = {"dim_x": 1, "dim_y": 1, "dim_z": 1, "cell_x": 0.1, "cell_y": 0.2, "cell_z": 0.3}
+    material = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 0.0}
+    builder.add_soft_grid(pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), **sizes, **material)
+    x = np.array(builder.particle_q)
+    builder.particle_q = [wp.vec3(*row) for row in 2.0 * x]
+    edges, lengths, is_solid = edges_at_rest(builder.finalize(device=device))
+    assert np.allclose(lengths, np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1), rtol=1e-5)
+    assert is_solid.tolist() == (edges >= 9).all(axis=1).tolist()
+    assert len(edges) == 16 + 18
+
+
+def test_each_world_takes_the_substeps_that_it_needs(device):
+    """Three worlds, of which one takes none, in one model and each in a model of its own."""
+    speeds = 0.1, 3.0, 30.0
+    worlds, alone = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0)), []
+    for speed in speeds:
+        world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        add_patch(world, 8, 0.05, (0.0, 0.0, 0.0), fixed=True)
+        add_patch(world, 4, 0.03, (0.011, 0.017, 2e-4 + 0.004 * speed), velocity=(0.0, 0.0, -speed))
+        worlds.add_world(world)
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.add_world(world)
+        alone.append(builder)
+    rollouts = []
+    for builder in (worlds, *alone):
+        builder.color()
+        model = builder.finalize(device=device)
+        solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), separation=2e-4, substeps="auto")
+        rollouts.append(Rollout(model, solver))
+    substeps = []
+    for _ in range(3):
+        for rollout in rollouts:
+            rollout.step()
+        numbers = [rollout.solver.report.substeps for rollout in rollouts]
+        assert numbers[0] == max(numbers[1:])
+        substeps.append(numbers[1:])
+        expected = np.concatenate([rollout.positions for rollout in rollouts[1:]])
+        assert rollouts[0].positions.tobytes() == expected.tobytes()
+    assert any(len(set(numbers)) == 3 for numbers in substeps)
+    assert all(rollout.solver.report.totals.uncertified_steps == 0 for rollout in rollouts)
+
+
+@pytest.mark.parametrize("inner", SOLVERS)
+def test_without_contacts_coupling_changes_no_bit(inner, device):
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 1.0), velocity=(1.0, 0.0, 2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    plain = Rollout(model, SOLVERS[inner](model))
+    coupled = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), substeps=4))
+    for _ in range(5):
+        plain.step(1e-4)  # short enough for the explicit solver
+        coupled.step(1e-4)
+    assert coupled.positions.tobytes() == plain.positions.tobytes()
+    assert coupled.velocities.tobytes() == plain.velocities.tobytes()
+    assert coupled.solver.report.totals.substepped_steps == 0
+
+
+def test_a_world_without_contacts_keeps_its_bits(device):
+    """One of two worlds collides, and the other is that of the inner solver alone."""
+    builder = newton.ModelBuilder()
+    for height in (0.01, 1.0):
+        world = newton.ModelBuilder()
+        world.add_ground_plane()
+        add_patch(world, 4, 0.05, (0.0, 0.0, height), velocity=(0.0, 0.0, -5.0))
+        builder.add_world(world)
+    builder.color()
+    model = builder.finalize(device=device)
+    plain = Rollout(model, SOLVERS["vbd"](model))
+    coupled = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3))
+    for _ in range(4):
+        plain.step()
+        coupled.step()
+    half = model.particle_count // 2
+    assert coupled.solver.report.totals.substepped_steps > 1
+    assert coupled.positions[:half, 2].min() > 0.0 > plain.positions[:half, 2].min()
+    assert coupled.positions[half:].tobytes() == plain.positions[half:].tobytes()
+    assert coupled.velocities[half:].tobytes() == plain.velocities[half:].tobytes()
+
+
+def test_worlds_are_like_one_alone(device):
+    models = bullet(30.0, device=device), bullet(30.0, device=device, worlds=2)
+    one, both = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), restitution=0.3, substeps=3)) for model in models)
+    for _ in range(6):
+        one.step()
+        both.step()
+    assert both.collisions == 0 and both.solver.report.totals.substepped_steps > 1
+    for world in both.positions.reshape(2, -1, 3):
+        assert world.tobytes() == one.positions.tobytes()
+
+
+@pytest.mark.parametrize("substeps", [None, 4, "auto"])
+def test_momentum_of_free_bodies_is_conserved(substeps, device):
+    """Two patches collide; momentum is kept to 1e-6 of what collides, as XPBD keeps it and VBD by itself does not."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 1.0))
+    add_patch(builder, 5, 0.04, (0.013, 0.017, 0.012), velocity=(0.5, 0.0, -1.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, substeps=substeps))
+    before, _ = rollout.momenta()
+    colliding = model.particle_mass.numpy() @ np.linalg.norm(rollout.velocities, axis=1)
+    for _ in range(8):
+        rollout.step()
+    after, _ = rollout.momenta()
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert (rollout.solver.report.totals.substepped_steps > 0) is (substeps is not None)
+    assert np.abs(after - before).max() < 1e-6 * colliding
+    assert abs(rollout.velocities[: 7 * 7, 2].mean() - 1.0) > 0.3  # they did collide
+
+
+@pytest.mark.parametrize("substeps", [None, 4])
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_a_bounce_returns_the_energy_of_restitution(restitution, substeps, device):
+    """A patch hits a box squarely: its energy afterwards is that before times restitution squared."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    box = newton.ModelBuilder.ShapeConfig(mu=0.0)
+    builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.1), wp.quat_identity()), hx=1.0, hy=1.0, hz=0.1, cfg=box)
+    add_patch(builder, 5, 0.05, (0.0, 0.0, 0.02), velocity=(0.0, 0.0, -2.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, substeps=substeps)
+    rollout = Rollout(model, solver)
+    mass = model.particle_mass.numpy()[:, None]
+    before = (mass * rollout.velocities**2).sum()
+    for _ in range(8):
+        rollout.step()
+    assert (solver.report.totals.substepped_steps > 0) is (substeps is not None) and rollout.collisions == 0
+    assert abs((mass * rollout.velocities**2).sum() / before - restitution**2) < 0.02
+
+
+@pytest.mark.parametrize("substeps, dt", [(None, DT), (3, DT), ("auto", DT), (None, DT / 3)])
+def test_a_pile_comes_to_rest(substeps, dt, device):
+    """Layers that fall on the ground gain no energy, and lie still; in small steps they are very near the ground."""
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    for layer in range(3):
+        add_patch(builder, 4, 0.05, (0.011 * layer, 0.007 * layer, 0.02 * (layer + 1)))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, substeps=substeps))
+    mass = model.particle_mass.numpy().astype(float)
+
+    def energy():
+        return mass @ (0.5 * (rollout.velocities.astype(float) ** 2).sum(axis=1) + 9.81 * rollout.positions[:, 2])
+
+    start, energies = energy(), []
+    for _ in range(90 if dt == DT else 150):
+        rollout.step(dt)
+        energies.append(energy())
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert max(energies) < 1.001 * start
+    assert np.sqrt((rollout.velocities**2).sum(axis=1).mean()) < 0.1
+
+
+def test_style3d_is_coupled_too(device):
+    """Cloth on a fixed box stretches less at 1/60 s with substeps, and nothing passes through."""
+    builder = newton.ModelBuilder()
+    newton.solvers.SolverStyle3D.register_custom_attributes(builder)
+    builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.05), wp.quat_identity()), hx=0.08, hy=0.3, hz=0.05)
+    newton.solvers.style3d.add_cloth_grid(
+        builder,
+        pos=wp.vec3(-0.24, -0.24, 0.005),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(),
+        dim_x=12,
+        dim_y=12,
+        cell_x=0.04,
+        cell_y=0.04,
+        mass=5e-4,
+        particle_radius=0.002,
+        tri_aniso_ke=wp.vec3(1e2, 1e2, 1e1),
+        edge_aniso_ke=wp.vec3(2e-5, 1e-5, 5e-6),
+    )
+    model = builder.finalize(device=device)
+    contacts = newton.CollisionPipeline(model).contacts()
+    stretch = []
+    for substeps in (None, 8):
+        inner = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
+        rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=substeps))
+        edges = rollout.mesh.edges[rollout.mesh.edges[:, 1] < model.particle_count]
+        rest = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
+        for _ in range(20):
+            rollout.step(1.0 / 60.0, contacts)
+        length = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
+        stretch.append((length / rest).max() - 1.0)
+        assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert rollout.solver.report.totals.substepped_steps > 10
+    assert stretch[1] < 0.5 * stretch[0]
+
+
+def test_xpbd_is_coupled_too(device):
+    """Cloth of springs falls on a sphere at 1/60 s, where XPBD with its contacts between steps throws it apart."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(body=-1, radius=0.15)
+    cells = {"dim_x": 12, "dim_y": 12, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.001, "particle_radius": 0.005}
+    springs = {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": 5.0, "spring_kd": 0.0}
+    at = wp.vec3(-0.3, -0.3, 0.16)
+    builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **springs)
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverXPBD(model, iterations=10)
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=8))
+    edges, lengths, _ = edges_at_rest(model)
+    for _ in range(12):
+        rollout.step(1.0 / 60.0)
+    stretch = (np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1) / lengths).max() - 1.0
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert rollout.solver.report.totals.substepped_steps > 6
+    assert stretch < 0.5
+
+
+class Clocked(newton.solvers.SolverVBD):
+    """VBD with a clock on the device."""
+
+    def __init__(self, model):
+        super().__init__(model, iterations=3)
+        self.time = wp.zeros(1, dtype=float, device=model.device)
+        self.calls = 0
+
+    def step(self, state_in, state_out, control, contacts, dt, **options):
+        super().step(state_in, state_out, control, contacts, dt, **options)
+        self.time += dt
+        self.calls += 1
+
+
+def test_a_clock_of_the_inner_solver_advances_once_a_step(device):
+    model = bullet(30.0, device=device)
+    rollout = Rollout(model, bsc.SolverCCD(Clocked(model), substeps=4))
+    for _ in range(6):
+        rollout.step()
+    assert rollout.solver.report.totals.substepped_steps > 1
+    assert rollout.solver.solver.calls == 6
+    assert np.isclose(rollout.solver.solver.time.numpy()[0], 6 * DT)
+
+
+def test_the_state_at_the_start_may_be_that_at_the_end(device):
+    model = bullet(30.0, device=device)
+    apart = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3))
+    state, solver = model.state(), bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3)
+    for _ in range(6):
+        apart.step()
+        state.clear_forces()
+        solver.step(state, state, apart.control, None, DT)
+    assert apart.solver.report.totals.substepped_steps > 1
+    assert state.particle_q.numpy().tobytes() == apart.positions.tobytes()
+
+
+def test_forces_act_as_often_as_without_coupling(device):
+    """A patch on frictionless ground is pushed: coupled, it accelerates as force over mass."""
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=0.0))
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.001))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, substeps=4)
+    start, end = model.state(), model.state()
+    for _ in range(24):
+        start.particle_f.assign(model.particle_mass.numpy()[:, None] * np.float32([2.0, 0.0, 0.0]))
+        solver.step(start, end, model.control(), None, DT)
+        start, end = end, start
+    assert solver.report.totals.substepped_steps > 10
+    velocity = start.particle_qd.numpy().mean(axis=0)
+    assert np.allclose(velocity[0], 2.0 * 24 * DT, rtol=1e-3)
+    assert abs(velocity[2]) < 9.81 * DT  # it falls within the separation
+
+
+def test_a_moving_plate_pushes_in_each_substep(device):
+    """A kinematic plate that rises carries cloth along without throwing it ahead."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_box(body, hx=0.2, hy=0.2, hz=0.05)
+    add_patch(builder, 4, 0.05, (0.0, 0.0, 0.051))
+    builder.color()
+    model = builder.finalize(device=device)
+    inner = newton.solvers.SolverVBD(model, iterations=5, integrate_with_external_rigid_solver=True)
+    solver = bsc.SolverCCD(inner, restitution=0.0, substeps=4)
+    start, end = model.state(), model.state()
+    heights = 0.5 * 20.0 * (DT * np.arange(1, 13)) ** 2  # at 20 m/s^2
+    for height in heights:
+        start.clear_forces()
+        end.body_q.assign(np.float32([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]]))
+        solver.step(start, end, model.control(), None, DT)
+        assert solver.report.certified
+        is_pushed = solver._work.status.is_fast.numpy()[0] == 1  # so that no vertex is left in the way
+        assert is_pushed or solver.report.hits == 0
+        start, end = end, start
+    assert solver.report.totals.substepped_steps > 8
+    above = start.particle_q.numpy()[:, 2] - (0.05 + heights[-1])
+    assert above.min() > 0.0 and above.max() < 0.001
+    assert np.allclose(start.particle_qd.numpy()[:, 2], 20.0 * 12 * DT, rtol=0.1)
+
+
+@pytest.mark.parametrize("substeps", [3, "auto"])
+def test_coupled_steps_in_a_graph_are_those_without(substeps, device):
+    if device.is_cuda and not wp.is_conditional_graph_supported():
+        pytest.skip("needs conditional nodes")
+    model = bullet(30.0, device=device)
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps)) for _ in range(2))
+    start, end = captured.states
+
+    def frame():
+        for states in ((start, end), (end, start)):
+            states[0].clear_forces()
+            captured.solver.step(*states, captured.control, None, DT)
+
+    with wp.ScopedCapture(device) as capture:
+        frame()
+    for _ in range(3):
+        wp.capture_launch(capture.graph)
+    for _ in range(6):
+        plain.step()
+    assert plain.solver.report.totals.substepped_steps > 1
+    assert captured.solver.report.totals.substepped_steps == plain.solver.report.totals.substepped_steps
+    assert captured.positions.tobytes() == plain.positions.tobytes()
+
+
+def test_a_solver_that_allocates_is_captured_too(device):
+    """On a GPU, the body of a condition cannot allocate memory, as XPBD does: its substeps are taken in each step."""
+    if device.is_cuda and not wp.is_conditional_graph_supported():
+        pytest.skip("needs conditional nodes")
+    model = bullet(30.0, device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=3))
+    start, end = rollout.states
+    rollout.step()
+    with wp.ScopedCapture(device) as capture:
+        for states in ((end, start), (start, end)):
+            states[0].clear_forces()
+            rollout.solver.step(*states, rollout.control, None, DT)
+    for _ in range(3):
+        wp.capture_launch(capture.graph)
+    assert rollout.solver.report.totals.steps == 7 and rollout.solver.report.totals.substepped_steps > 1
+    assert rollout.solver.report.totals.uncertified_steps == 0
+    if device.is_cuda:  # a graph of the CPU knows what to leave out
+        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps="auto")
+        with pytest.raises(NotImplementedError, match="SolverXPBD needs a number"), wp.ScopedCapture(device):
+            chooses.step(start, end, rollout.control, None, DT)
+
+
+def test_what_cannot_be_coupled_is_refused(device):
+    model = bullet(10.0, device=device)
+    with pytest.raises(ValueError, match="substeps must be an integer in"):
+        bsc.SolverCCD(SOLVERS["vbd"](model), substeps=1)
+    with pytest.raises(ValueError, match="'auto', not 'always'"):
+        bsc.SolverCCD(SOLVERS["vbd"](model), substeps="always")
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
+    builder.color()
+    differentiable = builder.finalize(device=device, requires_grad=True)
+    with pytest.raises(NotImplementedError, match="no gradients"):
+        bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), substeps=4)
+
+
+def vbd_with_self_contact(model):
+    """VBD with self-contact as in Newton's example ``cloth_twist``, but for the number of iterations."""
+    margins = {"particle_self_contact_margin": 0.002, "particle_self_contact_gap": 0.0015}
+    return newton.solvers.SolverVBD(model, iterations=3, particle_enable_self_contact=True, **margins)
+
+
+@pytest.mark.parametrize("lift", [True, False])
+def test_the_speed_limit_of_self_contact_is_lifted(lift, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 3, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 60.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(vbd_with_self_contact(model), lift_speed_limit=lift)
+    rollout = Rollout(model, solver)
+    for _ in range(3):
+        rollout.step()
+    assert solver.report.speed_limit_lifted is lift
+    assert ("speed limit" in str(solver.report)) is lift
+    speed = rollout.velocities[:, 2].mean()
+    assert np.isclose(speed, 60.0, rtol=1e-5) if lift else speed < 2.0 * 0.5 * 0.85 * 0.0035 / DT
+
+
+def test_layers_in_reach_of_self_contact_fly_on_together(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for height in (0.0, 0.0025):
+        add_patch(builder, 3, 0.02, (0.0, 0.0, height), velocity=(3.0, 0.0, -10.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(vbd_with_self_contact(model)))
+    for _ in range(4):
+        rollout.step()
+    assert np.allclose(rollout.velocities, [3.0, 0.0, -10.0], atol=1e-3)
+
+
+def test_self_contact_without_its_limit_still_pushes(device):
+    """Two patches nearer than the margin part by VBD's forces alone, which the stage would not add."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for height in (0.0, 0.001):
+        add_patch(builder, 4, 0.05, (0.3 * height, 0.0, height))
+    builder.color()
+    model = builder.finalize(device=device)
+    model.soft_contact_ke = 1e3
+    rollout = Rollout(model, bsc.SolverCCD(vbd_with_self_contact(model)))
+    for _ in range(3):
+        rollout.step()
+    assert rollout.solver.report.hits == 0
+    lower, upper = np.split(rollout.positions[:, 2], 2)
+    assert upper.mean() - lower.mean() > 0.00105
+
+
+def test_a_bullet_behind_self_contact_is_stopped(device):
+    rollout_of = bullet(60.0, device=device)
+    rollout = Rollout(rollout_of, bsc.SolverCCD(vbd_with_self_contact(rollout_of)))
+    for _ in range(8):
+        rollout.step()
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+
+
+def test_the_inner_solver_alone_keeps_its_limit(device):
+    """Outside a step of the stage, VBD is as it was made."""
+    model = bullet(60.0, device=device)
+    inner = vbd_with_self_contact(model)
+    Rollout(model, bsc.SolverCCD(inner)).step()
+    assert inner.particle_enable_self_contact
+    assert "_penetration_free_truncation" not in vars(inner)
+
+
+def test_the_private_name_belongs_to_this_newton():
+    """The stage lifts the limit through a method without a public name, of Newton 1.8."""
+    assert importlib.metadata.version("newton").startswith("1.8."), "look again at warp_bsc/response/speed_limit.py"
+    assert callable(newton.solvers.SolverVBD._penetration_free_truncation)
+
+
+def test_friction_holds_and_slides_as_without_coupling(device):
+    """Cloth on a ramp slides as a rigid body would, without friction and with it."""
+    angle, time = np.radians(20.0), 0.25
+    tilt = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), float(angle))
+    up, down = np.array([np.sin(angle), 0.0, np.cos(angle)]), np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    for friction in (0.0, 0.2, 0.6):
+        builder = newton.ModelBuilder()
+        material = newton.ModelBuilder.ShapeConfig(mu=friction)
+        pose = wp.transform(wp.vec3(), tilt)
+        builder.add_shape_box(-1, xform=pose, hx=2.0, hy=1.0, hz=0.1, cfg=material)
+        cells = {"dim_x": 4, "dim_y": 4, "cell_x": 0.04, "cell_y": 0.04, "mass": 0.001}
+        builder.add_cloth_grid(pos=wp.vec3(*(0.1003 * up - down)), rot=tilt, vel=wp.vec3(), **cells, **STIFF)
+        builder.color()
+        model = builder.finalize(device=device)
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=friction, substeps=4))
+        start = rollout.positions.mean(axis=0)
+        for _ in range(round(time / DT)):
+            rollout.states[0].clear_forces()
+            rollout.solver.step(*rollout.states, rollout.control, None, DT)
+            rollout.states = rollout.states[::-1]
+        slid = (rollout.positions.mean(axis=0) - start) @ down
+        expected = 0.5 * 9.81 * max(0.0, np.sin(angle) - friction * np.cos(angle)) * time**2
+        assert abs(slid - expected) < 0.03 * expected + 1.5e-3

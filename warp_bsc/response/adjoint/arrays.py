@@ -1,0 +1,55 @@
+"""Copies of arrays of structs, and launches of the adjoints of kernels."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+
+def copy_arrays(struct, into, lengths):
+    """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
+    for name, length in lengths.items():
+        array = getattr(struct, name)
+        if length == 0:  # Warp makes no empty slices
+            setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))
+        else:
+            setattr(into, name, wp.clone(array if length is None else array[:length]))
+    return into
+
+
+def attach_gradients(struct, names, gradients=None):
+    """Replaces arrays of a struct by aliases with gradients, given or new ones; returns the gradients by name."""
+    into = SimpleNamespace(**(gradients or {}))
+    for name in names:
+        array = getattr(struct, name)
+        if not hasattr(into, name):
+            setattr(into, name, wp.zeros_like(array, requires_grad=False))
+        if len(array):
+            alias = array[:]
+            alias.grad = getattr(into, name)
+            setattr(struct, name, alias)
+    return into
+
+
+@functools.cache
+def _empty(struct_type):
+    """Returns a struct without arrays, in place of the gradient of one, whose arrays have gradients of their own."""
+    return struct_type()
+
+
+def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
+    """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
+
+    The adjoint does not read or write outputs, so their gradients may stand in for them, except for outputs that
+    functions add to.
+    """
+    wp.launch(
+        kernel,
+        dim,
+        inputs=inputs,
+        outputs=outputs,
+        adj_inputs=[_empty(value._cls) if hasattr(value, "_cls") else None for value in inputs],
+        adj_outputs=of_outputs,
+        adjoint=True,
+        device=device,
+    )

@@ -1,0 +1,1 @@
+"""What the stage has to know of Newton and Warp beyond their public interfaces."""

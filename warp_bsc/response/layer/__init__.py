@@ -1,0 +1,1 @@
+"""A layer around surfaces in which contacts push gradually."""

@@ -1,0 +1,335 @@
+"""A solver around another one that pushes gradually in a layer around all surfaces, so that results are continuous.
+
+A contact that acts where it hits makes trajectories jump: whether a hit falls into this step or the next decides which
+velocities the inner solver sees in the next. In the layer a contact is a spring with a damper instead. It acts at the
+positions y = x1 + theta (x0 - x1) between start and end of the step, and removes the share kappa of the depth of its
+pair in the layer at y; velocities change by as much over the length of the step. Alone, such a depth obeys a linear
+recurrence, with kappa and theta such that its roots are rho exp(+-i pi / 4): four steps after it came in, the pair
+leaves with rho^4 of its speed, which is the restitution, whatever the speed and whatever part of a step it came in at.
+
+Contacts of one vertex divide its mass among them, by the squares of their depths (mass splitting, Tonge et al. 2012):
+one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
+little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide
+fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable.
+"""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from ..._arguments import checked_distance, checked_number
+from ..._one_thread import one_at_a_time
+from ...detection.host_function import run_on_host
+from ...detection.launch import retry_until_fits
+from ...detection.pipeline import DetectionPipeline
+from ...detection.settings import Count
+from ..adjoint.arrays import attach_gradients, launch_adjoint
+from ..integration.tape import paused_tape
+from ..integration.wrapped_solver import StateArrays, WrappedSolver
+from ..options import StageOptions, friction_of, particle_edge_lengths
+from ..state.mesh import ModelMesh
+from ..state.motion import ModelMotion
+from ..state.planes import MovingPlanes
+from ..state.structs import Motion
+from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
+from .kernels import (
+    Layer,
+    Pairs,
+    add_pushes,
+    add_pushes_of_planes,
+    add_shares,
+    add_shares_of_planes,
+    begin_backward,
+    finish_backward,
+    finish_shares,
+    move_particles,
+    place_vertices_between,
+    sum_pushes,
+    sum_shares,
+)
+
+
+@dataclass(frozen=True)
+class _PushedStep:
+    """What the adjoint needs of a step.
+
+    Attributes:
+        motion: The predicted motion.
+        planes: The planes.
+        pairs: The pairs that may be in the layer, of each kind.
+        shares: The sums of the weights of the contacts of each vertex.
+        dt: Length of the step [s].
+    """
+
+    motion: Motion
+    planes: MovingPlanes
+    pairs: list[Pairs]
+    shares: wp.array
+    dt: float
+
+
+class ContactLayer(WrappedSolver):
+    """Lets another solver step, then pushes what has come into a layer around all surfaces.
+
+    Behind it, ``SolverCCD(ContactLayer(solver))``, the stage resolves what the layer leaves: pairs that passed each
+    other since the start of the step, and contacts with dynamic bodies that the inner solver integrates. With the layer
+    results are continuous in the inputs, and gradients hold where contacts come and go. Pushes conserve linear
+    momentum, but angular momentum only to the first order of the step, as they act along directions at y (see above).
+
+    Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps.
+
+    Limitations:
+        Only contacts within one step are seen: what a program moves between steps is passed on to the stage. On a tape,
+        a layer carries no gradients to poses of bodies: a step raises NotImplementedError if shapes move with bodies.
+
+    References:
+        R. Tonge, F. Benevolenski and A. Voroshilov, Mass Splitting for Jitter-Free Parallel Rigid Body Simulation, ACM
+        Transactions on Graphics 31(4), 2012, doi:10.1145/2185520.2185601.
+
+    Attributes:
+        solver: The inner solver.
+        mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
+        thickness: Thickness of the layer [m].
+        friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
+        restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
+    """
+
+    def __init__(
+        self,
+        solver: SolverBase,
+        *,
+        thickness: float | None = None,
+        friction: float | wp.array[float] | None = None,
+        restitution: float | wp.array[float] | None = None,
+        min_distance: float | None = None,
+        particle_radius: float | np.ndarray | wp.array | None = None,
+    ):
+        """Puts the layer around a solver.
+
+        Args:
+            solver: Any Newton solver that moves particles.
+            thickness: Thickness of the layer [m], above the minimum distances. It should be more than the longest path
+                of a step, and less than half of the shortest edge, as neighbours beyond the next push each other as
+                well. Default: a quarter of the median edge length, at most 0.45 of the shortest.
+            friction: As for :class:`.solver_ccd.SolverCCD`.
+            restitution: As for :class:`.solver_ccd.SolverCCD`.
+            min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
+            particle_radius: As for :class:`.solver_ccd.SolverCCD`.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If a number, or the friction of a shape that collides with particles, is out of range.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
+        """
+        super().__init__(solver)
+        options = StageOptions.of(
+            self.model,
+            friction=friction,
+            restitution=restitution,
+            min_distance=min_distance,
+            particle_radius=particle_radius,
+        )
+        self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
+        self.friction, self.restitution, self._reads_friction = (
+            options.friction,
+            options.restitution,
+            options.reads_friction,
+        )
+        if thickness is None:
+            lengths = particle_edge_lengths(mesh)
+            shares = np.array(LAYER_THICKNESS) * ((np.median(lengths), lengths.min()) if len(lengths) else (1.0, 1.0))
+            thickness = float(shares.min())
+        self.thickness = checked_distance(thickness, "thickness", zero=False)
+        moves_bodies = options.moves_bodies(mesh, solver)
+        self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
+        self._layer = layer = Layer()
+        layer.thickness, layer.restitution = self.thickness, self.restitution
+        layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
+        device = mesh.device
+        pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
+        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
+        n = mesh.vertex_count
+        self._y = wp.zeros(n, dtype=wp.vec3, device=device)
+        self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
+        self._shares = wp.zeros(n, dtype=wp.float64, device=device)
+        self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
+        self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
+        self._motion.set_start(self.model.particle_q, self.model.body_q)
+        self._set_end(self.model, 1.0)
+        self._detect()  # allocates buffers, which a CUDA graph cannot
+
+    @property
+    def skipped_steps(self) -> int:
+        """Steps so far in which the layer pushed nothing, because a queue of a CUDA graph was too small.
+
+        Contacts then act where they hit, and results are not continuous. Synchronizes with the device.
+        """
+        return int(self.skipped.numpy()[0])
+
+    @one_at_a_time
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        **options,
+    ) -> None:
+        """Steps the inner solver, and pushes particles that have come into the layer.
+
+        Args:
+            state_in: The state at the start; the inner solver may change it.
+            state_out: The state at the end. May be the same, except on a tape.
+            control: As for the inner solver.
+            contacts: As for the inner solver.
+            dt: Length of the step [s], more than 0.
+            options: As for the inner solver.
+
+        Raises:
+            TypeError: If ``dt`` is no number.
+            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients, and ``state_out`` is
+                ``state_in``.
+            NotImplementedError: If a tape records gradients, and shapes move with bodies.
+            RuntimeError: If another thread is using this layer.
+        """
+        checked_number(dt, "dt", 0.0, above=True)
+        with paused_tape() as tape:
+            if tape is not None and self.model.requires_grad:
+                if state_in is state_out:
+                    raise ValueError("on a tape, state_out must not be state_in")
+                if self.mesh.has_shapes_on_bodies:
+                    raise NotImplementedError(
+                        "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
+                    )
+            self._motion.set_start(state_in.particle_q, state_in.body_q)
+        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        with paused_tape() as tape:
+            end, device = StateArrays.of(state_out), self.mesh.device
+            if end.particle_q is None:
+                return
+            if tape is None or not end.particle_q.requires_grad:
+                run_on_host(lambda: self._push(end, dt), device)
+                return
+            arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
+            read = [self._motion.friction.of_particles, self._motion.friction.of_shapes, self.restitution]
+            read = [a for a in [*read, self.model.particle_inv_mass] if a is not None and len(a) and a.requires_grad]
+            pushed: _PushedStep | None = None
+
+            def forward():
+                nonlocal pushed
+                pushed = self._push(end, dt, record=True)
+
+            def backward():
+                with self._lock:
+                    self._backward(pushed, *(array.grad for array in arrays))
+
+            run_on_host(forward, device)
+            tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+
+    def _set_end(self, end, dt):
+        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
+
+    def _detect(self):
+        """Finds the pairs that may be in the layer."""
+        detector = self._detector
+        self._launch(place_vertices_between, len(self._y), [self._motion.vertices, self._layer, self._y])
+        retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self.mesh.device)
+
+    @one_at_a_time
+    def _push(self, end, dt, *, record=False):
+        """Changes the end of a step by the pushes of contacts; returns what the adjoint needs if that is recorded."""
+        if self._reads_friction:
+            self._motion.friction.read()
+        self._set_end(end, dt)
+        self._detect()
+        motion, planes, layer, detector = self._motion.vertices, self._motion.planes, self._layer, self._detector
+        pairs = [self._pairs_of(narrow_phase) for narrow_phase in detector.narrow_phases]
+        for of_kind in pairs:
+            self._launch_over(sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
+        inputs = [motion, planes, layer, detector.counters.array, detector.capacities]
+        self._launch(finish_shares, len(motion.x1), [*inputs, self._share_sums, self._shares, self.skipped])
+        for of_kind in pairs:
+            self._launch_over(sum_pushes, of_kind, [motion, layer, of_kind, self._shares, self._sums])
+        step = self._recorded(pairs, dt) if record else None
+        inputs = [motion, planes, layer, self._shares, dt, self._sums]
+        self._launch(move_particles, len(end.particle_q), [*inputs, end.particle_q, end.particle_qd])
+        return step
+
+    def _backward(self, step, start_q, particle_q, particle_qd):
+        """Turns gradients with respect to a pushed state into those with respect to the predicted one, in place.
+
+        Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
+        from, and of restitution, where these have such arrays.
+        """
+        motion, planes, layer, device = step.motion, step.planes, self._layer, self.mesh.device
+        n, particles = len(motion.x0), len(particle_q)
+        of_changes, changes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
+        self._launch(begin_backward, particles, [motion.is_not_finite, step.dt, particle_q, particle_qd, of_changes])
+        of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
+        of_planes = attach_gradients(planes, ("friction",))
+        shares = step.shares[:]
+        shares.grad = of_shares = wp.zeros(n, dtype=wp.float64, device=device)
+        sums = wp.zeros(n, dtype=wp.float64, device=device)
+        over_planes = (particles, len(planes.end))
+        for of_kind in step.pairs:
+            inputs = [motion, layer, of_kind, shares]
+            launch_adjoint(add_pushes, len(of_kind.pairs), inputs, [changes], [of_changes], device)
+        inputs = [motion, planes, layer, shares]
+        launch_adjoint(add_pushes_of_planes, over_planes, inputs, [changes], [of_changes], device)
+        for of_kind in step.pairs:
+            inputs = [motion, layer, of_kind]
+            launch_adjoint(add_shares, len(of_kind.pairs), inputs, [sums], [of_shares], device)
+        launch_adjoint(add_shares_of_planes, over_planes, [motion, planes, layer], [sums], [of_shares], device)
+        inverse_mass = self.model.particle_inv_mass
+        assert inverse_mass is not None
+        inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
+        self._launch(finish_backward, particles, [*inputs, start_q, particle_q, inverse_mass.grad])
+        self._motion.friction.backward(of_motion.friction, of_planes.friction)
+
+    def _recorded(self, pairs, dt):
+        """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
+        copies = []
+        for of_kind in pairs:
+            copy = Pairs()
+            copy.kind, copy.elements = of_kind.kind, of_kind.elements
+            count = len(of_kind.pairs)
+            if not self.mesh.device.is_capturing:
+                count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+            if count:
+                copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
+                copies.append(copy)
+        motion, planes = Motion(), MovingPlanes()
+        for name in ("x0", "x1", "is_not_finite", "friction"):
+            setattr(motion, name, wp.clone(getattr(self._motion.vertices, name)))
+        for name in ("inverse_mass", "world"):
+            setattr(motion, name, getattr(self._motion.vertices, name))
+        for name in MovingPlanes.vars:
+            array = getattr(self._motion.planes, name)
+            setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
+        return _PushedStep(motion, planes, copies, wp.clone(self._shares), dt)
+
+    def _pairs_of(self, narrow_phase):
+        pairs = Pairs()
+        pairs.kind, pairs.elements = int(narrow_phase.kind), self.mesh.device_elements(narrow_phase.kind)
+        pairs.pairs, pairs.counts = narrow_phase.contacts.pairs, narrow_phase.counts
+        return pairs
+
+    def _launch(self, kernel, size, inputs):
+        wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
+
+    def _launch_over(self, kernel, of_kind, inputs):
+        """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
+        count = len(of_kind.pairs)
+        if self.mesh.device.is_cpu:
+            count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+        self._launch(kernel, count, inputs)
+
+    @one_at_a_time
+    def notify_model_changed(self, flags: int) -> None:
+        """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
+        super().notify_model_changed(flags)
+        self.mesh.refresh_inverse_masses()

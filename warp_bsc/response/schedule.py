@@ -1,0 +1,289 @@
+"""When a world projects, divides, truncates and freezes: all limits, the predicates on them, and the solve status.
+
+What a world does after the ``n``-th detection of a step, ``MAX_ITERATIONS`` being 40 and ``MAX_DIVISIONS`` 32::
+
+                     slow contacts only              a fast, pushing or body contact
+    n = 0            project                         project
+    n = 1 .. 39      divide (recorded: project)      project, target widened 1.25 times each n, at most 5 times
+    n = 40 .. 71     divide (recorded: truncate, n = 40 .. 47)                       the same in both columns
+    then             freeze what still collides
+
+A step ends when a detection finds nothing to do, or when freezing changes nothing more. It ends, as vertices that stood
+apart at the start and stand still do not collide. The step is certified if its last detection was complete and found no
+contact, see :func:`decide`. A detection whose queues are too small takes all worlds to the third row, where
+:mod:`.contacts.search` finds contacts without queues; where it cannot (a recorded step in a CUDA graph), all is frozen.
+
+Excluded from all this are contacts of which no vertex can be moved, of elements that crossed or touched at the start of
+the step, and of vertices that began in the solid of a plane, see :func:`.contacts.rules.classify_contact`.
+"""
+
+import warp as wp
+
+from .state.structs import Constraints
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_ITERATIONS = 40
+"""Iterations of detect and project, after which vertices that still collide are divided."""
+MAX_SLOW_ITERATIONS = 1
+"""The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
+MAX_DIVISIONS = 32
+"""Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
+MAX_TRUNCATIONS = wp.constant(8)
+"""Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
+MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
+"""Sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one active
+set, after which the device checks whether a constraint is still active."""
+SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 16, 12
+"""Sweeps over constraints that move no body in worlds without fast contacts: division resolves what they leave."""
+MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
+"""Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""
+_WIDENING = wp.constant(wp.float64(1.25))
+"""Factor by which the separation of new constraints grows with each iteration, so that jams are resolved."""
+_WIDEST = wp.constant(wp.float64(5.0))
+"""Largest factor on the separation."""
+
+
+@wp.struct
+class LoopControl:
+    """What the conditions of the loop over iterations read; each field is an array of one element."""
+
+    active: wp.array[int]  # 1 while another iteration is needed
+    unfinished: wp.array[int]  # 1 if the first detection leaves something to do
+    iteration: wp.array[int]  # detections so far, less one; from max_iterations on, all worlds divide
+    projecting: wp.array[int]  # 1 if the last detection added constraints
+    newly_frozen: wp.array[int]  # vertices and bodies that this iteration froze
+    recount: wp.array[int]  # 1 if crossings may have changed since they were counted
+    more_sweeps: wp.array[int]  # 1 while another batch of sweeps is needed
+    sweep: wp.array[int]  # sweeps so far
+
+
+@wp.struct
+class DetectionCounts:
+    """Counters of the detection in progress; each field is an array of one element."""
+
+    hits: wp.array[int]  # contacts
+    excluded: wp.array[int]  # contacts of elements that crossed or touched at the start
+    of_bodies: wp.array[int]  # contacts between bodies, which are left to the inner solver
+    too_near: wp.array[int]  # 1 if a pair ends nearer than its separation, but not in contact
+
+
+@wp.struct
+class StepResults:
+    """Results of a step; each field is an array of one element."""
+
+    certified: wp.array[int]  # 1 if the last detection was complete and found no contact
+    undetected: wp.array[int]  # 1 if the last detection was incomplete
+    counted: wp.array[int]  # 1 once all contacts of the predicted motion are counted
+    first_hits: wp.array[int]  # contacts of the predicted motion
+    remaining: wp.array[int]  # contacts that the last detection found
+    excluded: wp.array[int]  # contacts that the last detection found and excluded
+    body_contacts: wp.array[int]  # contacts between bodies that the last detection found
+    crossings: wp.array[int]  # edges that cross faces at the start
+    iterations: wp.array[int]  # of detect and project or divide
+    truncated: wp.array[int]  # 1 if a path was cut
+    frozen: wp.array[int]  # 1 if a vertex or a body was frozen
+    not_finite: wp.array[int]  # particles whose predicted position or velocity was not finite
+
+
+@wp.struct
+class SolveStatus:
+    """How far a step is, and its limits."""
+
+    loop: LoopControl
+    detection: DetectionCounts
+    results: StepResults
+    contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
+    is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
+    max_iterations: int
+    max_slow_iterations: int
+    max_truncations: int  # or divisions
+    slow_position_sweeps: int
+    slow_velocity_sweeps: int
+
+
+def views_of(struct_type: type, values: wp.array):
+    """Returns a struct whose fields, in their order, are views of one element each of an array."""
+    struct = struct_type()
+    for i, name in enumerate(struct_type.vars):
+        setattr(struct, name, values[i : i + 1])
+    return struct
+
+
+def allocate_status(
+    worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool
+) -> tuple[SolveStatus, list[wp.array]]:
+    """Returns a cleared status, and the arrays that its parts are views of.
+
+    Args:
+        worlds: Number of worlds.
+        device: The device.
+        max_iterations: Iterations of detect and project.
+        recorded: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided.
+    """
+    status, values = SolveStatus(), []
+    for name, struct_type in (("loop", LoopControl), ("detection", DetectionCounts), ("results", StepResults)):
+        values.append(wp.zeros(len(struct_type.vars), dtype=int, device=device))
+        setattr(status, name, views_of(struct_type, values[-1]))
+    for name in ("contact_iteration", "is_fast"):
+        setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
+    status.max_iterations = max_iterations
+    status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
+    status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
+    status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
+    status.slow_velocity_sweeps = int(MAX_SWEEPS) if recorded else SLOW_VELOCITY_SWEEPS
+    return status, values
+
+
+@wp.func
+def clear_status(status: SolveStatus):
+    """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
+    status.loop.active[0] = 0
+    status.loop.unfinished[0] = 0
+    status.loop.iteration[0] = 0
+    status.loop.projecting[0] = 0
+    status.loop.newly_frozen[0] = 0
+    status.detection.hits[0] = 0
+    status.detection.excluded[0] = 0
+    status.detection.of_bodies[0] = 0
+    status.detection.too_near[0] = 0
+    status.results.certified[0] = 0
+    status.results.undetected[0] = 0
+    status.results.counted[0] = 0
+    status.results.first_hits[0] = 0
+    status.results.remaining[0] = 0
+    status.results.excluded[0] = 0
+    status.results.body_contacts[0] = 0
+    status.results.iterations[0] = 0
+    status.results.truncated[0] = 0
+    status.results.frozen[0] = 0
+    status.results.not_finite[0] = 0
+
+
+@wp.func
+def is_dividing(status: SolveStatus, world: int, iteration: int) -> bool:
+    """Returns whether contacts found after ``iteration`` iterations are divided, or truncated, and not projected."""
+    if iteration >= status.max_iterations:
+        return True
+    return iteration >= status.max_slow_iterations and status.is_fast[world] == 0
+
+
+@wp.func
+def divides_all_proximities(status: SolveStatus) -> bool:
+    """Returns whether all proximities are divided in this iteration, also where that stops what moves together."""
+    return status.loop.iteration[0] - 1 == status.max_slow_iterations
+
+
+@wp.func
+def divides_proximities(status: SolveStatus, world: int) -> bool:
+    """Returns whether proximities of a world without fast contacts are divided in this iteration, as contacts are.
+
+    Those at rest are divided after the last projection, and all of them in the next iteration, if contacts are left.
+    """
+    last = status.loop.iteration[0] - 1
+    if status.contact_iteration[world] != last or status.is_fast[world] == 1:
+        return False
+    return last == status.max_slow_iterations - 1 or divides_all_proximities(status)
+
+
+@wp.func
+def is_projecting(status: SolveStatus, world: int) -> bool:
+    """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
+    iteration = status.loop.iteration[0]
+    return status.contact_iteration[world] == iteration - 1 and not is_dividing(status, world, iteration - 1)
+
+
+@wp.func
+def is_freezing(status: SolveStatus) -> bool:
+    """Returns whether this iteration freezes what still collides."""
+    return status.loop.iteration[0] > status.max_iterations + status.max_truncations
+
+
+@wp.func
+def is_reversible(status: SolveStatus, is_slow: bool) -> bool:
+    """Returns whether a constraint may pull back what it pushed too far, which keeps vertices near the prediction.
+
+    Constraints of fast elements only push after the first iteration, which leaves space where contacts come back.
+    """
+    return status.loop.iteration[0] == 1 or is_slow
+
+
+@wp.func
+def widened(separation: wp.float64, status: SolveStatus) -> wp.float64:
+    """Returns the separation of constraints that are added in this iteration [m]."""
+    return separation * wp.min(wp.pow(_WIDENING, wp.float64(status.loop.iteration[0])), _WIDEST)
+
+
+@wp.func
+def count_contact(status: SolveStatus, world: int):
+    """Counts a contact that a detection found."""
+    wp.atomic_add(status.detection.hits, 0, 1)
+    status.contact_iteration[world] = status.loop.iteration[0]
+
+
+@wp.func
+def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
+    """Returns whether a queue of the detector was too small for a detection."""
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
+        if counts[i] > capacities[i]:
+            return True
+    return False
+
+
+@wp.kernel
+def decide(
+    # in
+    constraints: Constraints,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    can_search: bool,
+    # in and out
+    status: SolveStatus,
+):
+    """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
+
+    If a queue overflowed, the detection is incomplete. With ``can_search`` it is to be completed by
+    :mod:`.contacts.search`, and decided upon by another launch.
+    """
+    loop = status.loop
+    detection = status.detection
+    results = status.results
+    overflowed = has_overflowed(counts, capacities)
+    if can_search and overflowed and results.undetected[0] == 0:
+        results.undetected[0] = 1
+        detection.too_near[0] = 0
+        detection.hits[0] = 0
+        detection.excluded[0] = 0
+        detection.of_bodies[0] = 0
+        loop.iteration[0] = wp.max(loop.iteration[0], status.max_iterations)
+        return
+    overflowed = overflowed and not can_search
+    hits = detection.hits[0]
+    finished = hits == 0 and detection.too_near[0] == 0
+    stuck = is_freezing(status) and loop.newly_frozen[0] == 0
+    results.remaining[0] = hits
+    results.excluded[0] = detection.excluded[0]
+    results.body_contacts[0] = detection.of_bodies[0]
+    detection.too_near[0] = 0
+    detection.hits[0] = 0
+    detection.excluded[0] = 0
+    detection.of_bodies[0] = 0
+    loop.newly_frozen[0] = 0
+    if results.counted[0] == 0:
+        results.first_hits[0] = results.first_hits[0] + hits
+        results.counted[0] = 1
+    results.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
+    results.undetected[0] = wp.where(overflowed, 1, 0)
+    loop.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
+    loop.iteration[0] = loop.iteration[0] + loop.active[0]
+    results.iterations[0] = results.iterations[0] + loop.active[0]
+    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
+
+
+@wp.kernel
+def start_sweeps(status: SolveStatus):
+    """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
+    loop = status.loop
+    loop.sweep[0] = 0
+    loop.more_sweeps[0] = wp.where(loop.active[0] == 0 or loop.projecting[0] == 1, 1, 0)
+    loop.projecting[0] = 0

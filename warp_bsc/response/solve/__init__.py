@@ -1,0 +1,1 @@
+"""Solves constraints: positions, velocities, bodies, dividing planes and truncation."""

@@ -1,0 +1,310 @@
+"""Angular momentum: a rigid turn of all that collided removes what the position multipliers added to it.
+
+Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from ..state.fixed_sum import with_delta
+from ..state.poses import centre_of, inertia_at
+from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Constraints, Motion, Vertices, has_final_velocity
+from ..state.vectors import ONE, ZERO, relative, to_double, to_single
+from ..state.workspace import Workspace
+from ..tuning import MAX_TURN
+
+wp.set_module_options({"enable_backward": False})
+
+
+Moments = wp.types.vector(length=11, dtype=wp.float64)
+
+_Torque = wp.types.vector(length=3, dtype=wp.int64)
+
+_Sums = wp.types.vector(length=14, dtype=wp.int64)
+
+_UNITS = wp.constant(wp.float64(2.0**32))
+"""Units in one kg, m and s; sums are of integers in these units, so that they are the same in any order."""
+
+
+@wp.func
+def _units(x: wp.float64) -> wp.int64:
+    return wp.int64(wp.rint(_UNITS * x))
+
+
+@wp.func
+def _add(sums: wp.array2d[wp.int64], world: int, added: Any):
+    """Adds what a thread has summed to the sums of a world."""
+    for i in range(len(added)):
+        if added[i] != wp.int64(0):
+            wp.atomic_add(sums, world, i, added[i])
+
+
+@wp.func
+def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+    """Returns whether a vertex collided, and is free to turn by itself."""
+    outcome = vertices.outcome[vertex]
+    return motion.inverse_mass[vertex] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
+
+
+@wp.func
+def body_turns(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Returns whether a body collided, and is free to turn."""
+    outcome = vertices.bodies.outcome[body]
+    return motion.bodies.inverse_mass[body] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
+
+
+@wp.func
+def torque_of(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+    """Returns the change of angular momentum by a contact between free vertices and bodies [kg m^2/s].
+
+    Position changes across the motion change it, and so do impulses at points that slid apart since the contact. For
+    the position changes of bodies, see :func:`sum_body_moments`.
+    """
+    weights = constraints.weights[i]
+    corners = constraints.vertices[i]
+    moving = wp.vec4d(weights)
+    if motion.bodies.of_vertex:
+        for j in range(4):
+            if motion.bodies.of_vertex[corners[j]] >= 0:
+                moving[j] = ZERO
+    of_positions = wp.cross(constraints.position_multiplier[i], relative(moving, corners, motion.velocity))
+    return of_positions + wp.cross(relative(weights, corners, vertices.x1), constraints.velocity_multiplier[i])
+
+
+@wp.func
+def acts(constraints: Constraints, i: int) -> bool:
+    """Returns whether a constraint moved anything."""
+    position, velocity = constraints.position_multiplier[i], constraints.velocity_multiplier[i]
+    return wp.length_sq(position) + wp.length_sq(velocity) > ZERO
+
+
+@wp.func
+def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> bool:
+    """Returns whether a contact is with something that is not free."""
+    corners = constraints.vertices[i]
+    held = corners[0] == corners[1]  # on a plane
+    for j in range(4):
+        free = turns(motion, vertices, corners[j])
+        if motion.bodies.of_vertex:
+            body = motion.bodies.of_vertex[corners[j]]
+            if body >= 0:
+                free = body_turns(motion, vertices, body)
+        held = held or (constraints.weights[i][j] != ZERO and not free)
+    return held
+
+
+@wp.kernel
+def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, threads: int, sums: wp.array2d[wp.int64]):
+    """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
+
+    For one contact they cancel; for many at once, which share vertices, they need not. Each of ``threads`` threads sums
+    several contacts before it adds to the sums of their world, which all threads share.
+    """
+    world = int(0)
+    added = _Torque()
+    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
+        own = motion.world[constraints.vertices[i][0]]
+        if own != world:
+            _add(sums, world, added)
+            added = _Torque()
+            world = own
+        if sums[world, HELD] == wp.int64(0) and acts(constraints, i):
+            if is_held(motion, vertices, constraints, i):
+                sums[world, HELD] = wp.int64(1)
+            else:
+                torque = torque_of(motion, vertices, constraints, i)
+                for axis in range(3):
+                    added[axis] += _units(torque[axis])
+    _add(sums, world, added)
+
+
+@wp.func
+def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
+    """Returns what a vertex adds to the sums of its world, from :data:`MASS` on."""
+    mass = ONE / wp.float64(motion.inverse_mass[vertex])
+    x = to_double(vertices.x1[vertex])
+    change = to_double(vertices.velocity[vertex]) - to_double(motion.velocity[vertex])
+    return Moments(
+        mass,
+        mass * x[0],
+        mass * x[1],
+        mass * x[2],
+        mass * x[0] * x[0],
+        mass * x[1] * x[1],
+        mass * x[2] * x[2],
+        mass * x[1] * x[2],
+        mass * x[2] * x[0],
+        mass * x[0] * x[1],
+        mass * wp.dot(change, change),
+    )
+
+
+@wp.kernel
+def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the vertices that collided, and the torques of those that were divided.
+
+    Threads are as in :func:`sum_torques`.
+    """
+    world = int(0)
+    added = _Sums()
+    for vertex in range(wp.tid(), particles, threads):
+        own = motion.world[vertex]
+        if own != world:
+            _add(sums, world, added)
+            added = _Sums()
+            world = own
+        if turns(motion, vertices, vertex) and sums[world, HELD] == wp.int64(0):
+            moment = moments(motion, vertices, vertex)
+            for i in range(MOMENTS):
+                added[MASS + i] += _units(moment[i])
+            if vertices.outcome[vertex] & DIVIDED != 0:
+                projected = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+                moved = to_double(vertices.x1[vertex]) - to_double(projected)
+                torque = moment[0] * wp.cross(moved, to_double(motion.velocity[vertex]))
+                for axis in range(3):
+                    added[axis] += _units(torque[axis])
+    _add(sums, world, added)
+
+
+@wp.func
+def body_moments(motion: Motion, vertices: Vertices, body: int):
+    """Returns the torque by the change of the pose of a body, and what the body adds to the moments of its world."""
+    mass = wp.float64(motion.bodies.mass[body])
+    x = vertices.bodies.centre[body]
+    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
+    half = wp.float64(0.5) * wp.trace(inertia)  # the second moments are half - inertia, without products
+    predicted = motion.bodies.velocity[body]
+    linear = to_double(wp.spatial_top(predicted))
+    angular = to_double(wp.spatial_bottom(predicted))
+    change = to_double(wp.spatial_top(vertices.bodies.velocity[body])) - linear
+    turn = to_double(wp.spatial_bottom(vertices.bodies.velocity[body])) - angular
+    moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
+    torque = mass * wp.cross(moved, linear)
+    torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
+    total = Moments(
+        mass,
+        mass * x[0],
+        mass * x[1],
+        mass * x[2],
+        mass * x[0] * x[0] + half - inertia[0, 0],
+        mass * x[1] * x[1] + half - inertia[1, 1],
+        mass * x[2] * x[2] + half - inertia[2, 2],
+        mass * x[1] * x[2] - inertia[1, 2],
+        mass * x[2] * x[0] - inertia[2, 0],
+        mass * x[0] * x[1] - inertia[0, 1],
+        mass * wp.length_sq(change) + wp.dot(turn, inertia * turn),
+    )
+    return torque, total
+
+
+@wp.kernel
+def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Sums the moments of the bodies that collided, and the torques by changes of their poses."""
+    body = wp.tid()
+    world = wp.max(motion.bodies.world[body], 0)
+    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+        return
+    torque, total = body_moments(motion, vertices, body)
+    added = _Sums()
+    for axis in range(3):
+        added[axis] = _units(torque[axis])
+    for i in range(MOMENTS):
+        added[MASS + i] = _units(total[i])
+    _add(sums, world, added)
+
+
+@wp.func
+def _turn_of(torque: wp.vec3d, total: Moments):
+    """Returns the turn of a world that removes a torque [rad/s], and the point that it is about."""
+    square = total[10]
+    if wp.dot(torque, torque) == ZERO or square <= ZERO:
+        return wp.vec3d(), wp.vec3d()
+    mass = total[0]
+    centre = wp.vec3d(total[1], total[2], total[3]) / mass
+    squares = wp.vec3d(total[4], total[5], total[6]) - mass * wp.cw_mul(centre, centre)
+    products = wp.vec3d(
+        total[7] - mass * centre[1] * centre[2],
+        total[8] - mass * centre[2] * centre[0],
+        total[9] - mass * centre[0] * centre[1],
+    )
+    inertia = wp.mat33d(
+        squares[1] + squares[2],
+        -products[2],
+        -products[1],
+        -products[2],
+        squares[0] + squares[2],
+        -products[0],
+        -products[1],
+        -products[0],
+        squares[0] + squares[1],
+    )
+    if wp.determinant(inertia) <= ZERO:
+        return wp.vec3d(), wp.vec3d()
+    turn = -wp.inverse(inertia) * torque
+    most = MAX_TURN * wp.sqrt(square / wp.max(wp.dot(turn, inertia * turn), wp.float64(1e-300)))
+    return wp.min(most, ONE) * turn, centre
+
+
+@wp.func
+def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
+    """Returns the change of velocity at ``x`` by a rigid turn of a world that removes a torque [m/s]."""
+    turn, centre = _turn_of(torque, total)
+    return wp.cross(turn, x - centre)
+
+
+@wp.func
+def body_change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
+    """Returns the changes of the linear and angular velocity of a body with its centre of mass at ``x``."""
+    turn, centre = _turn_of(torque, total)
+    return wp.cross(turn, x - centre), turn
+
+
+@wp.func
+def _totals(sums: wp.array2d[wp.int64], world: int):
+    """Returns the torque on a world and its moments."""
+    torque = wp.vec3d()
+    for axis in range(3):
+        torque[axis] = wp.float64(sums[world, axis]) / _UNITS
+    total = Moments()
+    for i in range(MOMENTS):
+        total[i] = wp.float64(sums[world, MASS + i]) / _UNITS
+    return torque, total
+
+
+@wp.kernel
+def turn_vertices(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Turns the vertices that collided in each world, which removes the torque that contacts added."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if not turns(motion, vertices, vertex) or sums[world, HELD] != wp.int64(0):
+        return
+    torque, total = _totals(sums, world)
+    change = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
+    vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)
+
+
+@wp.kernel
+def turn_bodies(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+    """Turns the bodies that collided as :func:`turn_vertices` does the vertices of their world."""
+    body = wp.tid()
+    world = wp.max(motion.bodies.world[body], 0)
+    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+        return
+    torque, total = _totals(sums, world)
+    change, turn = body_change_by_turn(torque, total, vertices.bodies.centre[body])
+    velocity = vertices.bodies.velocity[body]
+    linear = to_double(wp.spatial_top(velocity)) + change
+    angular = to_double(wp.spatial_bottom(velocity)) + turn
+    vertices.bodies.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
+
+
+def restore_angular_momentum(work: Workspace) -> None:
+    """Turns all that collided in each world where nothing is held, which removes the torque that contacts added."""
+    inputs, threads = [work.motion.vertices, work.vertices], work.summing_threads
+    work.turn.zero_()
+    for kernel, arguments in ((sum_torques, [work.constraints]), (sum_moments, [work.particle_count])):
+        work.launch(kernel, threads, [*inputs, *arguments, threads, work.turn])
+    work.launch_over_bodies(sum_body_moments, work.turn)
+    work.launch_over_particles(turn_vertices, [*inputs, work.turn])
+    work.launch_over_bodies(turn_bodies, work.turn)

@@ -1,0 +1,232 @@
+"""Rigid bodies: what constraints do to the pose and velocity of a body, whose vertices follow as one.
+
+A constraint acts on a body at the contact point: the inverse mass along a normal n is 1/m + (r x n) I^-1 (r x n), with
+the arm r from the centre of mass. Each constraint adds a change of the centre and a turn to the sums of its bodies, as
+it adds changes of positions to those of particles; a body then moves by its sums, and its vertices follow from the
+pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of a body is cut as one.
+"""
+
+import warp as wp
+
+from ..state.fixed_sum import _UNITS, sums_of
+from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
+from ..state.structs import NEVER, PROJECTED, Bodies, Constraints, Motion, MovedBodies, Vertices, has_final_velocity
+from ..state.vectors import ONE, ZERO, to_double, to_single
+
+wp.set_module_options({"enable_backward": False})
+
+WHOLE_PATH = wp.constant(wp.int64(2**30))
+"""The share of a path that is not cut, in units of TIME_UNITS."""
+
+FREEZES = wp.constant(wp.int64(-1))
+"""In place of a share: the body is frozen."""
+
+
+@wp.func
+def _body_of_side(motion: Motion, corners: wp.vec4i, side: int) -> int:
+    """Returns the body of the first or second element of a constraint, -1 if there is none; a plane is none."""
+    if side == 1 and corners[0] == corners[3]:
+        return -1
+    return motion.bodies.of_vertex[corners[3 * side]]
+
+
+@wp.func
+def _lever(motion: Motion, vertices: Vertices, constraints: Constraints, i: int, side: int, x: wp.array[wp.vec3]):
+    """Returns the lever of the first or second element of a constraint, at positions ``x`` of the vertices.
+
+    Returns:
+        The body, -1 if the side is no body that can be moved; the sum of the weights of its vertices, and the sum of
+        their arms by weight [m].
+    """
+    corners = constraints.vertices[i]
+    weights = constraints.weights[i]
+    body = _body_of_side(motion, corners, side)
+    if body >= 0 and motion.bodies.inverse_mass[body] == 0.0:
+        body = -1
+    weight = ZERO
+    arm = wp.vec3d()
+    if body >= 0:
+        for j in range(4):
+            if motion.bodies.of_vertex[corners[j]] == body:  # the other element is of another body
+                weight += weights[j]
+                arm += weights[j] * (to_double(x[corners[j]]) - vertices.bodies.centre[body])
+    return body, weight, arm
+
+
+@wp.func
+def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
+    """Counts an active constraint for its bodies."""
+    for side in range(2):
+        body = _body_of_side(motion, constraints.vertices[i], side)
+        if body >= 0:
+            wp.atomic_add(vertices.bodies.active, body, 1)
+
+
+@wp.func
+def body_inverse_masses(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    x: wp.array[wp.vec3],
+    relaxation: wp.float64,
+):
+    """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
+
+    The inverse mass of a body is a matrix. The two numbers are those of a matrix without products of the normal with
+    other directions that exceeds it, so that sweeps converge.
+    """
+    normal = constraints.normal[i]
+    along = ZERO
+    across = ZERO
+    for side in range(2):
+        body, weight, arm = _lever(motion, vertices, constraints, i, side, x)
+        if body >= 0:
+            parts = wp.max(wp.float64(vertices.bodies.active[body]) / relaxation, ONE)
+            inverse_inertia = vertices.bodies.inverse_inertia[body]
+            linear = weight * weight * wp.float64(motion.bodies.inverse_mass[body])
+            turned = wp.cross(inverse_inertia * wp.cross(arm, normal), arm)
+            turned_along = wp.dot(turned, normal)
+            product = ZERO
+            if constraints.friction[i] > 0.0:
+                product = wp.length(turned - turned_along * normal)
+            trace = wp.trace(inverse_inertia) * wp.length_sq(arm)
+            trace -= wp.dot(arm, inverse_inertia * arm)
+            along += parts * (linear + turned_along + product)
+            across += parts * (linear + trace - turned_along + product)
+    return along, across
+
+
+@wp.func
+def body_change(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    side: int,
+    change: wp.vec3d,
+    x: wp.array[wp.vec3],
+):
+    """Returns what the change of a multiplier does to the body on one side of its constraint.
+
+    Returns:
+        The body, -1 if there is none that can be moved; the change of its centre of mass and its turn, or of the
+        velocities of both.
+    """
+    body, weight, arm = _lever(motion, vertices, constraints, i, side, x)
+    shift = wp.vec3d()
+    turn = wp.vec3d()
+    if body >= 0:
+        shift = weight * wp.float64(motion.bodies.inverse_mass[body]) * change
+        turn = vertices.bodies.inverse_inertia[body] * wp.cross(arm, change)
+    return body, shift, turn
+
+
+@wp.func
+def add_body_delta(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    i: int,
+    change: wp.vec3d,
+    x: wp.array[wp.vec3],
+    sums: wp.array2d[wp.int64],
+):
+    """Adds what the change of a multiplier does to the bodies of its constraint, at positions ``x`` of vertices."""
+    for side in range(2):
+        body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
+        if body >= 0:
+            for axis in range(3):
+                wp.atomic_add(sums, body, axis, wp.int64(wp.rint(_UNITS * shift[axis])))
+                wp.atomic_add(sums, body, 3 + axis, wp.int64(wp.rint(_UNITS * turn[axis])))
+
+
+@wp.func
+def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
+    """Makes the pose of a body that where impulses act."""
+    pose = moved.pose[body]
+    moved.centre[body] = centre_of(bodies, body, pose)
+    moved.inverse_inertia[body] = inverse_inertia_at(bodies, body, pose)
+
+
+@wp.kernel
+def begin_bodies(motion: Motion, vertices: Vertices):
+    """Initializes the bodies by what is predicted of them, and clears everything else."""
+    body = wp.tid()
+    moved = vertices.bodies
+    moved.pose[body] = motion.bodies.end[body]
+    moved.velocity[body] = motion.bodies.velocity[body]
+    _set_centre(motion.bodies, moved, body)
+    for axis in range(6):
+        moved.delta_x[body, axis] = wp.int64(0)
+        moved.delta_v[body, axis] = wp.int64(0)
+    moved.active[body] = 0
+    moved.moved[body] = 0
+    moved.share[body] = WHOLE_PATH
+    moved.first_contact[body] = NEVER
+    moved.loose[body] = 0
+    moved.outcome[body] = 0
+
+
+@wp.kernel
+def move_bodies(motion: Motion, vertices: Vertices, last: bool):
+    """Moves each body by the sum of what its constraints did to it in a sweep; ``last`` empties its active set."""
+    body = wp.tid()
+    moved = vertices.bodies
+    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    moved.moved[body] = wp.where(active, 1, 0)
+    if last:
+        moved.active[body] = 0
+    if active:
+        shift, turn = sums_of(moved.delta_x, body)
+        moved.pose[body] = turned_pose(motion.bodies, body, motion.bodies.end[body], shift, turn)
+        moved.outcome[body] = moved.outcome[body] | PROJECTED
+
+
+@wp.kernel
+def place_vertices(motion: Motion, vertices: Vertices):
+    """Moves the vertices of bodies that moved."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    body = motion.bodies.of_vertex[vertex]
+    if body >= 0 and vertices.bodies.moved[body] != 0:
+        vertices.x1[vertex] = wp.transform_point(vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
+        vertices.changed[vertex] = 1
+
+
+@wp.kernel
+def move_to_end(motion: Motion, vertices: Vertices):
+    """Makes the poses at the end of the step those where impulses act."""
+    body = wp.tid()
+    if motion.bodies.inverse_mass[body] > 0.0:
+        _set_centre(motion.bodies, vertices.bodies, body)
+
+
+@wp.func
+def changed_velocity(predicted: wp.spatial_vector, sums: wp.array2d[wp.int64], body: int) -> wp.spatial_vector:
+    """Returns the velocity of a body by the one that was predicted, and the sum of what constraints did to it."""
+    linear, angular = sums_of(sums, body)
+    linear += to_double(wp.spatial_top(predicted))
+    angular += to_double(wp.spatial_bottom(predicted))
+    return wp.spatial_vector(to_single(linear), to_single(angular))
+
+
+@wp.kernel
+def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
+    """Changes the velocity of each body that was not truncated; ``last`` empties its active set."""
+    body = wp.tid()
+    moved = vertices.bodies
+    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    if last:
+        moved.active[body] = 0
+    if active and not has_final_velocity(moved.outcome[body]):
+        moved.velocity[body] = changed_velocity(motion.bodies.velocity[body], moved.delta_v, body)
+
+
+@wp.kernel
+def set_vertex_velocities(motion: Motion, vertices: Vertices):
+    """Makes the velocities of vertices those of their bodies."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    body = motion.bodies.of_vertex[vertex]
+    if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
+        arm = to_double(vertices.x1[vertex]) - vertices.bodies.centre[body]
+        vertices.velocity[vertex] = velocity_on_body(vertices.bodies.velocity[body], arm)

@@ -1,0 +1,353 @@
+"""Truncation: paths are cut before the first contact, or vertices and bodies are frozen at their start."""
+
+import warp as wp
+
+from ..contacts.constraints import (
+    EDGE_EDGE_CONTACT,
+    EDGE_EDGE_PROXIMITY,
+    NO_CONSTRAINT,
+    PLANE_CONTACT,
+    RESTING,
+    TIME_UNITS,
+    TOUCH,
+    VERTEX_FACE_PROXIMITY,
+    Contacts,
+    contact_vertices,
+    has_pushed,
+    least_distance,
+    moves_body,
+    truncated_path,
+)
+from ..contacts.detect import contacts_of
+from ..contacts.dividing_planes import add_dividing_plane, has_all_planes
+from ..schedule import SolveStatus, divides_all_proximities, divides_proximities
+from ..state.poses import pose_between, velocity_between
+from ..state.record import NO_CONTACT, StepRecord, is_recording
+from ..state.structs import (
+    DIVIDED,
+    FROZEN,
+    NEVER,
+    PROJECTED,
+    TRUNCATED,
+    UNCONSTRAINED,
+    Constraints,
+    DividingPlanes,
+    Motion,
+    Vertices,
+)
+from ..state.vectors import ONE, to_double, to_single
+from ..state.workspace import Workspace
+from ..tuning import SHARE_OF_PATH
+from .bodies import FREEZES, WHOLE_PATH, place_vertices
+from .sides import position_on_sides, share_of_path
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def divide_proximities(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    status: SolveStatus,
+    separation: wp.float64,
+):
+    """Adds dividing planes for proximities, see :func:`.constraints.divides_proximities`.
+
+    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    A constraint whose elements would meet changes velocities too.
+    """
+    i = wp.tid()
+    if i >= constraints.count[0]:
+        return
+    kind = constraints.kind[i]
+    if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
+        return
+    corners = constraints.vertices[i]
+    if not divides_proximities(status, motion.world[corners[0]]) or moves_body(motion, constraints, i):
+        return
+    edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
+    all_pairs = divides_all_proximities(status)
+    if not all_pairs and constraints.pace[i] != RESTING:
+        return
+    least = least_distance(constraints, i)
+    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False, all_pairs)
+    if meets and not has_pushed(constraints, i):
+        constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
+        for j in range(4):
+            vertex = corners[j]
+            if motion.inverse_mass[vertex] > 0.0:
+                vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
+
+
+@wp.func
+def share_before(time: wp.float64) -> wp.float64:
+    """Returns the share of the path of a body that is left before a contact, at ``time`` in [0, 1]."""
+    return SHARE_OF_PATH * time
+
+
+@wp.func
+def first_contact_of_body(key: wp.int64, vertex: int) -> wp.int64:
+    """Returns a key that orders the first contacts of the vertices of a body by time, then by vertex."""
+    return ((key >> wp.int64(32)) << wp.int64(32)) | wp.int64(vertex)
+
+
+@wp.kernel
+def find_body_shares(
+    motion: Motion, vertices: Vertices, status: SolveStatus, dividing: DividingPlanes, record: StepRecord
+):
+    """Finds the share of the path of each body up to which its vertices are above their dividing planes.
+
+    The vertices go straight here, but in an arc where the body turns: if one ends below its plane for that and
+    collides, the next iteration cuts the path again. Where a contact has no plane, the path ends before that contact.
+    After ``max_truncations`` iterations, a body that still collides is frozen. If the step is recorded, first contacts
+    are left for :func:`.kernels.record_body_truncations`.
+    """
+    vertex = motion.bodies.particle_count + wp.tid()
+    key = vertices.first_contact[vertex]
+    body = motion.bodies.of_vertex[vertex]
+    if key == NEVER or body < 0:
+        return
+    if is_recording(record):
+        wp.atomic_min(vertices.bodies.first_contact, body, first_contact_of_body(key, vertex))
+    else:
+        vertices.first_contact[vertex] = NEVER
+    if motion.bodies.inverse_mass[body] == 0.0:
+        return
+    if status.loop.iteration[0] > status.max_iterations + status.max_truncations:
+        wp.atomic_min(vertices.bodies.share, body, FREEZES)
+        return
+    share = ONE
+    divides = bool(False)
+    complete = bool(False)
+    if dividing.first:
+        divides = dividing.first[vertex] >= 0
+        complete = divides and has_all_planes(dividing, vertex)
+    if divides:
+        share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
+    if not complete:
+        share = wp.min(share, share_before(wp.float64(key >> wp.int64(32)) / TIME_UNITS))
+    if not complete or int(key & wp.int64(3)) == NO_CONSTRAINT:
+        vertices.bodies.loose[body] = 1
+    wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
+
+
+@wp.kernel
+def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.float64):
+    """Moves each body whose path is to be cut back along it, or freezes it in its pose at the start."""
+    body = wp.tid()
+    moved = vertices.bodies
+    share = moved.share[body]
+    moved.share[body] = WHOLE_PATH
+    moved.first_contact[body] = NEVER
+    frozen = moved.outcome[body] & FROZEN != 0
+    moved.moved[body] = wp.where(share < WHOLE_PATH and not frozen, 1, 0)
+    if moved.moved[body] == 0:
+        return
+    start = motion.bodies.start[body]
+    if share == FREEZES:
+        moved.pose[body] = start
+        moved.velocity[body] = wp.spatial_vector()
+        moved.outcome[body] = moved.outcome[body] | FROZEN
+        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        return
+    end = pose_between(motion.bodies, body, start, moved.pose[body], wp.float64(share) / TIME_UNITS)
+    moved.pose[body] = end
+    outcome = moved.outcome[body] | TRUNCATED
+    if moved.loose[body] == 0:
+        moved.outcome[body] = outcome | DIVIDED
+        return
+    moved.velocity[body] = velocity_between(motion.bodies, body, start, end, dt)
+    moved.outcome[body] = (outcome | DIVIDED) - DIVIDED
+
+
+@wp.kernel
+def freeze_undetected_bodies(motion: Motion, vertices: Vertices, status: SolveStatus):
+    """Freezes all bodies if a detection was incomplete, as :func:`.kernels.freeze_undetected` does vertices."""
+    body = wp.tid()
+    frozen = status.results.undetected[0] == 1 and motion.bodies.inverse_mass[body] > 0.0
+    vertices.bodies.moved[body] = wp.where(frozen, 1, 0)
+    if frozen:
+        vertices.bodies.pose[body] = motion.bodies.start[body]
+        vertices.bodies.velocity[body] = wp.spatial_vector()
+        vertices.bodies.outcome[body] = vertices.bodies.outcome[body] | FROZEN
+
+
+@wp.func
+def _record_truncation(
+    vertices: Vertices,
+    record: StepRecord,
+    vertex: int,
+    body: int,
+    cuts: bool,
+    key: wp.int64,
+    vertex_face: Contacts,
+    edge_edge: Contacts,
+):
+    """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
+    entry = wp.atomic_add(record.counts.truncations, 0, 1)
+    if entry >= record.vertex.shape[0]:
+        return
+    record.vertex[entry] = wp.where(body < 0, vertex, -1)
+    record.end[entry] = vertices.x1[vertex]
+    record.body[entry] = body
+    if body >= 0:
+        record.pose[entry] = vertices.bodies.pose[body]
+    first = int(key & wp.int64(0xFFFFFFFF))
+    if first & 3 == EDGE_EDGE_CONTACT:
+        _record_contact(record, entry, vertex, cuts, key, edge_edge)
+    else:
+        _record_contact(record, entry, vertex, cuts, key, vertex_face)
+
+
+@wp.func
+def _record_contact(record: StepRecord, entry: int, vertex: int, cuts: bool, key: wp.int64, contacts: Contacts):
+    """Records the contact that a path is truncated before."""
+    first = int(key & wp.int64(0xFFFFFFFF))
+    kind = wp.where(cuts, first & 3, NO_CONTACT)
+    i = first >> 2
+    record.kind[entry] = kind
+    record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
+    record.toi[entry] = wp.float64(key >> wp.int64(32)) / TIME_UNITS
+    if kind != PLANE_CONTACT and kind != NO_CONTACT:
+        record.contact[entry] = contact_vertices(contacts, i)
+        record.within_tolerance[entry] = contacts.within_tolerance[i]
+        record.toi[entry] = contacts.toi[i]
+        record.coordinates[entry] = contacts.coordinates[i]
+        record.normal[entry] = contacts.normal[i]
+
+
+@wp.func
+def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes, vertex: int):
+    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided.
+
+    One without a new plane is there, as no projection follows the first planes of its world.
+    """
+    first = dividing.first[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or first < 0 or first == dividing.kept[vertex]:
+        return
+    dividing.kept[vertex] = first
+    x1 = vertices.x1[vertex]
+    end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
+    if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+
+
+@wp.kernel
+def truncate_vertices(
+    motion: Motion,
+    vertices: Vertices,
+    status: SolveStatus,
+    record: StepRecord,
+    dividing: DividingPlanes,
+    vertex_face: Contacts,
+    edge_edge: Contacts,
+    dt: wp.float64,
+):
+    """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
+
+    Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
+    ``max_truncations`` iterations vertices that still collide are frozen.
+    """
+    vertex = wp.tid()
+    key = vertices.first_contact[vertex]
+    if key == NEVER:
+        if dividing.first:
+            _keep_on_sides(motion, vertices, dividing, vertex)
+        return
+    vertices.first_contact[vertex] = NEVER
+    if motion.inverse_mass[vertex] == 0.0:
+        return
+    time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
+    cuts = status.loop.iteration[0] <= status.max_iterations + status.max_truncations
+    if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
+        _record_truncation(vertices, record, vertex, -1, cuts, key, vertex_face, edge_edge)
+    outcome = vertices.outcome[vertex]
+    if cuts:
+        x0 = motion.x0[vertex]
+        end = vertices.x1[vertex]
+        divides = bool(False)
+        complete = bool(False)
+        if dividing.first:
+            divides = dividing.first[vertex] >= 0
+            complete = divides and has_all_planes(dividing, vertex)
+        if divides:
+            end, truncated = position_on_sides(dividing, vertex, x0, end)
+            outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+        if not complete:
+            path = truncated_path(to_double(x0), to_double(end), time)
+            end = to_single(to_double(x0) + path)
+            outcome = outcome | TRUNCATED
+            if not divides:
+                vertices.velocity[vertex] = to_single(path / dt)
+        if divides and int(key & wp.int64(3)) == NO_CONSTRAINT:
+            vertices.velocity[vertex] = (end - x0) / float(dt)
+            outcome = outcome | UNCONSTRAINED
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = outcome
+    elif outcome & FROZEN == 0:
+        vertices.x1[vertex] = motion.x0[vertex]
+        vertices.changed[vertex] = 1
+        vertices.velocity[vertex] = wp.vec3()
+        vertices.outcome[vertex] = outcome | FROZEN
+        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+
+
+@wp.kernel
+def record_body_truncations(
+    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: Contacts, edge_edge: Contacts
+):
+    """Records the pose of each body whose path is to be truncated before the first contact of its vertices."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    key = vertices.first_contact[vertex]
+    if key == NEVER:
+        return
+    vertices.first_contact[vertex] = NEVER
+    body = motion.bodies.of_vertex[vertex]
+    if body < 0 or motion.bodies.inverse_mass[body] == 0.0 or vertices.bodies.outcome[body] & FROZEN != 0:
+        return
+    if vertices.bodies.first_contact[body] == first_contact_of_body(key, vertex):
+        cuts = vertices.bodies.share[body] >= wp.int64(0)
+        _record_truncation(vertices, record, vertex, body, cuts, key, vertex_face, edge_edge)
+
+
+@wp.kernel
+def freeze_undetected(motion: Motion, vertices: Vertices, status: SolveStatus):
+    """Freezes all vertices if a detection was incomplete, because a buffer overflowed."""
+    vertex = wp.tid()
+    if status.results.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
+        vertices.x1[vertex] = motion.x0[vertex]
+        vertices.velocity[vertex] = wp.vec3()
+        vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+
+
+def divide(work: Workspace, dt: float) -> None:
+    """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them.
+
+    Args:
+        work: The workspace of the step.
+        dt: Length of the step [s].
+    """
+    work.reserve_truncations()
+    motion, vertices, status, record = work.motion.vertices, work.vertices, work.status, work.record
+    contacts = contacts_of(work)[0]
+    if not work.differentiable:
+        inputs = [motion, vertices, work.constraints, work.dividing, status, work.separation]
+        work.launch_over_constraints(divide_proximities, inputs)
+    work.launch_over_particles(truncate_vertices, [motion, vertices, status, record, work.dividing, *contacts, dt])
+    work.launch_over_shape_vertices(find_body_shares, status, work.dividing, record)
+    if work.recorder is not None:
+        work.launch_over_shape_vertices(record_body_truncations, record, *contacts)
+    work.launch_over_bodies(cut_bodies, status, dt)
+    work.launch_over_shape_vertices(place_vertices)
+
+
+def freeze_if_undetected(work: Workspace) -> None:
+    """Freezes everything if the last detection was incomplete: a recorded step whose CUDA graph is too small."""
+    work.launch_over_particles(freeze_undetected, [work.motion.vertices, work.vertices, work.status])
+    work.launch_over_bodies(freeze_undetected_bodies, work.status)
+    work.launch_over_shape_vertices(place_vertices)

@@ -1,0 +1,68 @@
+"""Coefficients of friction of the vertices and planes of a mesh, from those of particles and shapes."""
+
+import warp as wp
+
+from .mesh import ModelMesh
+
+
+@wp.kernel
+def _write_friction(
+    # in
+    of_particles: wp.array[float],
+    of_shapes: wp.array[float],
+    particle_count: int,
+    shape_of_vertex: wp.array[int],
+    shape_of_plane: wp.array[int],
+    # out
+    vertices: wp.array[float],
+    planes: wp.array[float],
+):
+    """Writes the coefficients of vertices and planes; those below 0 count as 0."""
+    i = wp.tid()
+    if i < planes.shape[0]:
+        planes[i] = wp.max(of_shapes[shape_of_plane[i]], 0.0)
+    if i < particle_count:
+        vertices[i] = wp.max(of_particles[i % of_particles.shape[0]], 0.0)
+    elif i < vertices.shape[0]:
+        vertices[i] = wp.max(of_shapes[shape_of_vertex[i - particle_count]], 0.0)
+
+
+class Friction:
+    """Coefficients of friction; that of a contact is the geometric mean of those of its two sides.
+
+    Attributes:
+        vertices: Those of vertices, Warp array of float, shape [vertex_count].
+        planes: Those of infinite planes, Warp array of float.
+        of_particles: What those of particles are read from, one for all or one each.
+        of_shapes: What those of shapes are read from, as ``newton.Model.shape_material_mu``.
+    """
+
+    def __init__(self, mesh: ModelMesh, of_particles: wp.array[float], of_shapes: wp.array[float]):
+        """Reads the coefficients for the first time.
+
+        Args:
+            mesh: The mesh.
+            of_particles: Those of particles, shape [1] or [particle_count].
+            of_shapes: Those of shapes, shape [shape_count].
+        """
+        self._mesh, self.of_particles, self.of_shapes = mesh, of_particles, of_shapes
+        self.vertices = wp.zeros(mesh.vertex_count, dtype=float, device=mesh.device)
+        self.planes = wp.zeros(len(mesh.planes.shape), dtype=float, device=mesh.device)
+        self.read()
+
+    def read(self) -> None:
+        """Reads the coefficients again. Can be captured in a CUDA graph."""
+        self._launch([self.vertices, self.planes])
+
+    def backward(self, of_vertices: wp.array[float], of_planes: wp.array[float]) -> None:
+        """Adds to the gradients of what coefficients are read from, given those of vertices and planes."""
+        outputs = [of_vertices, of_planes]  # which stand in for the outputs: the adjoint neither reads nor writes these
+        inputs = 5 * [None]
+        self._launch(outputs, adjoint=True, adj_inputs=inputs, adj_outputs=outputs)
+
+    def _launch(self, outputs, **options):
+        mesh = self._mesh
+        shapes = mesh.device_shape_vertices.shape, mesh.device_planes.shape
+        inputs = [self.of_particles, self.of_shapes, mesh.model.particle_count, *shapes]
+        size = max(map(len, outputs))
+        wp.launch(_write_friction, size, inputs=inputs, outputs=outputs, device=mesh.device, **options)

@@ -1,0 +1,445 @@
+"""The collision mesh of a Newton model: cloth, the surfaces of soft bodies, and rigid shapes cut into triangles."""
+
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+import warp as wp
+from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
+
+from ..._arguments import checked_distance, checked_distances
+from ...detection.approach_phase import MinDistances, make_min_distances
+from ...detection.mesh import CollisionMesh
+from ..tuning import SEGMENTS
+
+_STRAIGHT = 0.9
+"""Length of a spring, as a share of that of two others between its ends, from which it runs along them."""
+
+_BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
+"""Options of a ``newton.Mesh`` whose triangles alone are used."""
+
+_Array = TypeVar("_Array", np.ndarray, wp.array)
+
+
+class ShapeVertices(NamedTuple, Generic[_Array]):
+    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
+
+    Attributes:
+        position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
+        body: Body that the vertex moves with, -1 for none, int32, shape [n].
+        shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
+    """
+
+    position: _Array
+    body: _Array
+    shape: _Array
+
+
+class Planes(NamedTuple, Generic[_Array]):
+    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
+
+    Attributes:
+        point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
+        normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
+        body: Body that the plane moves with, -1 for none, int32, shape [n].
+        shape: Shape of the plane, int32, shape [n].
+        world: World of the plane, -1 for all worlds, int32, shape [n].
+    """
+
+    point: _Array
+    normal: _Array
+    body: _Array
+    shape: _Array
+    world: _Array
+
+
+@wp.struct
+class Incidence:
+    """The elements that each element belongs to: those of element ``i`` are ``items[first[i]:first[i + 1]]``."""
+
+    first: wp.array[int]
+    items: wp.array[int]
+
+
+class ModelMesh(CollisionMesh):
+    """The triangles of a Newton model that particles can collide with, as one mesh.
+
+    Its vertices are the particles of the model, then those of the tessellated shapes; its faces are the triangles of
+    the model, then the other surface triangles of its tetrahedra, then those of the shapes. Round shapes have their
+    vertices on the surface, so that the mesh of a convex shape lies within it. A shape that is in all worlds has
+    vertices in each. Infinite planes have no triangles and are listed separately.
+
+    Later changes of the model do not change the mesh, except for positions and inverse masses. Margins of shapes and
+    radii of particles are ignored. Springs and particles without faces take part only where pairs keep distances, see
+    :meth:`keep_distances`.
+
+    Attributes:
+        model: The model.
+        shape_vertices: The vertices from ``model.particle_count`` on, NumPy arrays.
+        planes: The infinite planes, NumPy arrays.
+        inverse_masses: Inverse masses [1/kg] of all vertices, Warp array of float, shape [vertex_count].
+        device_world: World of each vertex, Warp array of int, shape [vertex_count].
+        device_shape_vertices: ``shape_vertices`` as Warp arrays.
+        device_planes: ``planes`` as Warp arrays.
+        device_vertex_edges: The edges of each vertex, :class:`Incidence`.
+        device_edge_faces: The faces of each edge, :class:`Incidence`.
+        distances: Minimum distances of pairs, None if pairs only must not touch.
+    """
+
+    def __init__(self, model: Model, *, strands: bool = False):
+        """Tessellates the shapes and puts the mesh on the model's device.
+
+        Args:
+            model: The ``newton.Model``.
+            strands: Whether springs without faces take part as edges, and particles without springs as points. Only a
+                minimum distance keeps these apart from each other. A spring that runs along two others, against
+                bending, takes no part.
+
+        Raises:
+            NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
+                cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
+        """
+        particle_world = _finalized(model.particle_world).numpy()
+        if model.world_count == 1:
+            particle_world = np.zeros_like(particle_world)
+        elif (particle_world < 0).any():
+            raise NotImplementedError(
+                f"particle {np.argmax(particle_world < 0)} is in all of {model.world_count} worlds; add it to one world"
+            )
+        shape_body, shape_world = _finalized(model.shape_body).numpy(), _finalized(model.shape_world).numpy()
+        shape_type, shape_scale = _finalized(model.shape_type).numpy(), _finalized(model.shape_scale).numpy()
+        transform = _finalized(model.shape_transform).numpy().astype(np.float64)
+        collides = (_finalized(model.shape_flags).numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
+        infinite = (shape_type == GeoType.PLANE) & (shape_scale[:, :2] <= 0.0).any(axis=1)
+
+        tessellations = {}
+        shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
+        vertex_count = model.particle_count
+        for shape in np.flatnonzero(collides & ~infinite):
+            key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
+            if key not in tessellations:
+                tessellations[key] = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
+            shape_positions, shape_faces = tessellations[key]
+            shape_positions = transform[shape, :3] + _rotate(transform[shape, 3:], shape_positions)
+            for world in range(model.world_count) if shape_world[shape] < 0 else [shape_world[shape]]:
+                shapes += [shape] * len(shape_positions)
+                worlds += [world] * len(shape_positions)
+                positions.append(shape_positions)
+                faces.append(vertex_count + shape_faces)
+                vertex_count += len(shape_positions)
+        world = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)])
+        worlds = world if model.world_count > 1 else None
+        faces = np.concatenate(faces)
+        edges, points = _strands(model, faces) if strands else (None, None)
+        super().__init__(faces, vertex_count, edges=edges, points=points, world=worlds, device=model.device)
+
+        shapes = np.array(shapes, dtype=np.int32)
+        planes = np.flatnonzero(collides & infinite).astype(np.int32)
+        self.model = model
+        self.shape_vertices = ShapeVertices(np.concatenate(positions).astype(np.float32), shape_body[shapes], shapes)
+        self.planes = Planes(
+            transform[planes, :3].astype(np.float32),
+            _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0])).astype(np.float32),
+            shape_body[planes],
+            planes,
+            shape_world[planes],
+        )
+        self.device_world = self._on_device(world)
+        self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
+        self.device_planes = Planes(*map(self._on_device, self.planes))
+        self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
+        self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
+        self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
+        self.refresh_inverse_masses()
+        self.distances: MinDistances | None = None
+
+    @property
+    def has_shapes_on_bodies(self) -> bool:
+        """Whether a vertex or a plane moves with a body."""
+        return bool((self.shape_vertices.body >= 0).any() or (self.planes.body >= 0).any())
+
+    def keep_distances(
+        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
+    ) -> None:
+        """Sets the minimum distances of pairs, with arguments as of :meth:`min_distances`."""
+        self.distances = self.min_distances(min_distance, radius, reach=reach)
+
+    def min_distances(
+        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
+    ) -> MinDistances:
+        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
+
+        Args:
+            min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
+            radius: Radius of each particle [m], as the distance, shape [particle_count], or one for all; None for 0.
+            reach: How much farther apart than their distance near pairs are at most [m].
+
+        Raises:
+            TypeError: If the distance or the radii are no numbers.
+            ValueError: If they have another shape or are out of range.
+        """
+        distance, count = checked_distance(min_distance, "min_distance"), self.model.particle_count
+        given = 0.0 if radius is None else radius.numpy() if isinstance(radius, wp.array) else radius
+        radii = checked_distances(given, "radius", count)
+        every = np.full(self.vertex_count, 0.5 * distance)
+        every[:count] += radii
+        group = np.full(self.vertex_count, -1)
+        group[count:] = self.shape_vertices.body + 1
+        return make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
+
+    def _on_device(self, values: np.ndarray) -> wp.array:
+        """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
+        return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
+
+    def positions(
+        self,
+        particle_q: wp.array[wp.vec3] | None,
+        body_q: wp.array[wp.transform] | None,
+        out: wp.array[wp.vec3],
+    ) -> None:
+        """Writes the positions of all vertices, those of particles bit for bit. Can be captured in a CUDA graph.
+
+        Args:
+            particle_q: Positions of the particles [m], Warp array of vec3, shape [particle_count], or None if the model
+                has none.
+            body_q: Transforms of the bodies, Warp array of transform, shape [body_count], or None if the model has
+                none.
+            out: Where to write the positions [m], Warp array of vec3, shape [vertex_count].
+
+        Raises:
+            ValueError: If an array has another length.
+        """
+        self.check_lengths(particle_q, body_q, out)
+        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
+
+    def check_lengths(
+        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
+    ) -> None:
+        """Raises ValueError if an array as of :meth:`positions` has another length."""
+        for name, array, count in (
+            ("particle_q", particle_q, self.model.particle_count),
+            ("body_q", body_q, self.model.body_count),
+            ("out", out, self.vertex_count),
+        ):
+            length = 0 if array is None else len(array)
+            if length != count:
+                raise ValueError(f"{name} must have length {count}, not {length}")
+
+    def refresh_inverse_masses(self) -> None:
+        """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
+
+        The response cannot move vertices with inverse mass 0: kinematic and inactive particles, and shapes.
+        """
+        model = self.model
+        inputs, outputs = [model.particle_inv_mass, model.particle_flags], [self.inverse_masses]
+        wp.launch(_write_inverse_masses, model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+@wp.func
+def vertex_position(
+    vertex: int,
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    shape_vertex_position: wp.array[wp.vec3],
+    shape_vertex_body: wp.array[int],
+) -> wp.vec3:
+    """Returns the position of a vertex of a :class:`ModelMesh` [m], see :meth:`ModelMesh.positions`."""
+    i = vertex - particle_q.shape[0]
+    if i < 0:
+        return particle_q[vertex]
+    if shape_vertex_body[i] < 0:
+        return shape_vertex_position[i]
+    return wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_positions(
+    # in
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    shape_vertex_position: wp.array[wp.vec3],
+    shape_vertex_body: wp.array[int],
+    # out
+    positions: wp.array[wp.vec3],
+):
+    vertex = wp.tid()
+    positions[vertex] = vertex_position(vertex, particle_q, body_q, shape_vertex_position, shape_vertex_body)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def _write_inverse_masses(
+    particle_inv_mass: wp.array[float], particle_flags: wp.array[int], inverse_masses: wp.array[float]
+):
+    particle = wp.tid()
+    inverse_mass = float(0.0)
+    if particle_flags[particle] & ParticleFlags.ACTIVE:
+        inverse_mass = particle_inv_mass[particle]
+    inverse_masses[particle] = inverse_mass
+
+
+def _finalized(array: wp.array | None) -> wp.array:
+    """Returns an array that a model has once it is finalized."""
+    assert array is not None
+    return array
+
+
+def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
+    """Returns the rows of ``elements`` that each of ``count`` numbers is in; negative numbers are left out."""
+    numbers = elements.ravel()
+    rows = np.repeat(np.arange(len(elements)), elements.shape[1])
+    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+    incidence = Incidence()
+    first = np.concatenate([[0], np.cumsum(np.bincount(numbers[order], minlength=count))])
+    incidence.first = wp.array(first, dtype=int, device=device)
+    incidence.items = wp.array(rows[order], dtype=int, device=device)
+    return incidence
+
+
+def _soft_faces(model):
+    """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
+    triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
+    if model.tet_indices is None:
+        return triangles
+    sides = sides_of(model.tet_indices.numpy())
+    # an inner side belongs to two tetrahedra; with the triangles counted twice, the missing sides occur once
+    corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
+    _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
+    return np.concatenate([triangles, sides[first[count == 1]]])
+
+
+def sides_of(tetrahedra: np.ndarray) -> np.ndarray:
+    """Returns the sides of tetrahedra, shape [n, 4], counterclockwise from outside, shape [4 n, 3]."""
+    return tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+
+
+def _strands(model, faces):
+    """Returns the springs with an end that no face has, without those along two others, and particles without springs.
+
+    The inner particles of soft bodies are left out.
+    """
+    count = model.particle_count
+    bare = np.ones(count, dtype=bool)
+    bare[faces[faces < count]] = False
+    if model.tet_indices is not None:
+        bare[model.tet_indices.numpy()] = False
+    if not model.spring_count:
+        return None, np.flatnonzero(bare)
+    springs = model.spring_indices.numpy().reshape(-1, 2)
+    lengths = model.spring_rest_length.numpy()
+    taken = bare[springs].any(axis=1)
+    springs, lengths = springs[taken], lengths[taken]
+    neighbours = [{} for _ in range(count)]
+    for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True):
+        neighbours[a][b] = neighbours[b][a] = length
+
+    def is_chord(a, b, length):
+        between = neighbours[a].keys() & neighbours[b].keys()
+        return any(length >= _STRAIGHT * (neighbours[a][c] + neighbours[b][c]) for c in between)
+
+    kept = [not is_chord(a, b, length) for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True)]
+    bare[springs] = False
+    return springs[kept], np.flatnonzero(bare)
+
+
+def _tessellate(model, shape, shape_type, scale):
+    """Returns the surface of a shape as triangles, without two vertices in one place.
+
+    Args:
+        model: The ``newton.Model``.
+        shape: Index of the shape.
+        shape_type: Its type.
+        scale: Its scale, whose meaning depends on the type.
+
+    Returns:
+        Positions [m] in the frame of the shape, float64, shape [n, 3], and faces, shape [m, 3].
+
+    Raises:
+        NotImplementedError: If there are no triangles for the type.
+    """
+    x, y, z = scale.astype(np.float64)
+    match shape_type:
+        case GeoType.MESH | GeoType.CONVEX_MESH:
+            positions, faces = _weld(model.shape_source[shape])
+            return positions * (x, y, z), faces
+        case GeoType.PLANE:
+            return _weld(Mesh.create_plane(x, y, **_BARE))
+        case GeoType.BOX:
+            return _weld(Mesh.create_box(x, y, z, **_BARE))
+        case GeoType.SPHERE:
+            return _revolve(_capsule_profile(x, 0.0))
+        case GeoType.ELLIPSOID:
+            positions, faces = _revolve(_capsule_profile(1.0, 0.0))
+            return positions * (x, y, z), faces
+        case GeoType.CAPSULE:
+            return _revolve(_capsule_profile(x, y))
+        case GeoType.CYLINDER:
+            height = np.linspace(-y, y, SEGMENTS // 2 + 1 if z > 0.0 else 2)
+            # the side of a barrel is an arc of radius z
+            bulge = np.sqrt(z * z - height * height) - np.sqrt(z * z - y * y) if z > 0.0 else np.zeros(2)
+            return _revolve(np.concatenate([[[0.0, -y]], np.stack([x + bulge, height], axis=1), [[0.0, y]]]))
+        case GeoType.CONE:
+            return _revolve(np.array([[0.0, -y], [x, -y], [0.0, y]]))
+    raise NotImplementedError(
+        f"shape {shape} ({model.shape_label[shape]!r}) of type {shape_type.name} collides with particles, but has no "
+        "triangles to collide with: use a mesh, or clear its flag COLLIDE_PARTICLES"
+    )
+
+
+def _weld(mesh):
+    """Returns the triangles of a ``newton.Mesh``, with its vertices that are in one place merged.
+
+    Seams of texture or normals have several, and the triangles on both sides would always collide with each other.
+
+    Returns:
+        Positions [m], float64, shape [n, 3], and faces, shape [m, 3].
+    """
+    positions, vertex = np.unique(mesh.vertices.astype(np.float64), axis=0, return_inverse=True)
+    return positions, vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
+
+
+def _capsule_profile(radius, half_height):
+    """Returns radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
+    angle = np.linspace(0.0, np.pi / 2.0, SEGMENTS // 4 + 1)
+    lower = np.stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)], axis=1)
+    upper = lower[::-1] * (1.0, -1.0)
+    return np.concatenate([lower, upper if half_height > 0.0 else upper[1:]])
+
+
+def _revolve(profile):
+    """Returns the surface that a profile makes when it turns around the z axis.
+
+    Args:
+        profile: Radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
+
+    Returns:
+        Positions [m], float64, shape [2 + (n - 2) * SEGMENTS, 3], and faces, counter-clockwise from outside, shape
+        [2 * (n - 2) * SEGMENTS, 3].
+    """
+    angle = 2.0 * np.pi / SEGMENTS * np.arange(SEGMENTS)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(SEGMENTS)], axis=1)
+    rings = circle * profile[1:-1, None][:, :, [0, 0, 1]]
+    poles = np.array([[[0.0, 0.0, height]] for height in profile[[0, -1], 1]])
+    positions = np.concatenate([poles[0], rings.reshape(-1, 3), poles[1]])
+    # a row of vertices for each point of the profile, those of the poles all one
+    vertex = np.arange(len(profile) * SEGMENTS).reshape(-1, SEGMENTS) - SEGMENTS + 1
+    vertex = np.clip(vertex, 0, len(positions) - 1)
+    a, d = vertex[:-1], vertex[1:]
+    b, c = np.roll(a, -1, axis=1), np.roll(d, -1, axis=1)
+    return positions, np.concatenate([np.stack([a, b, c], axis=2)[1:], np.stack([a, c, d], axis=2)[:-1]]).reshape(-1, 3)
+
+
+def _rotate(quaternion, vectors):
+    """Returns vectors rotated by unit quaternions (x, y, z, w), shape [..., 3]."""
+    axis = quaternion[..., :3]
+    twist = 2.0 * np.cross(axis, vectors)
+    return vectors + quaternion[..., 3:] * twist + np.cross(axis, twist)
+
+
+@wp.struct
+class Connectivity:
+    """The elements of a mesh, and the elements that each belongs to."""
+
+    faces: wp.array2d[int]
+    edges: wp.array2d[int]
+    vertex_edges: Incidence
+    edge_faces: Incidence

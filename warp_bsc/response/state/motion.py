@@ -1,0 +1,363 @@
+"""The motion of a model in a step: its vertices and planes at the start, and as predicted at the end."""
+
+import newton
+import numpy as np
+import warp as wp
+from newton import BodyFlags
+
+from .friction import Friction
+from .mesh import ModelMesh, vertex_position
+from .planes import MovingPlanes, transformed_plane
+from .poses import centre_of, velocity_on_body
+from .structs import Bodies, Motion
+from .vectors import to_double
+
+_SAME_POSE = 1e-5
+"""Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
+
+
+@wp.struct
+class _Placement:
+    """Where the vertices and the planes of a mesh are in a state."""
+
+    particle_q: wp.array[wp.vec3]
+    body_q: wp.array[wp.transform]
+    shape_vertex_position: wp.array[wp.vec3]
+    shape_vertex_body: wp.array[int]
+    plane_point: wp.array[wp.vec3]
+    plane_normal: wp.array[wp.vec3]
+    plane_body: wp.array[int]
+
+
+@wp.func
+def _position(placement: _Placement, vertex: int) -> wp.vec3:
+    return vertex_position(
+        vertex,
+        placement.particle_q,
+        placement.body_q,
+        placement.shape_vertex_position,
+        placement.shape_vertex_body,
+    )
+
+
+@wp.func
+def _place_plane(placement: _Placement, i: int, planes: wp.array[wp.vec4d]):
+    """Writes a plane, if there is one of that number."""
+    if i < planes.shape[0]:
+        planes[i] = transformed_plane(
+            placement.plane_point[i], placement.plane_normal[i], placement.plane_body[i], placement.body_q
+        )
+
+
+@wp.func
+def _is_movable(motion: Motion, body: int) -> bool:
+    """Returns whether the response can move a body, -1 for none."""
+    if body < 0 or not motion.bodies.inverse_mass:
+        return False
+    return motion.bodies.inverse_mass[body] > 0.0
+
+
+@wp.func
+def moves_with_body(motion: Motion, vertex: int) -> bool:
+    """Returns whether a vertex is of a body that the response can move."""
+    if not motion.bodies.of_vertex:
+        return False
+    return _is_movable(motion, motion.bodies.of_vertex[vertex])
+
+
+@wp.func
+def predicted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
+    """Returns the predicted velocity of a vertex of a body, whose predicted position is ``x1`` [m/s]."""
+    body = motion.bodies.of_vertex[vertex]
+    arm = to_double(x1) - centre_of(motion.bodies, body, motion.bodies.end[body])
+    return velocity_on_body(motion.bodies.velocity[body], arm)
+
+
+@wp.func
+def continues(motion: Motion, world: int) -> bool:
+    """Returns whether a step begins where the last one ended, as far as movable particles of a world go."""
+    last = motion.interrupted.shape[0] - 1
+    return motion.interrupted[wp.where(world < 0, last, world)] == 0
+
+
+@wp.kernel(enable_backward=False)
+def _interrupt(
+    # in
+    world_mask: wp.array[wp.bool],
+    # out
+    interrupted: wp.array[int],
+):
+    """Marks worlds as interrupted, and what is in all of them if any world is."""
+    i = wp.tid()
+    last = world_mask.shape[0] - 1
+    if world_mask[wp.min(i, last)] or world_mask[last]:
+        interrupted[i] = 1
+        interrupted[interrupted.shape[0] - 1] = 1
+
+
+@wp.kernel(enable_backward=False)
+def _write_start(
+    # in
+    placement: _Placement,
+    last: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    world: wp.array[int],
+    # out
+    x0: wp.array[wp.vec3],
+    planes: wp.array[wp.vec4d],
+    interrupted: wp.array[int],
+):
+    """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
+    i = wp.tid()
+    _place_plane(placement, i, planes)
+    if i >= x0.shape[0]:
+        return
+    x = _position(placement, i)
+    x0[i] = x
+    if last and inverse_mass[i] > 0.0:
+        for axis in range(3):
+            if x[axis] != last[i][axis]:
+                interrupted[world[i]] = 1
+                interrupted[interrupted.shape[0] - 1] = 1
+
+
+@wp.kernel(enable_backward=False)
+def _write_bodies(
+    # in
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_inv_mass: wp.array[float],
+    body_flags: wp.array[int],
+    worlds: int,
+    # in and out
+    motion: Motion,
+):
+    """Writes poses, velocities and inverse masses of bodies at the end of the step.
+
+    A body whose pose or velocity is not finite is left to the inner solver, and so is one that is in all of several
+    worlds.
+    """
+    body = wp.tid()
+    pose = body_q[body]
+    velocity = body_qd[body]
+    movable = wp.isfinite(wp.transform_get_translation(pose)) and wp.isfinite(wp.transform_get_rotation(pose))
+    movable = movable and wp.isfinite(wp.length(velocity)) and body_flags[body] & BodyFlags.KINEMATIC == 0
+    movable = movable and (worlds <= 1 or motion.bodies.world[body] >= 0)
+    motion.bodies.end[body] = pose
+    motion.bodies.velocity[body] = velocity
+    motion.bodies.inverse_mass[body] = wp.where(movable, body_inv_mass[body], 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def _write_end(
+    # in
+    placement: _Placement,
+    particle_qd: wp.array[wp.vec3],
+    dt: float,
+    last: wp.array[wp.vec3],
+    plane_world: wp.array[int],
+    # in and out
+    motion: Motion,
+    # out
+    plane_starts: wp.array[wp.vec4d],
+    plane_ends: wp.array[wp.vec4d],
+):
+    """Writes positions, velocities and planes at the end of a step.
+
+    Velocities are those of particles and movable bodies as they are, and those of other shapes from their positions. A
+    vertex without a finite position at the end stands where it was. What nothing moves starts where the last step left
+    it: a program that animates it between steps would otherwise take it past what is in its way unseen.
+    """
+    i = wp.tid()
+    if last and i < plane_ends.shape[0] and not _is_movable(motion, placement.plane_body[i]):
+        if continues(motion, plane_world[i]) and wp.isfinite(plane_ends[i]):
+            plane_starts[i] = plane_ends[i]
+    _place_plane(placement, i, plane_ends)
+    if i >= motion.x1.shape[0]:
+        return
+    if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
+        if continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
+            motion.x0[i] = last[i]
+    x0 = motion.x0[i]
+    x1 = _position(placement, i)
+    velocity = (x1 - x0) / dt
+    if i < particle_qd.shape[0]:
+        velocity = particle_qd[i]
+    elif moves_with_body(motion, i):
+        velocity = predicted_velocity(motion, i, x1)
+    finite = wp.isfinite(x1) and wp.isfinite(velocity)
+    motion.x1[i] = wp.where(finite, x1, x0)
+    motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
+    motion.is_not_finite[i] = wp.where(finite, 0, 1)
+
+
+def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
+    """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
+    if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
+        return np.empty(0, dtype=int)
+    state = model.state()
+    assert model.joint_q is not None and model.joint_qd is not None and model.body_q is not None
+    assert state.body_q is not None
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    placed, given = state.body_q.numpy(), model.body_q.numpy().copy()  # of the CPU, it is the model's own memory
+    given[(placed[:, 3:] * given[:, 3:]).sum(axis=1) < 0.0, 3:] *= -1.0  # the same rotation
+    return np.flatnonzero(np.abs(placed - given).max(axis=1) > _SAME_POSE)
+
+
+class ModelMotion:
+    """The input of :meth:`.response.Response.resolve`, whose buffers are reused from step to step.
+
+    Attributes:
+        vertices: The vertices, :class:`.buffers.Motion`.
+        planes: The infinite planes, :class:`.planes.MovingPlanes`.
+        mesh: The mesh.
+        friction: The coefficients of its vertices and planes.
+        moves_bodies: Whether the response can move bodies.
+        keeps_poses: Whether poses of bodies at the start and end are kept: then, or if the model requires gradients.
+    """
+
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        friction: Friction,
+        *,
+        moves_bodies: bool = False,
+        responds_to_bodies: bool = False,
+    ):
+        """Allocates buffers.
+
+        Args:
+            mesh: The mesh.
+            friction: The coefficients of its vertices and planes.
+            moves_bodies: Whether the response can move bodies.
+            responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
+        """
+        self.mesh, self.friction = mesh, friction
+        self.vertices = vertices = Motion()
+        for name in ("x0", "x1", "velocity"):
+            setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
+        vertices.is_not_finite = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
+        vertices.interrupted = wp.zeros(max(1, mesh.model.world_count) + 1, dtype=int, device=mesh.device)
+        self._last: wp.array[wp.vec3] | None = None
+        vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
+        vertices.friction = friction.vertices
+        if mesh.distances is not None:
+            vertices.distances = mesh.distances
+        self.planes = planes = MovingPlanes()
+        planes.friction, planes.world = friction.planes, mesh.device_planes.world
+        planes.shape, planes.body = mesh.device_planes.shape, mesh.device_planes.body
+        for name in ("start", "end"):
+            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=mesh.device))
+        self._size = max(mesh.vertex_count, len(friction.planes))
+        self.moves_bodies = moves_bodies
+        if moves_bodies:
+            vertices.bodies = self._allocate_bodies()
+            vertices.bodies.responds = int(responds_to_bodies)
+        self.keeps_poses = moves_bodies or bool(mesh.model.requires_grad and mesh.model.body_count)
+        if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
+            for name in ("start", "end"):
+                poses = wp.zeros(mesh.model.body_count, dtype=wp.transform, device=mesh.device)
+                setattr(vertices.bodies, name, poses)
+
+    def _allocate_bodies(self):
+        """Returns the bodies of the model, with buffers for their motion."""
+        mesh, bodies = self.mesh, Bodies()
+        model, device = mesh.model, mesh.device
+        pairs = np.sort(np.array(list(model.shape_collision_filter_pairs), dtype=np.int64).reshape(-1, 2), axis=1)
+        filtered = np.unique(model.shape_count * pairs[:, 0] + pairs[:, 1])
+        bodies.filtered = wp.array(filtered, dtype=wp.int64, device=device)
+        bodies.shape = mesh.device_shape_vertices.shape
+        bodies.shape_flags, bodies.shape_collision_group = model.shape_flags, model.shape_collision_group
+        bodies.particle_count = model.particle_count
+        of_vertex = np.concatenate([np.full(model.particle_count, -1, dtype=np.int32), mesh.shape_vertices.body])
+        bodies.of_vertex = wp.array(of_vertex, dtype=int, device=device)
+        bodies.position = mesh.device_shape_vertices.position
+        bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
+        bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
+        bodies.inverse_mass = wp.zeros(model.body_count, dtype=float, device=device)
+        bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
+        return bodies
+
+    def remember(self, last: wp.array[wp.vec3]) -> None:
+        """Makes what the response cannot move start a step where it was at the end of the last one.
+
+        Not in worlds in which a movable particle is elsewhere than then: those were set to another state. The first
+        step starts where the model puts vertices and planes, as set by :meth:`set_start` and :meth:`set_end`; but those
+        of bodies that the joint coordinates of the model put elsewhere start where the state of the step has them,
+        since a program that evaluates these does not move them.
+
+        Args:
+            last: Positions of the vertices at the end of the last step, which the response keeps.
+        """
+        self._last = last
+        positions, planes = self.vertices.x0.numpy().copy(), self.planes.end.numpy().copy()
+        misplaced = _find_misplaced_bodies(self.mesh.model)
+        first = self.mesh.model.particle_count
+        positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
+        planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
+        last.assign(positions)
+        self.planes.end.assign(planes)
+
+    def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
+        """Makes the next step begin where its state is.
+
+        Args:
+            world_mask: The worlds, then whether what is in all of them, shape [world_count + 1]; None for everything.
+        """
+        interrupted = self.vertices.interrupted
+        if world_mask is None:
+            interrupted.fill_(1)
+        else:
+            inputs, outputs = [world_mask], [interrupted]
+            wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
+
+    def starts(self) -> list[wp.array]:
+        """Returns the arrays that say where the next step begins: to repeat a step, set them to what they were."""
+        arrays: list[wp.array] = [self.vertices.interrupted]
+        return arrays if self._last is None else [*arrays, self._last, self.planes.end]
+
+    def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
+        """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""
+        vertices = self.vertices
+        self.mesh.check_lengths(particle_q, body_q, vertices.x0)
+        inputs = [self._placement(particle_q, body_q), self._last, vertices.inverse_mass, vertices.world]
+        outputs = [vertices.x0, self.planes.start, vertices.interrupted]
+        wp.launch(_write_start, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        if self.keeps_poses:
+            wp.copy(self.vertices.bodies.start, body_q)
+
+    def set_end(
+        self,
+        particle_q: wp.array[wp.vec3] | None,
+        particle_qd: wp.array[wp.vec3] | None,
+        body_q: wp.array[wp.transform] | None,
+        dt: float,
+        body_qd: wp.array[wp.spatial_vector] | None = None,
+    ) -> None:
+        """Copies the predicted positions and velocities at the end of a step of length ``dt`` [s], after its start.
+
+        Velocities of bodies are needed only where the response can move bodies.
+        """
+        self.mesh.check_lengths(particle_q, body_q, self.vertices.x1)
+        if self.moves_bodies:
+            self.set_body_ends(body_q, body_qd)
+        elif self.keeps_poses:
+            wp.copy(self.vertices.bodies.end, body_q)
+        inputs = [self._placement(particle_q, body_q), particle_qd, dt, self._last, self.planes.world]
+        outputs = [self.vertices, self.planes.start, self.planes.end]
+        wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+
+    def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
+        """Copies the predicted poses and velocities of bodies, but not the positions of their vertices."""
+        model = self.mesh.model
+        inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
+        wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)
+
+    def _placement(self, particle_q, body_q):
+        mesh, placement = self.mesh, _Placement()
+        placement.particle_q, placement.body_q = particle_q, body_q
+        placement.shape_vertex_position = mesh.device_shape_vertices.position
+        placement.shape_vertex_body = mesh.device_shape_vertices.body
+        planes = mesh.device_planes
+        placement.plane_point, placement.plane_normal, placement.plane_body = planes.point, planes.normal, planes.body
+        return placement

@@ -1,0 +1,200 @@
+"""Device data of the response: the motion that comes in, the vertices and constraints worked on, and the status."""
+
+import warp as wp
+
+from ...detection.approach_phase import MinDistances
+
+PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
+"""Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity, dividing planes moved it,
+its path was cut, it was left where it was, it was left there because its predicted position was not finite, it was
+divided from contacts without constraints."""
+
+NEVER = wp.constant(wp.int64(2**62))
+"""The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
+
+SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
+"""Columns of the sums of a world: their number; the number of moments, which are mass, mass by position, its six second
+moments, and mass by the squared change of velocity; where they begin, behind the torque; and the column that is not 0
+if a contact is with something that is not free."""
+
+
+@wp.struct
+class Bodies:
+    """The rigid bodies, and the motion that the inner solver wants of them; empty if the response moves none.
+
+    Velocities are those of centres of mass, as in ``newton.State.body_qd``.
+    """
+
+    responds: int  # 1 if the response keeps bodies apart from each other and from static shapes
+    of_vertex: wp.array[int]  # body of a vertex of a shape, -1 of particles and of static shapes
+    shape: wp.array[int]  # of a vertex of a shape
+    shape_flags: wp.array[int]  # as in newton.Model, of shapes
+    shape_collision_group: wp.array[int]
+    filtered: wp.array[wp.int64]  # pairs of shapes that do not collide, the smaller times their number plus the other
+    particle_count: int  # the vertices of shapes follow the particles
+    position: wp.array[wp.vec3]  # of a vertex of a shape, in the frame of its body [m]
+    com: wp.array[wp.vec3]  # centre of mass in the frame of the body [m]
+    world: wp.array[int]
+    mass: wp.array[float]  # [kg]
+    inertia: wp.array[wp.mat33]  # about the centre of mass, in the frame of the body [kg m^2]
+    inverse_inertia: wp.array[wp.mat33]
+    inverse_mass: wp.array[float]  # [1/kg], 0 where the response cannot move the body in this step
+    start: wp.array[wp.transform]  # pose at the start of the step
+    end: wp.array[wp.transform]  # predicted pose at its end
+    velocity: wp.array[wp.spatial_vector]  # predicted velocity at its end, linear and angular [m/s, rad/s]
+
+
+@wp.struct
+class MovedBodies:
+    """The bodies as the response moves them; empty if it moves none."""
+
+    pose: wp.array[wp.transform]  # at the end of the step
+    velocity: wp.array[wp.spatial_vector]  # at its end
+    centre: wp.array[wp.vec3d]  # of mass, where impulses act: as predicted, and in the end as moved [m]
+    inverse_inertia: wp.array[wp.mat33d]  # there, in the frame of the world
+    active: wp.array[int]  # active constraints of the body
+    moved: wp.array[int]  # 1 if its vertices are to follow
+    delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
+    delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
+    share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see bodies.find_body_shares
+    first_contact: wp.array[wp.int64]  # of its vertices, see bodies.first_contact_of_body
+    loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
+
+
+@wp.struct
+class Motion:
+    """The motion that the inner solver wants, and properties of its vertices. The response only reads it."""
+
+    x0: wp.array[wp.vec3]  # positions at the start of the step [m]
+    x1: wp.array[wp.vec3]  # predicted positions at its end [m]
+    velocity: wp.array[wp.vec3]  # predicted velocities at its end [m/s]
+    is_not_finite: wp.array[int]  # 1 where what was predicted is not finite: the vertex stands
+    inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved by itself
+    friction: wp.array[float]  # coefficient
+    world: wp.array[int]
+    bodies: Bodies
+    distances: MinDistances  # that pairs are to keep; empty if they only must not touch
+    interrupted: wp.array[int]  # by world, then of any: 1 where the program moved a movable particle between steps
+
+
+@wp.struct
+class Vertices:
+    """The vertices as the response moves them."""
+
+    x1: wp.array[wp.vec3]  # positions at the end of the step [m]
+    velocity: wp.array[wp.vec3]  # velocities at its end [m/s]
+    active: wp.array[int]  # active constraints that move the vertex
+    particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see projection.add_delta
+    particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
+    first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
+    changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
+    outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED
+    bodies: MovedBodies
+
+
+@wp.struct
+class Constraints:
+    """Contacts of this and earlier iterations as constraints, so that resolving one does not bring back another.
+
+    A constraint keeps two contact points apart along a normal at the end of the step.
+    """
+
+    count: wp.array[int]
+    vertices: wp.array[wp.vec4i]
+    weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
+    normal: wp.array[wp.vec3d]
+    separation: wp.array[wp.float64]  # along the normal [m]
+    least: wp.array[wp.float64]  # part of it that is the minimum distance [m]; empty without minimum distances
+    friction: wp.array[float]  # coefficient
+    kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
+    plane: wp.array[int]  # of a contact with a plane
+    within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
+    toi: wp.array[wp.float64]  # time of impact
+    approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
+    pace: wp.array[int]  # see constraints.Pace
+    position_multiplier: wp.array[wp.vec3d]  # [kg m]
+    velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
+    previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum
+    last_sweep: wp.array[int]  # in which it was active last
+    active_set: wp.array[int]  # indices of the active constraints
+    active_count: wp.array[wp.int64]
+
+
+@wp.func
+def has_final_velocity(outcome: int) -> bool:
+    """Returns whether the velocity of a vertex follows from its path, and constraints do not change it."""
+    cut = outcome & (DIVIDED | TRUNCATED) == TRUNCATED
+    return cut or outcome & (FROZEN | NOT_FINITE | UNCONSTRAINED) != 0
+
+
+def allocate_vertices(count, device) -> Vertices:
+    """Returns vertices without contacts."""
+    vertices = Vertices()
+    for name in ("x1", "velocity"):
+        setattr(vertices, name, wp.zeros(count, dtype=wp.vec3, device=device))
+    for name in ("active", "changed", "outcome"):
+        setattr(vertices, name, wp.zeros(count, dtype=int, device=device))
+    for name in ("particle_delta_x", "particle_delta_v"):
+        setattr(vertices, name, wp.zeros((count, 3), dtype=wp.int64, device=device))
+    vertices.first_contact = wp.full(count, int(NEVER), dtype=wp.int64, device=device)
+    return vertices
+
+
+def allocate_bodies(count, device) -> MovedBodies:
+    """Returns bodies that nothing has moved."""
+    bodies = MovedBodies()
+    for name, var in MovedBodies.vars.items():
+        shape = (count, 6) if var.type.ndim == 2 else count
+        setattr(bodies, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
+    return bodies
+
+
+def allocate_constraints(capacity, device, *, keep_distances: bool = False) -> Constraints:
+    """Returns constraints, none yet, with this capacity."""
+    constraints = Constraints()
+    for name, var in Constraints.vars.items():
+        setattr(constraints, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
+    if not keep_distances:
+        constraints.least = wp.empty(0, dtype=wp.float64, device=device)
+    constraints.count = wp.zeros(1, dtype=int, device=device)
+    constraints.active_count = wp.zeros(1, dtype=wp.int64, device=device)
+    return constraints
+
+
+NO_NODE = wp.constant(-1)
+
+
+@wp.struct
+class DividingPlanes:
+    """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
+
+    The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices.
+    """
+
+    count: wp.array[int]  # of planes, whether they fit or not
+    normal: wp.array[wp.vec3d]
+    offset: wp.array[wp.float64]  # coordinate along the normal [m]
+    half: wp.array[wp.float64]  # of the minimum distance of both elements [m]; empty without minimum distances
+    margin: wp.array[float]  # by which projection exceeds it [m]
+    split: wp.array[wp.int8]  # the first corner that stays below
+    next: wp.array[int]  # the next node in the list of the same vertex, or the end
+    first: wp.array[int]  # node of a vertex, or the end
+    kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
+
+
+def allocate_dividing_planes(
+    vertices: int, capacity: int, device: wp.Device, *, keep_distances: bool = False
+) -> DividingPlanes:
+    """Returns lists without planes for this many vertices, with a capacity for all planes together."""
+    planes = DividingPlanes()
+    planes.count = wp.zeros(1, dtype=int, device=device)
+    planes.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
+    planes.offset = wp.empty(capacity, dtype=wp.float64, device=device)
+    planes.half = wp.empty(capacity if keep_distances else 0, dtype=wp.float64, device=device)
+    planes.margin = wp.empty(capacity, dtype=float, device=device)
+    planes.split = wp.empty(capacity, dtype=wp.int8, device=device)
+    planes.next = wp.empty(4 * capacity, dtype=int, device=device)
+    planes.first = wp.full(vertices, int(NO_NODE), dtype=int, device=device)
+    planes.kept = wp.full(vertices, int(NO_NODE), dtype=int, device=device)
+    return planes

@@ -1,0 +1,286 @@
+"""The buffers that a step works on, and launches of kernels over their elements."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ...detection.intersections import CrossingCandidates
+from ...detection.pipeline import DetectionPipeline
+from ...detection.settings import capacity_for
+from ..schedule import SolveStatus, allocate_status, clear_status
+from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
+from .mesh import Connectivity, ModelMesh
+from .motion import ModelMotion
+from .record import StepRecord, StepRecorder, record_offsets
+from .structs import (
+    NEVER,
+    NO_NODE,
+    NOT_FINITE,
+    SUMS,
+    Constraints,
+    DividingPlanes,
+    Motion,
+    Vertices,
+    allocate_bodies,
+    allocate_constraints,
+    allocate_dividing_planes,
+    allocate_vertices,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _begin(
+    # in
+    motion: Motion,
+    worlds: int,
+    # out
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    status: SolveStatus,
+):
+    """Initializes the vertices by their prediction, and clears everything else."""
+    i = wp.tid()
+    if i == 0:
+        clear_status(status)
+        constraints.count[0] = 0
+        dividing.count[0] = 0
+    if i < worlds:
+        status.contact_iteration[i] = -1
+        status.is_fast[i] = 0
+    if i <= worlds:
+        motion.interrupted[i] = 0
+    if i >= vertices.x1.shape[0]:
+        return
+    for axis in range(3):
+        if motion.x0[i][axis] != vertices.x1[i][axis]:  # moved between steps
+            status.loop.recount[0] = 1
+    vertices.x1[i] = motion.x1[i]
+    vertices.velocity[i] = motion.velocity[i]
+    for axis in range(3):
+        vertices.particle_delta_x[i, axis] = wp.int64(0)
+        vertices.particle_delta_v[i, axis] = wp.int64(0)
+    vertices.first_contact[i] = NEVER
+    vertices.changed[i] = 0
+    vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
+    dividing.first[i] = NO_NODE
+    dividing.kept[i] = NO_NODE
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """The result of a step; the next step overwrites its arrays.
+
+    Attributes:
+        vertices: The vertices as they were moved.
+        constraints: The constraints that moved them.
+        status: The solve status at the end.
+    """
+
+    vertices: Vertices
+    constraints: Constraints
+    status: SolveStatus
+
+
+class Workspace:
+    """The buffers that a step works on, reused from step to step, on one device.
+
+    Attributes:
+        detector: The detector of contacts.
+        crossing_candidates: The detector of edges that may cross faces.
+        mesh: The mesh.
+        connectivity: Its elements, for kernels.
+        motion: The motion of the step that is being resolved; it is only read.
+        vertices: The vertices and bodies as they are moved.
+        constraints: The constraints.
+        dividing: The dividing planes; without arrays if steps may be recorded.
+        status: The solve status.
+        status_values: The arrays that the parts of ``status`` are views of.
+        recorder: Records the step for its adjoint, or None.
+        record: The record, which may be empty.
+        separation: Distance that projection moves contacts apart [m].
+        tolerance: Tolerance of constraints on positions [m].
+        restitution: Share of the approaching velocity that comes back, array of one float.
+        differentiable: Whether steps may be recorded.
+        worlds: Number of worlds.
+        device: The device.
+    """
+
+    motion: ModelMotion
+
+    def __init__(
+        self,
+        mesh: ModelMesh,
+        *,
+        separation: float,
+        restitution: wp.array[float],
+        differentiable: bool,
+        moves_bodies: bool,
+        max_iterations: int,
+    ):
+        """Allocates buffers.
+
+        Args:
+            mesh: The mesh.
+            separation: Distance that projection moves contacts apart [m].
+            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
+            differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not
+                divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
+            moves_bodies: Whether motions have bodies that can be moved.
+            max_iterations: Iterations of detect and project.
+        """
+        self.mesh, self.device = mesh, mesh.device
+        self.separation, self.restitution = separation, restitution
+        self.differentiable, self.keeps_distances = differentiable, mesh.distances is not None
+        self.tolerance = 0.0 if differentiable else TOLERANCE * separation
+        self.worlds = max(1, mesh.model.world_count)
+        self.particle_count, self.shape_vertex_count = (
+            mesh.model.particle_count,
+            mesh.vertex_count - mesh.model.particle_count,
+        )
+        self.body_count = mesh.model.body_count if moves_bodies else 0
+        device = self.device
+        pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
+        self.crossing_candidates = CrossingCandidates(mesh)
+        self.connectivity = Connectivity()
+        self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges
+        self.connectivity.vertex_edges = mesh.device_vertex_edges
+        self.connectivity.edge_faces = mesh.device_edge_faces
+        self.vertices = allocate_vertices(mesh.vertex_count, device)
+        if moves_bodies:
+            self.vertices.bodies = allocate_bodies(self.body_count, device)
+        self.constraints = allocate_constraints(0, device)
+        self._retired: list[Constraints] = []
+        capacity = DIVIDING_PLANES * self.particle_count
+        self._dividing_planes = allocate_dividing_planes(
+            mesh.vertex_count, capacity, device, keep_distances=self.keeps_distances
+        )
+        self.dividing = DividingPlanes() if differentiable else self._dividing_planes
+        limits = {"max_iterations": max_iterations, "recorded": differentiable}
+        self.status, self.status_values = allocate_status(self.worlds, device, **limits)
+        self.recorder: StepRecorder | None = None
+        self.record = StepRecord()
+        self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
+        plane_worlds = mesh.planes.world
+        planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
+        self.vertices_at_planes = mesh.vertex_count if moves_bodies else self.particle_count
+        self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
+        self.kept = wp.zeros(1, dtype=int, device=device)
+        self.turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
+        self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
+        self._max_blocks = BLOCKS * device.sm_count
+
+    @property
+    def resolution(self) -> Resolution:
+        """The step as it was resolved last."""
+        return Resolution(self.vertices, self.constraints, self.status)
+
+    def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
+        """Initializes everything for a step.
+
+        Raises:
+            RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
+        """
+        self.motion, self.recorder = motion, recorder
+        self.record = StepRecord()  # which records nothing
+        if recorder is not None:
+            if not self.device.is_capturing:
+                recorder.reserve_entries(MIN_ENTRIES)
+            elif not len(recorder.record.constraint):
+                raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
+            self.record = recorder.begin()
+        outputs = [self.vertices, self.constraints, self._dividing_planes, self.status]
+        size = max(len(self.vertices.x1), self.worlds + 1)
+        self.launch(_begin, size, [motion.vertices, self.worlds], outputs)
+
+    @property
+    def max_contacts(self) -> int:
+        """Contacts that a detection finds at most with its queues as they are."""
+        return self.max_penetrations + sum(len(n.contacts.pairs) for n in self.detector.narrow_phases)
+
+    def reserve(self, more: int) -> None:
+        """Reserves ``more`` constraints, and as many for later iterations; does nothing in a CUDA graph."""
+        old = self.constraints
+        if self.device.is_capturing:
+            return
+        filled = int(old.count.numpy()[0])
+        if len(old.vertices) < filled + more:
+            capacity = filled + ITERATIONS_RESERVED * more
+            self.constraints = new = allocate_constraints(capacity, self.device, keep_distances=self.keeps_distances)
+            for name in Constraints.vars if filled else ():
+                array = getattr(old, name)
+                wp.copy(getattr(new, name), array, count=min(filled, len(array)))
+            self._retired.append(old)  # a CUDA graph may still write to it
+
+    def grow(self) -> bool:
+        """Enlarges the constraints, without the proximities, if those did not fit; returns whether. Synchronizes."""
+        kept, found = (int(count.numpy()[0]) for count in (self.kept, self.constraints.count))
+        if found + self.max_contacts <= len(self.constraints.vertices):
+            return False
+        wp.copy(self.constraints.count, self.kept)
+        self.reserve(self.max_contacts + capacity_for(found - kept, "proximities"))
+        return True
+
+    def record_offsets(self, after: int = 0) -> None:
+        """Records, if the step is recorded, where an iteration begins or, with 1, where the last ended."""
+        if self.recorder is not None:
+            self.launch(record_offsets, 1, [self.constraints, self.status, self.record, after])
+
+    def reserve_entries(self, sweeps: int) -> None:
+        """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
+        if self.recorder is not None and not self.device.is_capturing:
+            self.record = self.recorder.reserve_entries(sweeps * int(self.constraints.count.numpy()[0]))
+
+    def reserve_truncations(self) -> None:
+        """Reserves a truncation for each particle and body, if the step is recorded; does nothing in a CUDA graph."""
+        if self.recorder is not None and not self.device.is_capturing:
+            self.record = self.recorder.reserve_truncations(self.particle_count + self.body_count)
+
+    def launch(self, kernel: wp.Kernel, size: int, inputs: Sequence, outputs: Sequence = ()) -> None:
+        """Launches a kernel on the device."""
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
+
+    def launch_over(self, kernel: wp.Kernel, queues: Sequence, inputs: Sequence) -> None:
+        """Launches a kernel over queues at once: over their entries on the CPU, over their capacity on a GPU.
+
+        On the CPU it runs on one thread, unlike :func:`warp_bsc.detection.launch.launch_over_queue`, because Warp's
+        additions are not atomic there. On a GPU each thread takes several entries, so that capacity costs little.
+
+        Args:
+            kernel: The kernel, which takes an entry of each queue.
+            queues: Queues, each with its counts and the index of its own count.
+            inputs: Arguments of the kernel.
+        """
+        if self.device.is_cpu:
+            entries = max(min(len(queue), int(counts.numpy()[count])) for queue, counts, count in queues)
+            wp.launch(kernel, entries, inputs=inputs, device=self.device)
+        else:
+            entries = max(len(queue) for queue, _counts, _count in queues)
+            wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._max_blocks)
+
+    def launch_over_constraints(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        """Launches a kernel over the constraints."""
+        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
+
+    def launch_over_active_set(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        """Launches a kernel over the active constraints."""
+        self.launch_over(kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], inputs)
+
+    def launch_over_particles(self, kernel: wp.Kernel, inputs: Sequence, *, at_least_once: bool = False) -> None:
+        """Launches a kernel over the particles; ``at_least_once`` even if there are none."""
+        self.launch(kernel, max(self.particle_count, int(at_least_once)), inputs)
+
+    def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
+        """Launches a kernel over the bodies, if they can be moved, with motion and vertices as its first inputs."""
+        if self.body_count:
+            self.launch(kernel, self.body_count, [self.motion.vertices, self.vertices, *inputs])
+
+    def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
+        """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
+        if self.body_count:
+            self.launch(kernel, self.shape_vertex_count, [self.motion.vertices, self.vertices, *inputs])

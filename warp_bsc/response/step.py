@@ -1,0 +1,101 @@
+"""One step: detects the contacts of a predicted motion, and moves vertices until the motion is certified without them.
+
+Read :func:`resolve` first. Conditions are on the device, so that a CUDA graph holds them: ``wp.capture_if`` and
+``wp.capture_while`` call a function if, or as long as, the only element of an array is not 0. What a world does in an
+iteration, when it freezes and what makes a step uncertified stands in :mod:`.schedule`.
+
+Each contact is moved apart at the end of the step, and the new motion is detected again, as far as it changed. Bodies
+that can be moved are projected with the particles, each by its pose, see :mod:`.solve.bodies`. Where the mesh has
+minimum distances, a contact is a pair that comes nearer than it may.
+"""
+
+import warp as wp
+
+from .contacts import detect, proximities
+from .solve import division, positions, velocities
+from .solve.bodies import begin_bodies
+from .state.motion import ModelMotion
+from .state.record import StepRecorder
+from .state.workspace import Resolution, Workspace
+
+
+def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecorder | None = None) -> Resolution:
+    """Returns the motion without its contacts, except for those that cannot be resolved.
+
+    Args:
+        work: The buffers, which the next step overwrites.
+        motion: The predicted motion; it is only read.
+        dt: Length of the step [s].
+        recorder: Records the step for its adjoint; None to record nothing.
+
+    Raises:
+        RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
+    """
+    find_contacts(work, motion, recorder)
+    return resolve_contacts(work, dt)
+
+
+def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
+    """Detects the contacts of a motion, as the first half of :func:`resolve`, with the same arguments and errors."""
+    begin(work, motion, recorder)
+    if work.max_penetrations:
+        work.reserve(work.max_contacts)
+        detect.detect_penetrations(work, ahead=True)
+        work.record_offsets()
+        positions.leave_planes(work)
+    detect.detect(work)  # contacts become constraints; without any the motion is certified, and the step is done
+    work.record_offsets(after=1)
+
+
+def resolve_contacts(work: Workspace, dt: float) -> Resolution:
+    """Resolves the contacts that :func:`find_contacts` found, as the second half of :func:`resolve`."""
+    wp.capture_if(work.status.loop.unfinished, _resolve_contacts, work=work, dt=dt)
+    return work.resolution
+
+
+def _resolve_contacts(work, dt):
+    add_proximities(work)
+    wp.capture_while(work.status.loop.active, _iterate, work=work, dt=dt)
+    work.record_offsets(after=1)
+    wp.capture_if(work.constraints.count, velocities.project, work=work, dt=dt)
+    division.freeze_if_undetected(work)
+
+
+def _iterate(work, dt):
+    """Projects worlds, and divides those that are past their projections; then detects what has changed."""
+    work.record_offsets()
+    positions.project(work)
+    division.divide(work, dt)
+    detect.detect(work, only_changed=True)
+
+
+def add_proximities(work: Workspace) -> None:
+    """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
+    wp.capture_if(work.status.loop.active, proximities.add_proximities, work=work)
+
+
+def prepare(work: Workspace, motion: ModelMotion) -> None:
+    """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
+    resolve(work, motion, 1.0)
+    for values in work.status_values:
+        values.zero_()
+    work.vertices.outcome.zero_()
+
+
+def inspect(work: Workspace, motion: ModelMotion) -> Resolution:
+    """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
+
+    Args:
+        work: The buffers, which the next step overwrites.
+        motion: The predicted motion; it is only read.
+    """
+    begin(work, motion)
+    detect.detect(work)
+    return work.resolution
+
+
+def begin(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
+    """Initializes vertices and bodies by their prediction, and counts what crosses at the start, which is excluded."""
+    work.begin(motion, recorder)
+    work.launch_over_bodies(begin_bodies)
+    detect.detect_crossings(work)

@@ -1,0 +1,1 @@
+"""Steps that are taken again in substeps of the inner solver."""

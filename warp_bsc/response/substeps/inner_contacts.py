@@ -1,0 +1,310 @@
+"""Contacts for the inner solver in coupled steps: those of the program, without those that the stage resolves.
+
+Newton's contacts of particles with shapes are stiff springs, at rest where a particle is its radius away from the
+shape. The stage lets particles rest at the shape itself. If both acted, a long step would end where the springs let it,
+its elements stretched as far as the iterations of the inner solver leave them, and the stage would find no contact that
+asks for substeps. The first step in substeps would start from this stretch, and release its energy at once. So one of
+the two resolves a contact, in whole steps and in substeps alike, and where it can, that is the stage.
+"""
+
+import contextlib
+import copy
+from collections.abc import Iterator
+
+import newton
+import numpy as np
+import warp as wp
+from newton import BodyFlags, GeoType
+from newton.solvers import SolverBase, SolverStyle3D
+
+from ..state.mesh import ModelMesh
+from ..tuning import SHAPE_SAGITTA
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class _SoftContacts:
+    """Newton's contacts of particles, edges and faces with shapes; as in ``newton.Contacts``."""
+
+    indices: wp.array[wp.vec3i]
+    rigid_indices: wp.array[wp.vec3i]
+    particle: wp.array[int]
+    barycentric: wp.array[wp.vec3]
+    shape: wp.array[int]
+    body_pos: wp.array[wp.vec3]
+    body_vel: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    features: wp.array[wp.vec3i]  # empty without contacts of whole surfaces
+
+
+_FIELDS = {name: f"soft_contact_{name}" for name in _SoftContacts.vars} | {"features": "_soft_contact_mesh_features"}
+
+_OVERFLOW = "_soft_contact_source_overflow"
+"""Whether contacts were dropped before they were packed; the last one of ``contact_counters``."""
+
+
+@wp.struct
+class _Stage:
+    """What the stage resolves."""
+
+    depth: wp.array[float]  # [m] below the surface of each shape, from which on a particle has entered it; -1 of planes
+    takes_part: wp.array[bool]  # whether a particle meets shapes other than planes, which all meet
+    shape_body: wp.array[int]
+    body_world: wp.array[int]
+    body_flags: wp.array[int]
+    body_inv_mass: wp.array[float]
+    worlds: int
+    moves_bodies: int
+    leaves_bodies: int  # whether the inner solver moves those that the stage does not
+
+
+@wp.func
+def _resolves(
+    stage: _Stage,
+    contacts: _SoftContacts,
+    i: int,
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+) -> bool:
+    """Returns whether the stage resolves a contact, so that the inner solver need not."""
+    shape = contacts.shape[i]
+    depth = stage.depth[shape]
+    body = stage.shape_body[shape]
+    x = wp.vec3()
+    for corner in range(3):
+        particle = contacts.indices[i][corner]
+        if particle >= 0:
+            if depth >= 0.0 and not stage.takes_part[particle]:
+                return False
+            x += contacts.barycentric[i][corner] * particle_q[particle]
+    point = contacts.body_pos[i]
+    if body >= 0:
+        point = wp.transform_point(body_q[body], point)
+        if stage.body_inv_mass[body] > 0.0 and stage.body_flags[body] & BodyFlags.KINEMATIC == 0:
+            moves = stage.moves_bodies == 1 and (stage.worlds <= 1 or stage.body_world[body] >= 0)
+            if stage.leaves_bodies == 1 and not moves:
+                return False
+    return wp.dot(contacts.normal[i], x - point) >= -wp.max(depth, 0.0)
+
+
+@wp.kernel
+def _pack(
+    # in
+    stage: _Stage,
+    contacts: _SoftContacts,
+    count: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    # out
+    packed: _SoftContacts,
+    packed_count: wp.array[int],
+    overflow: wp.array[int],
+    places: wp.array[int],
+):
+    """Copies the contacts that the stage does not resolve, and writes the place of each among all."""
+    i = wp.tid()
+    if i == 0 and count[0] > contacts.shape.shape[0]:
+        overflow[0] = 1
+    if i >= count[0] or _resolves(stage, contacts, i, particle_q, body_q):
+        return
+    place = wp.atomic_add(packed_count, 0, 1)
+    places[place] = i
+    packed.indices[place] = contacts.indices[i]
+    packed.rigid_indices[place] = contacts.rigid_indices[i]
+    packed.particle[place] = contacts.particle[i]
+    packed.barycentric[place] = contacts.barycentric[i]
+    packed.shape[place] = contacts.shape[i]
+    packed.body_pos[place] = contacts.body_pos[i]
+    packed.body_vel[place] = contacts.body_vel[i]
+    packed.normal[place] = contacts.normal[i]
+    if contacts.features:
+        packed.features[place] = contacts.features[i]
+
+
+@wp.kernel
+def _unpack(
+    # in
+    packed: wp.array[wp.spatial_vector],
+    packed_count: wp.array[int],
+    places: wp.array[int],
+    first: int,
+    # out
+    forces: wp.array[wp.spatial_vector],
+):
+    """Writes the forces of packed contacts to the rows of the contacts that the program passed on."""
+    i = wp.tid()
+    if i < packed_count[0]:
+        forces[first + places[i]] = packed[i]
+
+
+@contextlib.contextmanager
+def without_own_contacts(solver: SolverBase) -> Iterator[None]:
+    """Keeps Style3D from resolving contacts of cloth with itself while it steps: the stage resolves them.
+
+    Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between
+    both, layers that the stage has moved together are thrown apart. Has no effect on other solvers.
+    """
+    if not isinstance(solver, SolverStyle3D):
+        yield
+        return
+    own, solver.collision = solver.collision, None
+    try:
+        yield
+    finally:
+        solver.collision = own
+
+
+class InnerContacts:
+    """Takes the contacts that the stage resolves out of those that a program passes on.
+
+    The stage resolves a contact of particles with a shape if the particles take part in its detection, and start the
+    step outside the shape. What has entered a shape, Newton's contact pushes out, as the stage leaves it alone. The
+    inner solver keeps a contact with a body that it moves, unless the stage pushes that body as well. Contacts of
+    bodies with each other remain.
+    """
+
+    def __init__(self, mesh: ModelMesh, *, moves_bodies: bool):
+        """Notes what the stage resolves.
+
+        Args:
+            mesh: The mesh.
+            moves_bodies: Whether the response can move bodies.
+        """
+        self._model, self._device = mesh.model, mesh.device
+        self._stage = stage = _Stage()
+        model = mesh.model
+        stage.depth = wp.array(_depths(model), dtype=float, device=mesh.device)
+        stage.takes_part = wp.array(_takes_part(mesh), dtype=bool, device=mesh.device)
+        stage.shape_body = model.shape_body
+        if model.body_count:
+            stage.body_world, stage.body_flags = model.body_world, model.body_flags
+            stage.body_inv_mass = model.body_inv_mass
+        stage.worlds, stage.moves_bodies = model.world_count, int(moves_bodies)
+        self._buffers: dict[tuple[int, bool], _Buffers] = {}
+
+    def take_out(
+        self, contacts: newton.Contacts | None, state: newton.State, *, leaves_bodies: bool
+    ) -> newton.Contacts | None:
+        """Returns the contacts for the inner solver.
+
+        Args:
+            contacts: The contacts of the program, which keep what they are.
+            state: The state at the start of the step.
+            leaves_bodies: Whether the inner solver, or a coupler around it, moves bodies that the stage does not.
+        """
+        if contacts is None or not contacts.soft_contact_max or not self._model.particle_count:
+            return contacts
+        key = _key(contacts)
+        if key not in self._buffers or self._buffers[key].in_graph:
+            self._buffers[key] = _Buffers(contacts)
+        buffers, packed = self._buffers[key], self.packed(contacts)
+        self._stage.leaves_bodies = int(leaves_bodies)
+        wp.copy(buffers.counters, contacts.contact_counters)
+        buffers.count.zero_()
+        inputs = [self._stage, _soft(contacts), contacts.soft_contact_count, state.particle_q, state.body_q]
+        outputs = [buffers.contacts, buffers.count, buffers.overflow, buffers.places]
+        wp.launch(_pack, contacts.soft_contact_max, inputs=inputs, outputs=outputs, device=self._device)
+        return packed
+
+    def packed(self, contacts: newton.Contacts) -> newton.Contacts:
+        """Returns the contacts that the inner solver got in the last step instead of those of the program."""
+        buffers = self._buffers.get(_key(contacts))
+        if buffers is None:
+            return contacts
+        packed = copy.copy(contacts)
+        for name, attribute in _FIELDS.items():
+            if getattr(contacts, attribute) is not None:
+                setattr(packed, attribute, getattr(buffers.contacts, name))
+        packed.contact_counters, packed.rigid_contact_count = buffers.counters, buffers.counters[0:1]
+        packed.soft_contact_count = buffers.count
+        setattr(packed, _OVERFLOW, buffers.overflow)
+        return packed
+
+    def unpack(self, forces: wp.array | None, contacts: newton.Contacts | None) -> None:
+        """Moves the forces on packed contacts to the rows of the contacts that the program passed on.
+
+        Args:
+            forces: Forces on all contacts, those of bodies first, as of ``Observables.contact_f``, or None.
+            contacts: The contacts of the program.
+        """
+        buffers = None if forces is None or contacts is None else self._buffers.get(_key(contacts))
+        if forces is None or contacts is None or buffers is None:
+            return
+        first = contacts.rigid_contact_max
+        rows = forces[first : first + contacts.soft_contact_max]
+        if buffers.forces is None:
+            buffers.forces = wp.empty_like(rows, requires_grad=False)
+        wp.copy(buffers.forces, rows)
+        rows.zero_()
+        inputs = [buffers.forces, buffers.count, buffers.places, first]
+        wp.launch(_unpack, contacts.soft_contact_max, inputs=inputs, outputs=[forces], device=self._device)
+
+
+class _Buffers:
+    """Packed contacts, and where they were.
+
+    Attributes:
+        contacts: The packed contacts.
+        counters: As ``Contacts.contact_counters``.
+        count: Number of packed contacts.
+        overflow: Whether contacts did not fit into the buffers of the program.
+        places: Place of each packed contact among all.
+        forces: Forces on the packed contacts; None before any.
+        in_graph: Whether the buffers belong to a CUDA graph, so that they are of no use outside it.
+    """
+
+    def __init__(self, contacts):
+        self.contacts = _SoftContacts()
+        for name, attribute in _FIELDS.items():
+            array = getattr(contacts, attribute)
+            if array is not None:
+                setattr(self.contacts, name, wp.empty_like(array, requires_grad=False))
+        self.counters = wp.zeros_like(contacts.contact_counters)
+        self.count, self.overflow = self.counters[1:2], self.counters[3:4]
+        self.places = wp.zeros(contacts.soft_contact_max, dtype=int, device=contacts.device)
+        self.forces: wp.array | None = None
+        self.in_graph = contacts.device.is_cuda and contacts.device.is_capturing
+
+
+def _key(contacts):
+    """Returns the size of buffers for contacts, and whether they may be of whole surfaces."""
+    return contacts.soft_contact_max, getattr(contacts, _FIELDS["features"]) is not None
+
+
+def _soft(contacts):
+    """Returns the arrays of contacts of particles, edges and faces with shapes."""
+    soft = _SoftContacts()
+    for name, attribute in _FIELDS.items():
+        array = getattr(contacts, attribute)
+        if array is not None:
+            setattr(soft, name, array)
+    return soft
+
+
+def _depths(model):
+    """Returns how deep below the surface of each shape a particle may rest on its triangles [m]; -1 for planes.
+
+    The triangles of a round shape lie below its surface, so that what rests on them has not entered it.
+    """
+    kind, scale = model.shape_type.numpy(), model.shape_scale.numpy().astype(np.float64)
+    x, y, z = scale.T
+    bulge = np.where(z > y, z - np.sqrt(np.maximum(z * z - y * y, 0.0)), np.where(z > 0.0, y, 0.0))  # of a barrel
+    radius = np.zeros(len(kind))
+    radius[np.isin(kind, (GeoType.SPHERE, GeoType.CAPSULE, GeoType.CONE))] = 1.0
+    radius *= x
+    radius = np.where(kind == GeoType.CYLINDER, x + bulge, radius)
+    radius = np.where(kind == GeoType.ELLIPSOID, scale.max(axis=1), radius)
+    infinite = (kind == GeoType.PLANE) & (scale[:, :2] <= 0.0).any(axis=1)
+    return np.where(infinite, -1.0, SHAPE_SAGITTA * radius)
+
+
+def _takes_part(mesh):
+    """Returns whether particles take part in the detection, or lie inside soft bodies, behind others that do."""
+    model = mesh.model
+    takes_part = np.zeros(mesh.vertex_count, dtype=bool)
+    takes_part[mesh.edges] = True
+    takes_part[mesh.points] = True
+    if model.tet_indices is not None:
+        takes_part[model.tet_indices.numpy()] = True
+    return takes_part[: model.particle_count]

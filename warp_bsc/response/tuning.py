@@ -1,0 +1,112 @@
+"""Numbers that were tuned, all in one place; limits on iterations and sweeps stand in :mod:`.schedule`."""
+
+import warp as wp
+
+# separations
+SEPARATION = 5e-3
+"""Default distance that contacts are moved apart, as a share of the median edge length."""
+TOLERANCE = 0.1
+"""Tolerance of constraints on positions, as a share of the separation."""
+SLOW_PATH = wp.constant(wp.float64(0.5))
+"""Longest path of slow elements, as a share of their shortest side."""
+RESTING_PATH = wp.constant(wp.float64(4.0))
+"""Longest path of proximities at rest, in separations. Dividing planes do not move: they would stop pairs that travel
+together and part pairs that slide."""
+RECOVERY = wp.constant(wp.float64(0.25))
+"""Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
+apart further than they fall in a step hop, and slide meanwhile."""
+REST = wp.constant(wp.float64(0.25))
+"""Distance of what may rest from slow elements, as a share of their longest path, from which it does not grow: what is
+further apart than it comes in a step does not collide in the next, and falls freely every few steps."""
+ROUNDING = wp.constant(wp.float64(2.0**-20))
+"""Least distance of what rests, as a share of its coordinates: 16 times their rounding, which closes smaller ones."""
+SMALL_DISTANCE = wp.constant(wp.float64(0.1))
+"""Least distance of other slow elements as a share of the separation, however short their paths are: a distance that is
+nearly 0 is closed again by the rounding of positions."""
+MAX_SAGITTA = wp.constant(wp.float64(4.0))
+"""Most that the turn of a body adds to the separation of a contact, in separations."""
+
+# proximities and occluded edges
+REACH = wp.constant(wp.float64(1.5))
+"""Distance in separations up to which pairs are proximities even if they stand still: neighbours in a stack."""
+BEHIND = wp.constant(wp.float64(1.5))
+"""Distance, as a multiple of that of the nearest face in its direction, from which an element is behind that face."""
+BEND_OF_SHEET, BEND_OF_BODY = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e-3))
+"""Sines of the angles by which a sheet may bend towards a body, and a body towards a sheet, which rounding allows."""
+
+# sweeps
+RELAXATION = wp.constant(wp.float64(1.5))
+"""Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
+PUSHING_MOMENTUM = wp.constant(wp.float64(0.5))
+"""Largest momentum of a multiplier that only pushes."""
+SLIDING = wp.constant(wp.float64(0.999))
+"""Share of the friction limit from which a contact slides."""
+CREEP = wp.constant(wp.float64(0.1))
+"""Longest path of a contact that friction holds, as a share of the tolerance; it adds up over steps."""
+TOLERANCE_OF_BODIES = wp.constant(wp.float64(0.1))
+"""Tolerance of a constraint on a body as a share of that of others: a body moves as one, so that its motion shows."""
+TOLERANCE_OF_DISTANCE = wp.constant(wp.float64(0.5))
+"""Largest tolerance of a position constraint as a share of its separation: elements that it holds stay apart."""
+TOLERANCE_OF_CHANGE = wp.constant(wp.float64(0.1))
+"""Largest tolerance of a contact with a plane as a share of its change by projection: what rests moves very little."""
+CLOSE_EDGES = wp.constant(wp.float64(0.1))
+"""Distance of edges in a proximity at the start, as a share of their separation, below which they are projected in any
+case: dividing planes keep a share of the distance, which becomes ever smaller where something presses."""
+MAX_TURN = wp.constant(wp.float64(0.1))
+"""Largest turn that restores angular momentum, as a share of the velocity changes by contacts, root mean square."""
+
+# division and truncation
+SHARE_OF_PATH = wp.constant(wp.float64(0.9))
+"""Share of the way to its first contact that a truncated vertex goes, and a body whose vertices have no planes."""
+MARGIN = wp.constant(wp.float64(0.2))
+"""Least distance from a dividing plane after projection, as a share of the elements' distance at the start."""
+CLOSE_MARGIN = wp.constant(wp.float64(0.45))
+"""The same of elements so close that they may hardly come nearer, step after step: positions are rounded."""
+SLACK = wp.constant(wp.float64(0.05))
+"""How much farther than that both are from the plane at the start at least, as a share of their distance."""
+WEDGE = wp.constant(wp.float64(4.0))
+"""Most that a vertex may be moved, beyond its path, in multiples of how far the start is below a plane."""
+MAX_PLANE_STEPS = wp.constant(64)
+"""Steps of the projection of a vertex onto its planes: it takes 4 on average, and 21 at most were seen."""
+
+# infinite planes
+PLANE_MARGIN = wp.constant(wp.float64(0.1))
+"""Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
+PLANE_APPROACH = wp.constant(wp.float64(0.25))
+"""Most of that, as a share of how far the vertex would be if it stood still: see :mod:`.contacts.dividing_planes`."""
+PLANE_DEPTH = wp.constant(wp.float64(0.05))
+"""Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
+
+# contact layer
+LAYER_THICKNESS = 0.25, 0.45
+"""Default thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
+PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
+"""Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
+points jump, and vertices hold them."""
+
+# substeps
+SUBSTEPS = (2, 4, 8, 16, 32)
+"""Numbers of substeps that ``"auto"`` chooses from; a CUDA graph contains the substep of each."""
+STRAIN = wp.constant(0.01)
+"""Strain by contacts that ``"auto"`` leaves to a substep: elongation of an edge of cloth beyond its length at rest, or
+change of the length of an edge in a soft body, as a share of that length."""
+COMPRESSION = wp.constant(0.25)
+"""What compression of cloth counts, as a share of the same elongation."""
+
+# rigid shapes
+SEGMENTS = 32
+"""Triangles around a round shape; a multiple of four."""
+SHAPE_SAGITTA = 0.01
+"""Depth of faces of a round shape below its surface, as a share of its radius, at most."""
+
+# capacities
+PAIRS_PER_FACE = 32
+"""Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow."""
+DIVIDING_PLANES = 32
+"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
+ITERATIONS_RESERVED = 3
+"""Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
+MIN_ENTRIES = 4096
+"""Least capacity of a record for active constraints, summed over sweeps."""
+BLOCKS = 8
+"""Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
