@@ -292,8 +292,8 @@ def main():
                 flush=True,
             )
     print(
-        f"{arguments.count} scenes, {coupled} steps in substeps, {uncertified} scenes with uncertified steps. Kinetic and "
-        f"potential energy rise by more than {RISE:.0%} in {rising}, in {worse} of which that of the inner solver "
+        f"{arguments.count} scenes, {coupled} steps in substeps, {uncertified} scenes with uncertified steps. Kinetic "
+        f"and potential energy rise by more than {RISE:.0%} in {rising}, in {worse} of which that of the inner solver "
         f"does not; with elastic energy in {strained}, in {more_strained} of which more than in whole steps"
     )
     return 1 if worse else 0
