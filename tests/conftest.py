@@ -1,5 +1,6 @@
 """Settings of the test run: one device for all tests, what tests need, quiet Warp, repeatable hypothesis."""
 
+import gc
 import os
 import signal
 
@@ -8,6 +9,7 @@ import pytest
 import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
+from compilation import compile_kernels_once
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
@@ -15,6 +17,7 @@ import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variabl
 
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
+compile_kernels_once()
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
 hypothesis.settings.load_profile("repeatable")
 
@@ -28,8 +31,9 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """Sets what must be set before any kernel is loaded or array made, and signals as a terminal has them."""
-    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
-        if signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
+    for name, handler in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number and signal.getsignal(number) == signal.SIG_IGN:  # as a shell has it for programs in the background
             signal.signal(number, handler)
     if config.getoption("--sanitize"):
         if not sanitizers_available():
@@ -61,6 +65,12 @@ def pytest_collection_modifyitems(items):
         for marker, skip in missing.items():
             if item.get_closest_marker(marker):
                 item.add_marker(skip)
+
+
+def pytest_collection_finish():
+    """Keeps what the imports have made, which lives as long as the run, out of every later collection of garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -165,8 +165,9 @@ def brute_force(kind, query):
     with localcontext() as context:
         context.prec = DIGITS
         times = {Decimal(0), Decimal(1)}
+        positions = [position(t) for t in range(max(degree for _, degree, _ in functions) + 1)]
         for function, degree, row in functions:
-            values = [function(*(position(t)[i] for i in row)) for t in range(degree + 1)]
+            values = [function(*(x[i] for i in row)) for x in positions[: degree + 1]]
             times.update(real_roots([Decimal(a.numerator) / a.denominator for a in interpolated(values)]))
         start, end = (
             [[Decimal(x) for x in point] for point in half] for half in (query[:4].tolist(), query[4:].tolist())

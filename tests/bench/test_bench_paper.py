@@ -62,8 +62,8 @@ def test_json_has_everything(capsys):
     assert total <= 3002
     assert sum(scene["decided_by"].values()) == total
     assert list(scene["decided_by"]) == list(STAGES)
-    if total == scene["candidates"]:
-        assert scene["collisions"] == len(collisions.vertex_face) + len(collisions.edge_edge)
+    assert total == scene["candidates"]
+    assert scene["collisions"] == len(collisions.vertex_face) + len(collisions.edge_edge)
     assert scene["errors"]["exact"] == {"hits": scene["collisions"], "false_positives": 0, "false_negatives": 0}
     assert scene["errors"]["conservative"]["false_negatives"] == 0
     assert scene["disagreeing"] == 0

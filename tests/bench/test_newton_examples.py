@@ -200,7 +200,11 @@ def test_an_example_that_fails_is_a_row(write_example, in_this_process, device, 
     ("source", "problem"),
     [
         ("raise RuntimeError('the string broke\\nat its end')", "failed: RuntimeError: the string broke"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "failed: the process was ended by SIGKILL"),
+        pytest.param(
+            "import os, signal; os.kill(os.getpid(), signal.SIGKILL)",
+            "failed: the process was ended by SIGKILL",
+            marks=pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals"),
+        ),
         (
             "import os; print('a {'); os.write(2, b'no room\\n\\n'); os._exit(3)",
             "failed: the process ended with status 3: no room",

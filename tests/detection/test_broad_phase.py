@@ -34,7 +34,7 @@ def find_pairs(broad_phase, mesh, x0, x1):
     finder.pair_edges_with_faces(x0, counts[2], queues[2])
     counts = counts.numpy()
     found = [queue.numpy()[: count[Count.QUEUED]] for queue, count in zip(queues, counts, strict=True)]
-    return counts[:2, Count.CANDIDATES].tolist(), [sorted(map(tuple, pairs.tolist())) for pairs in found]
+    return counts[:2, Count.CANDIDATES].tolist(), [in_lexicographic_order(pairs) for pairs in found]
 
 
 def all_pairs(mesh, x0, x1):
@@ -44,21 +44,28 @@ def all_pairs(mesh, x0, x1):
     world = np.zeros(mesh.vertex_count) if mesh.world is None else mesh.world
     kinds = [(vertices, faces, mesh.vertices, x1), (edges, edges, np.arange(len(edges)), x1)]
     for first, second, numbers, end in [*kinds, (edges, faces, np.arange(len(edges)), x0)]:
-        a = [x.astype(np.float32)[first][:, None] for x in (x0, end)]
-        b = [x.astype(np.float32)[second][None] for x in (x0, end)]
-        low, high = (bound([bound(x, axis=2) for x in a], axis=0) for bound in (np.min, np.max))
-        other_low, other_high = (bound([bound(x, axis=2) for x in b], axis=0) for bound in (np.min, np.max))
-        candidate = ((low <= other_high) & (other_low <= high)).all(axis=2)
-        candidate &= ~(first[:, None, :, None] == second[None, :, None, :]).any(axis=(2, 3))
-        candidate &= world[first[:, :1]] == world[second[:, 0]]
+        a, b = ([x.astype(np.float32)[element] for x in (x0, end)] for element in (first, second))
+        # ends, elements, axes
+        (low, high), (other_low, other_high) = ([bound(x, axis=2) for bound in (np.min, np.max)] for x in (a, b))
+        candidate = world[first[:, :1]] == world[second[:, 0]]
+        for axis in range(3):
+            candidate &= low[..., axis].min(axis=0)[:, None] <= other_high[..., axis].max(axis=0)
+            candidate &= other_low[..., axis].min(axis=0) <= high[..., axis].max(axis=0)[:, None]
         if first is second:
             candidate = np.triu(candidate, 1)
-        below = np.all([x.max(axis=2) < y.min(axis=2) for x, y in zip(a, b, strict=True)], axis=0)
-        above = np.all([x.min(axis=2) > y.max(axis=2) for x, y in zip(a, b, strict=True)], axis=0)
-        candidates.append(int(candidate.sum()))
-        i, j = np.nonzero(candidate & ~(below | above).any(axis=2))
-        near.append(sorted(zip(numbers[i].tolist(), j.tolist(), strict=True)))
+        i, j = np.nonzero(candidate)
+        distinct = ~(first[i][:, :, None] == second[j][:, None]).any(axis=(1, 2))
+        i, j = i[distinct], j[distinct]
+        below, above = (high[:, i] < other_low[:, j]).all(axis=0), (low[:, i] > other_high[:, j]).all(axis=0)
+        candidates.append(len(i))
+        meet = ~(below | above).any(axis=1)
+        near.append(in_lexicographic_order(np.stack([numbers[i[meet]], j[meet]], axis=1)))
     return candidates[:2], near
+
+
+def in_lexicographic_order(pairs):
+    """A list of pairs."""
+    return list(map(tuple, pairs[np.lexsort(pairs.T[::-1])].tolist()))
 
 
 @pytest.mark.slow

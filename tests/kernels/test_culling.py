@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from compilation import QUICK
 from generators import GENERATORS, mostly_hits, uniform
 
 import warp_bsc as bsc
@@ -22,6 +23,7 @@ from warp_bsc.kernels.signs import ROUNDOFF
 KINDS = ("vertex_face", "edge_edge")
 TRUTH = {"vertex_face": checker.vertex_face, "edge_edge": checker.edge_edge}
 DTYPES = (np.float32, np.float64)
+wp.set_module_options(QUICK)
 
 
 @wp.kernel(enable_backward=False)

@@ -4,6 +4,7 @@ import distances
 import numpy as np
 import pytest
 import warp as wp
+from compilation import QUICK
 
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
@@ -15,7 +16,7 @@ DIGITS = 21
 def kernel(limbs):
     decide_distance = decide_distance_in(limbs)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=QUICK)
     def decide(
         kind: int,
         x: wp.array2d[wp.vec3d],

@@ -6,11 +6,12 @@ import warp as wp
 from exact_queries import decide_exactly
 from flushing import subnormals_flushed
 from generators import GENERATORS
+from impacts import impact_kernel
 
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.launch import cores
-from warp_bsc.kernels import FREE, HIT, UNSURE, impact_edge_edge, impact_vertex_face, roots
+from warp_bsc.kernels import FREE, HIT, UNSURE, roots
 from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")
@@ -28,28 +29,6 @@ def around_underflow(rng, n, kind, dtype):
     return np.ldexp(points, np.where(rng.random(exponents.shape) < 0.4, others, exponents)).astype(dtype)
 
 
-def kernel(point):
-    """A user's kernel, for one type of point, with the options that modules have by default."""
-
-    @wp.kernel(enable_backward=False)
-    def ask(edges: bool, x: wp.array2d[point], status: wp.array[int], toi: wp.array[wp.float64]):
-        i = wp.tid()
-        tolerance = wp.float64(9.5367431640625e-07)
-        if edges:
-            impact = impact_edge_edge(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance)
-        else:
-            impact = impact_vertex_face(
-                x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
-            )
-        status[i] = impact.status
-        toi[i] = impact.toi
-
-    return ask
-
-
-KERNELS = {np.float32: kernel(wp.vec3), np.float64: kernel(wp.vec3d)}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", KINDS)
@@ -61,12 +40,15 @@ def test_answers_are_true(kind, dtype):
     interval = getattr(checker, f"{kind}_toi")(points)
     truth = ~np.isnan(interval[:, 0])
     latest = interval[:, 1] + 2.0**-1022
-    status, toi = wp.zeros(n, dtype=int, device="cpu"), wp.zeros(n, dtype=wp.float64, device="cpu")
-    x = wp.array(points, dtype=wp.vec3 if dtype is np.float32 else wp.vec3d, device="cpu")
+    status, _, _, toi, *_ = outputs = [
+        wp.zeros(n, dtype=t, device="cpu") for t in (int, int, int, wp.float64, wp.vec3d, wp.vec3d)
+    ]
+    point = wp.vec3 if dtype is np.float32 else wp.vec3d
+    inputs = [kind == "edge_edge", 2.0**-20, wp.array(points, dtype=point, device="cpu")]
     query = getattr(bsc, f"query_{kind}")
     with subnormals_flushed(), cores(1):
         conservative, exact = (query(points, method=method, device="cpu") for method in ("conservative", "exact"))
-        wp.launch(KERNELS[dtype], n, inputs=[kind == "edge_edge", x], outputs=[status, toi], device="cpu")
+        wp.launch(impact_kernel(point), n, inputs=inputs, outputs=outputs, device="cpu")
         checked = getattr(checker, kind)(points)
         times = [decide_exactly(kind, points, limbs, device="cpu")[0] for limbs in BITS if dtype is np.float64]
     assert np.array_equal(checked, truth)

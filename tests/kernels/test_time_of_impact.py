@@ -7,47 +7,17 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS, grazing, mostly_hits, one_ulp_apart, touching, uniform
+from impacts import impact_kernel
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.kernels import FREE, HIT, UNSURE, impact_edge_edge, impact_vertex_face
+from warp_bsc.kernels import FREE, HIT, UNSURE
 from warp_bsc.kernels.closest import between, closest_coordinates
 
 KINDS = ("vertex_face", "edge_edge")
 TRUTH = {"vertex_face": checker.vertex_face_toi, "edge_edge": checker.edge_edge_toi}
 AIMED = (mostly_hits, uniform, one_ulp_apart, grazing, touching)
 TOLERANCES = [2.0**-4, 2.0**-10, 2.0**-20, 2.0**-30]
-
-
-@wp.kernel(enable_backward=False)
-def find_impacts(
-    edges: bool,
-    x: wp.array2d[wp.vec3d],
-    tolerance: wp.float64,
-    status: wp.array[int],
-    within_tolerance: wp.array[int],
-    toi: wp.array[wp.float64],
-    coordinates: wp.array[wp.vec3d],
-    normal: wp.array[wp.vec3d],
-):
-    i = wp.tid()
-    x0 = x[i, 0]
-    x1 = x[i, 1]
-    x2 = x[i, 2]
-    x3 = x[i, 3]
-    x4 = x[i, 4]
-    x5 = x[i, 5]
-    x6 = x[i, 6]
-    x7 = x[i, 7]
-    if edges:
-        contact = impact_edge_edge(x0, x1, x2, x3, x4, x5, x6, x7, tolerance)
-    else:
-        contact = impact_vertex_face(x0, x1, x2, x3, x4, x5, x6, x7, tolerance)
-    status[i] = contact.status
-    within_tolerance[i] = contact.within_tolerance
-    toi[i] = contact.toi
-    coordinates[i] = contact.coordinates
-    normal[i] = contact.normal
 
 
 @wp.kernel(enable_backward=False)
@@ -72,8 +42,10 @@ def impacts(kind, points, tolerance=2.0**-20):
         "coordinates": wp.zeros(n, dtype=wp.vec3d),
         "normal": wp.zeros(n, dtype=wp.vec3d),
     }
-    inputs = [kind == "edge_edge", wp.array(points.astype(np.float64), dtype=wp.vec3d), tolerance]
-    wp.launch(find_impacts, n, inputs=inputs, outputs=list(outputs.values()))
+    inputs = [kind == "edge_edge", tolerance, wp.array(points.astype(np.float64), dtype=wp.vec3d)]
+    status, within_tolerance, *contacts = outputs.values()
+    grazing = wp.zeros(n, dtype=int)  # says of gradients whether they are clamped
+    wp.launch(impact_kernel(wp.vec3d), n, inputs=inputs, outputs=[status, within_tolerance, grazing, *contacts])
     return SimpleNamespace(**{name: array.numpy() for name, array in outputs.items()})
 
 
@@ -268,11 +240,25 @@ def test_points_that_are_all_the_same_are_in_contact_from_the_start(kind):
 # --- Any tolerance, any scale ---
 
 
+@functools.cache
+def aimed(kind):
+    """Queries that aim at trouble, and the times between which their first contact is, shape (n, 2)."""
+    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
+    return points, TRUTH[kind](points)
+
+
+@functools.cache
+def random(kind):
+    """Queries of which many pass through each other, and the times between which their first contact is."""
+    rng = np.random.default_rng(8)
+    points = np.concatenate([generator(rng, 300, kind, np.float64) for generator in (mostly_hits, uniform)])
+    return points, TRUTH[kind](points)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tolerance", [-np.inf, -1.0, 0.0, 1e-300, np.nan, 2.0**-38])
 def test_tolerances_that_are_too_small_are_the_smallest(kind, tolerance):
-    points = np.concatenate([generator(np.random.default_rng(7), 100, kind, np.float64) for generator in AIMED])
-    times = TRUTH[kind](points)
+    points, times = aimed(kind)
     found = impacts(kind, points, tolerance)
     expected = impacts(kind, points, 2.0**-38)
     for name, values in vars(found).items():
@@ -286,9 +272,7 @@ def test_tolerances_that_are_too_small_are_the_smallest(kind, tolerance):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tolerance", [2.0**-2, 0.3, 0.5, 1.0, 2.0, np.inf])
 def test_features_meet_at_the_coordinates_also_where_the_tolerance_is_the_step(kind, tolerance):
-    rng = np.random.default_rng(8)
-    points = np.concatenate([generator(rng, 300, kind, np.float64) for generator in (mostly_hits, uniform)])
-    times = TRUTH[kind](points)
+    points, times = random(kind)
     found = impacts(kind, points, tolerance)
     hits = ~np.isnan(times[:, 0])
     assert hits[found.status == HIT].all()

@@ -21,7 +21,7 @@ def ask_vertex_face(p: wp.array2d[wp.vec3], status: wp.array[int], toi: wp.array
     toi[i] = impact.toi
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False)
 def ask_edge_edge(p: wp.array2d[wp.vec3d], status: wp.array[int]):
     i = wp.tid()
     status[i] = ccd_edge_edge(p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7])

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 from exact_queries import decide_exactly
 from generators import GENERATORS
+from impacts import impact_kernel
 from rich import box
 from rich.console import Console
 from rich.progress import track
@@ -25,7 +26,6 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.kernels import impact_edge_edge, impact_vertex_face
 from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")
@@ -156,41 +156,6 @@ def certify_exact(count, seed):
     return sums[-1]
 
 
-def user_kernel(point):
-    """A kernel that asks for first contacts, for one type of point, in this module as users have theirs."""
-
-    @wp.kernel(enable_backward=False)
-    def ask(
-        edges: bool,
-        x: wp.array2d[point],
-        tolerance: wp.float64,
-        status: wp.array[int],
-        within_tolerance: wp.array[int],
-        toi: wp.array[wp.float64],
-        coordinates: wp.array[wp.vec3d],
-        normal: wp.array[wp.vec3d],
-    ):
-        i = wp.tid()
-        if edges:
-            contact = impact_edge_edge(
-                x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
-            )
-        else:
-            contact = impact_vertex_face(
-                x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7], tolerance
-            )
-        status[i] = contact.status
-        within_tolerance[i] = contact.within_tolerance
-        toi[i] = contact.toi
-        coordinates[i] = contact.coordinates
-        normal[i] = contact.normal
-
-    return ask
-
-
-USER_KERNELS = {np.float32: user_kernel(wp.vec3), np.float64: user_kernel(wp.vec3d)}
-
-
 def judge_user(kind, points, tolerance, interval):
     """Compares what a user's kernel finds with the truth.
 
@@ -203,11 +168,12 @@ def judge_user(kind, points, tolerance, interval):
     Returns:
         Numbers of queries: unsure, wrong, late, early, and with coordinates or a normal that are none.
     """
-    n, dtype = len(points), points.dtype.type
-    x = wp.array(points, dtype=wp.vec3 if dtype is np.float32 else wp.vec3d)
-    outputs = [wp.zeros(n, dtype=t) for t in (int, int, wp.float64, wp.vec3d, wp.vec3d)]
-    wp.launch(USER_KERNELS[dtype], n, inputs=[kind == "edge_edge", x, tolerance], outputs=outputs)
-    status, within_tolerance, toi, coordinates, normal = (output.numpy() for output in outputs)
+    n = len(points)
+    point = wp.vec3 if points.dtype == np.float32 else wp.vec3d
+    inputs = [kind == "edge_edge", tolerance, wp.array(points, dtype=point)]
+    outputs = [wp.zeros(n, dtype=t) for t in (int, int, int, wp.float64, wp.vec3d, wp.vec3d)]
+    wp.launch(impact_kernel(point), n, inputs=inputs, outputs=outputs)
+    status, within_tolerance, _, toi, coordinates, normal = (output.numpy() for output in outputs)
     truth = ~np.isnan(interval[:, 0])
     used = tolerance if tolerance > 2.0**-38 else 2.0**-38
     found = status != 0

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import warp as wp
+from compilation import QUICK
 
 from warp_bsc.kernels.exact.first_contact import decide_in
 from warp_bsc.kernels.exact.polygon import spread
@@ -13,7 +14,7 @@ from warp_bsc.kernels.exact.polygon import spread
 def _kernel(limbs):
     decide = decide_in(limbs)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options=QUICK)
     def decide_queries(
         kind: int,
         points: wp.array2d[wp.vec3d],

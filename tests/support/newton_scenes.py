@@ -1,12 +1,11 @@
 """Scenes of cloth for the collision stage, and rollouts whose every step exact detection looks at again."""
 
-from fractions import Fraction
-
 import newton
 import numpy as np
 import warp as wp
 
 import warp_bsc as bsc
+from warp_bsc import checker
 from warp_bsc.detection.distance_phase import pair_distances
 from warp_bsc.detection.settings import DistanceKind
 from warp_bsc.response.state.mesh import ModelMesh
@@ -195,9 +194,11 @@ class Rollout:
         movable = self.mesh.inverse_masses.numpy() > 0.0
         pairs = self.detector.find_intersections(x)
         own = movable[self.mesh.edges[pairs[:, 0]]].any(axis=1) | movable[self.mesh.faces[pairs[:, 1]]].any(axis=1)
-        found = map(tuple, pairs[own].tolist())
-        edges, faces = self.mesh.edges, self.mesh.faces
-        return {(edge, face) for edge, face in found if not inside or crosses_inside(x, edges[edge], faces[face])}
+        pairs = pairs[own]
+        if inside:  # as of faces without neighbours
+            edges, faces = self.mesh.edges[pairs[:, 0]], self.mesh.faces[pairs[:, 1]]
+            pairs = pairs[checker.edges_pass_faces(x[edges], x[faces], x[faces[:, [2, 0, 1]]])]
+        return set(map(tuple, pairs.tolist()))
 
     def vertex_crosses(self, vertex, face, crossings):
         """Whether an edge of a vertex is among those that cross a face."""
@@ -281,18 +282,3 @@ class DistanceRollout(Rollout):
             kept = np.where(start < distance, _SHRUNK * start - rounding, distance)
             if (kept > 0.0).any():
                 self.approaches += np.count_nonzero(query(points[kept > 0.0], min_distance=kept[kept > 0.0]).hit)
-
-
-def crosses_inside(x, edge, face):
-    """Whether the inside of an edge crosses the inside of a face, in rational arithmetic."""
-
-    def orientation(i, j, k, origin):
-        o, *others = ([Fraction(float(value)) for value in x[n]] for n in (origin, i, j, k))
-        a, b, c = ([u - v for u, v in zip(other, o, strict=True)] for other in others)
-        cross = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
-        value = sum(u * v for u, v in zip(a, cross, strict=True))
-        return (value > 0) - (value < 0)
-
-    (p, q), (a, b, c) = edge, face
-    passes = {orientation(q, i, j, p) for i, j in ((a, b), (b, c), (c, a))}
-    return orientation(b, c, p, a) * orientation(b, c, q, a) < 0 and len(passes) == 1 and 0 not in passes

@@ -1,0 +1,41 @@
+"""Compilation of the tests' kernels: options that make it quick, and no module compiled by two processes at once."""
+
+import functools
+import os
+import zlib
+
+import warp as wp
+
+try:
+    import fcntl
+except ImportError:  # Windows, where each process compiles for itself
+    fcntl = None
+
+__all__ = ["QUICK", "compile_kernels_once"]
+
+QUICK = {"cpu_compiler_flags": "-march=native"}
+"""Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take twice as
+long to compile. Such kernels are slower, which does not matter in tests."""
+
+
+def compile_kernels_once() -> None:
+    """Has this process wait for others that are compiling a module of kernels, and take it from the cache.
+
+    Processes lock one byte of a file beside the kernels, which byte depends on the module and its options.
+    """
+    if fcntl is None:
+        return
+    file = open(os.path.join(wp.config.kernel_cache_dir, "compiling.lock"), "w")  # noqa: SIM115 (until the process ends)
+    module = wp._src.context.Module
+    compile_module = module._compile
+
+    @functools.wraps(compile_module)
+    def compile_locked(self, device=None, output_dir=None, *arguments, **options):
+        byte = zlib.crc32(os.fsencode(output_dir or self.name))
+        fcntl.lockf(file, fcntl.LOCK_EX, 1, byte)
+        try:
+            return compile_module(self, device, output_dir, *arguments, **options)
+        finally:
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, byte)
+
+    module._compile = compile_locked
