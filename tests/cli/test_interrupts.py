@@ -18,6 +18,9 @@ from waving_sheets import FRAMES, OUTPUTS, options, write_old, write_scene
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 
+if sys.platform == "win32":
+    pytest.skip("signals of POSIX", allow_module_level=True)
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import resource
 import shlex
 import shutil
 import subprocess
@@ -165,6 +164,7 @@ def test_broken_scene_leaves_what_was_finished(stage, tmp_path, capsys):
 @contextlib.contextmanager
 def largest_file(size):
     """Lets no file become larger: as on a full disk, writing more is an error."""
+    resource = pytest.importorskip("resource")  # of POSIX
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

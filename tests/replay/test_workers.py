@@ -204,7 +204,7 @@ def children_of(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("number", [getattr(signal, "SIGKILL", signal.SIGTERM), signal.SIGINT])
 def test_workers_end_with_the_process_that_started_them(tmp_path, waves, number):
     """They say nothing, even if a Ctrl-C, which the terminal sends to all of them, comes while they start.
 

@@ -1,7 +1,6 @@
 """Gradients through the collision stage: against central differences, flagged where they are of no use, and lasting."""
 
 import itertools
-import resource
 
 import newton
 import numpy as np
@@ -265,6 +264,7 @@ def test_grazing_contacts_are_flagged_and_gradients_finite(device):
 
 
 def test_hundreds_of_tape_iterations_take_no_more_memory(device):
+    resource = pytest.importorskip("resource")  # of POSIX
     scene = Throw(device, friction=0.3, steps=1)
     down = np.array((0.0, 0.0, -9.0), dtype=np.float32)
 

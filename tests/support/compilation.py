@@ -23,11 +23,10 @@ def compile_kernels_once() -> None:
 
     Processes lock one byte of a file beside the kernels, which byte depends on the module and its options.
     """
-    if fcntl is None:
+    compile_module = getattr(wp._src.context.Module, "_compile", None)
+    if fcntl is None or compile_module is None:  # in another version of Warp, each process compiles for itself, too
         return
     file = open(os.path.join(wp.config.kernel_cache_dir, "compiling.lock"), "w")  # noqa: SIM115 (until the process ends)
-    module = wp._src.context.Module
-    compile_module = module._compile
 
     @functools.wraps(compile_module)
     def compile_locked(self, device=None, output_dir=None, *arguments, **options):
@@ -38,4 +37,4 @@ def compile_kernels_once() -> None:
         finally:
             fcntl.lockf(file, fcntl.LOCK_UN, 1, byte)
 
-    module._compile = compile_locked
+    wp._src.context.Module._compile = compile_locked
