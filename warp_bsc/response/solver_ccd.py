@@ -23,6 +23,13 @@ from .._one_thread import Occupied, one_at_a_time
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .integration.coupling_interface import CouplingHooks
+from .integration.private import (
+    body_q_prev,
+    check_versions,
+    has_external_rigid_solver,
+    paused_tape,
+    without_own_contacts,
+)
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
 from .layer.contact_layer import ContactLayer
 from .report import SolverReport, StepTotals
@@ -34,8 +41,8 @@ from .state.record import RecordCounts, StepRecorder
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, MovedBodies
 from .state.workspace import Workspace
 from .step import inspect, resolve
-from .substeps.inner_contacts import InnerContacts, without_own_contacts
-from .substeps.substeps import Coupling
+from .substeps.inner_contacts import InnerContacts
+from .substeps.substeps import Substeps
 from .tuning import SEPARATION, SUBSTEPS
 
 _MOST_SUBSTEPS = 1024
@@ -156,20 +163,6 @@ class _Arrays(NamedTuple):
 
 def _arrays(state):
     return _Arrays(*(getattr(state, name) for name in _Arrays._fields))
-
-
-@contextlib.contextmanager
-def _paused_tape():
-    """Pauses the active tape, if any, so that it records no launches, and yields it."""
-    tape = wp._src.context.runtime.tape  # there is no public way to ask
-    if tape is None:
-        yield None
-        return
-    tape.__exit__(None, None, None)
-    try:
-        yield tape
-    finally:
-        tape.__enter__()
 
 
 class SolverCCD(SolverBase, CouplingHooks):
@@ -295,6 +288,7 @@ class SolverCCD(SolverBase, CouplingHooks):
                 solver is to be differentiated, or to have a contact layer.
         """
         check_instance(solver, "solver", SolverBase, "a solver of Newton")
+        check_versions()
         respond, lift_speed_limit = checked_flag(respond, "respond"), checked_flag(lift_speed_limit, "lift_speed_limit")
         bodies = None if bodies is None else checked_flag(bodies, "bodies")
         coupling = self._checked_coupling(coupling)
@@ -358,7 +352,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             self._inner_contacts = InnerContacts(mesh, moves_bodies=self._moves_bodies)
             choices = SUBSTEPS if coupling == "auto" else (coupling,)
             arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
-            self._coupling = Coupling(*arguments, moves_bodies=self._moves_bodies)
+            self._coupling = Substeps(*arguments, moves_bodies=self._moves_bodies)
         no_substeps = wp.zeros(1, dtype=int, device=mesh.device)
         self._substeps = no_substeps if self._coupling is None else self._coupling.substeps
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
@@ -392,7 +386,7 @@ class SolverCCD(SolverBase, CouplingHooks):
             return False
         if bodies is None:
             integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
-            if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
+            if not integrates or has_external_rigid_solver(solver):
                 return False
         shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
         assert model.body_flags is not None and model.body_inv_mass is not None
@@ -486,7 +480,7 @@ class SolverCCD(SolverBase, CouplingHooks):
                 memory, such as ``SolverXPBD``.
         """
         checked_number(dt, "dt", 0.0, above=True)
-        with _paused_tape() as tape:
+        with paused_tape() as tape:
             if self.respond and tape is not None and state_in is state_out and self.model.requires_grad:
                 raise ValueError("gradients need the state at the start: step into another state")
             if self.respond and tape is not None and self.model.requires_grad and self.mesh.distances is not None:
@@ -499,11 +493,11 @@ class SolverCCD(SolverBase, CouplingHooks):
                 self._coupling.save(state_in)
             passed = contacts
             if self._inner_contacts is not None:
-                external = getattr(self.solver, "integrate_with_external_rigid_solver", False)
+                external = has_external_rigid_solver(self.solver)
                 leaves_bodies = self._coupled is not None or not external
                 contacts = self._inner_contacts.take_out(passed, state_in, leaves_bodies=leaves_bodies)
         self._step_inner(state_in, state_out, control, contacts, dt, **options)
-        with _paused_tape() as tape:
+        with paused_tape() as tape:
             if self._inner_contacts is not None:
                 self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), passed)
             if self._coupling is not None:
@@ -617,7 +611,7 @@ class SolverCCD(SolverBase, CouplingHooks):
         outputs = [end.particle_q, end.particle_qd, resolution.status]
         self._launch(_write_back, self.mesh.vertex_count, inputs, outputs)
         if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, getattr(self.solver, "body_q_prev", None), resolution.status]
+            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), resolution.status]
             self._launch(_write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
         self._count_step(resolution)
 

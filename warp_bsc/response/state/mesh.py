@@ -109,7 +109,7 @@ class ModelMesh(CollisionMesh):
         shape_type, shape_scale = _finalized(model.shape_type).numpy(), _finalized(model.shape_scale).numpy()
         transform = _finalized(model.shape_transform).numpy().astype(np.float64)
         collides = (_finalized(model.shape_flags).numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
-        infinite = (shape_type == GeoType.PLANE) & (shape_scale[:, :2] <= 0.0).any(axis=1)
+        infinite = are_infinite_planes(model)
 
         tessellations = {}
         shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
@@ -288,6 +288,12 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
     incidence.first = wp.array(first, dtype=int, device=device)
     incidence.items = wp.array(rows[order], dtype=int, device=device)
     return incidence
+
+
+def are_infinite_planes(model: Model) -> np.ndarray:
+    """Returns which shapes of a model are infinite planes, shape [shape_count]."""
+    kind, scale = _finalized(model.shape_type).numpy(), _finalized(model.shape_scale).numpy()
+    return (kind == GeoType.PLANE) & (scale[:, :2] <= 0.0).any(axis=1)
 
 
 def _soft_faces(model):
