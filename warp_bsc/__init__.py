@@ -45,8 +45,10 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .replay.scene_intersections import SceneIntersections
     from .replay.scene_proximities import SceneProximities
     from .response.captured_steps import CapturedSteps
+    from .response.layer.contact_layer import ContactLayer
+    from .response.monitor import CollisionMonitor
     from .response.report import SolverReport
-    from .response.solver_ccd import CollisionMonitor, SolverCCD
+    from .response.solver_ccd import SolverCCD
     from .usd.scene import FrameRange, Scene
     from .usd.selection import Selection
 
@@ -56,8 +58,9 @@ _MODULES = {
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
-    "CollisionMonitor": "response.solver_ccd",
+    "CollisionMonitor": "response.monitor",
     "Collisions": "detection.collisions",
+    "ContactLayer": "response.layer.contact_layer",
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.scene",
     "IntervalResult": "replay.results",
@@ -86,6 +89,7 @@ __all__ = [
     "CollisionMesh",
     "CollisionMonitor",
     "Collisions",
+    "ContactLayer",
     "DetectionStats",
     "FrameRange",
     "IntervalResult",

@@ -5,7 +5,7 @@ that says so in a warning. The first use on a version that was not tested warns,
 """
 
 import functools
-import importlib.metadata
+import importlib
 import warnings
 from types import ModuleType
 from typing import Any
@@ -14,20 +14,25 @@ import warp as wp
 
 __all__ = ["TESTED_VERSIONS", "cpu_graph", "may_run_in_threads", "replace_name", "warn_if_untested"]
 
-TESTED_VERSIONS = {"warp-lang": ("1.18", "1.19"), "newton": ("1.8",)}
-"""Versions with which the tests of this package have passed, by the name of the package that is installed."""
+TESTED_VERSIONS = {"warp": ("1.18", "1.19"), "newton": ("1.8",)}
+"""Versions with which the tests of this package have passed, by the name of the module."""
 
 
 @functools.cache
 def warn_if_untested(package: str) -> None:
-    """Warns, once, if the installed version of a package is none of :data:`TESTED_VERSIONS`."""
-    version, tested = importlib.metadata.version(package), TESTED_VERSIONS[package]
+    """Warns, once, if the version of a package, "warp" or "newton", is none of :data:`TESTED_VERSIONS`."""
+    version, tested = _version(package), TESTED_VERSIONS[package]
     if ".".join(version.split(".")[:2]) not in tested:
         warnings.warn(
             f"warp-bsc relies on undocumented parts of {package}, and was tested with its versions "
             f"{', '.join(tested)}, not with {version}, which is installed",
             stacklevel=3,
         )
+
+
+def _version(package: str) -> str:
+    """Returns the version of a package that has been imported."""
+    return importlib.import_module(package).__version__
 
 
 def cpu_graph() -> Any:
@@ -41,7 +46,7 @@ def cpu_graph() -> Any:
         RuntimeError: If this version of Warp has no graph of that name: operations that read results on the host then
             cannot be captured on the CPU. Graphs on CUDA do not need it.
     """
-    warn_if_untested("warp-lang")
+    warn_if_untested("warp")
     try:
         graph = wp._src.context.runtime._apic_graph
         is_known = isinstance(graph.apic, bool)
@@ -62,7 +67,7 @@ def may_run_in_threads(kernel: wp.Kernel) -> bool:
 
     Where the options are gone, the answer is False, with a warning: detection on the CPU then takes one core.
     """
-    warn_if_untested("warp-lang")
+    warn_if_untested("warp")
     try:
         options = kernel.module.options
         mode, level = options["mode"] or wp.config.mode, options["optimization_level"]
@@ -92,6 +97,5 @@ def replace_name(module: ModuleType, name: str, value: object) -> None:
     """
     warn_if_untested("newton")
     if not hasattr(module, name):
-        version = importlib.metadata.version("newton")
-        raise RuntimeError(f"Newton {version} has no {module.__name__}.{name}, which warp-bsc replaces")
+        raise RuntimeError(f"Newton {_version('newton')} has no {module.__name__}.{name}, which warp-bsc replaces")
     setattr(module, name, value)

@@ -73,8 +73,8 @@ def test_there_are_examples():
 @each_example
 def test_first_frames(path):
     report = run(path, FRAMES).solver.report
-    assert report.steps >= FRAMES
-    assert report.uncertified_steps == 0
+    assert report.totals.steps >= FRAMES
+    assert report.totals.uncertified_steps == 0
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_help(path, capsys):
 @pytest.mark.slow
 def test_bullet_is_stopped(capsys):
     example = run(BULLET, 30, "--speed", "20")
-    assert example.solver.report.steps >= 120
+    assert example.solver.report.totals.steps >= 120
     example.test_final()
     example.print_report()
     assert "0 particles of the patch are behind the sheet" in capsys.readouterr().out
@@ -217,8 +217,8 @@ def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
     example = run(GRIPPER, 60, "--robot", robot, "--friction", str(friction))
     example.test_final()
     report = example.solver.report
-    assert report.steps == 240 and report.frozen_steps == 0
-    assert report.truncated_steps == 0 or friction < 0.5
+    assert report.totals.steps == 240 and report.totals.frozen_steps == 0
+    assert report.totals.truncated_steps == 0 or friction < 0.5
 
 
 def test_bullet_passes_without_stage():
@@ -243,7 +243,7 @@ def test_a_cylinder_widens_a_sleeve():
     scene.duration = 0.2
     run = program.Run(scene, 1.0 / 240.0, None).simulate()
     report = run.solver.report
-    assert report.uncertified_steps == report.frozen_steps == report.truncated_steps == 0
+    assert report.totals.uncertified_steps == report.totals.frozen_steps == report.totals.truncated_steps == 0
     assert 0.3 < run.stretch() < 1.0 and report.hits > 100
 
 
@@ -315,7 +315,7 @@ def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypat
     example.run_frame._graph = "a graph"
     example.step()
     assert example.run_frame.retaken == 1
-    assert example.solver.report.lost_gradients == 0
+    assert example.solver.report.gradients.lost_steps == 0
     np.testing.assert_allclose(example.throws.numpy(), expected.throws.numpy(), rtol=1e-4)
 
 

@@ -351,6 +351,10 @@ def calls_of_solvers() -> dict[str, Call]:
         "doubles": wp.zeros(1, dtype=wp.float64, device="cpu"),
         "shape": wp.zeros(count + 1, dtype=wp.float32, device="cpu"),
     }
+    radii = without(MANY_DISTANCES, "None") | {
+        "one bad": [1.0] * (count - 1) + [-1.0],
+        "masked": masked(np.ones(count)),
+    }
     found = {
         "SolverCCD": Call(
             bsc.SolverCCD,
@@ -360,19 +364,34 @@ def calls_of_solvers() -> dict[str, Call]:
                 "separation": without(POSITIVE, "None"),
                 "friction": coefficient | {"huge": 1e39},
                 "restitution": coefficient | {"above 1": 1.5},
-                "coupling": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
-                "bodies": without(FLAGS, "None"),
+                "substeps": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
+                "bodies": {"unknown": "moved", "flag": True, "None": None},
+                "max_iterations": NOT_COUNT | {"too many": 41},
                 "min_distance": without(DISTANCES, "None"),
-                "radius": without(MANY_DISTANCES, "None")
-                | {"one bad": [1.0] * (count - 1) + [-1.0], "masked": masked(np.ones(count))},
-                "contact_layer": without(POSITIVE, "None"),
+                "particle_radius": radii,
+                "contact_layer": FLAGS,
                 "lift_speed_limit": FLAGS,
-                "respond": FLAGS,
             },
             raises=bsc.SolverCCD.__init__,
         ),
         "CollisionMonitor": Call(
-            bsc.CollisionMonitor, {"solver": inner}, {"solver": solvers}, raises=bsc.CollisionMonitor.__init__
+            bsc.CollisionMonitor,
+            {"solver": inner},
+            {"solver": solvers, "min_distance": without(DISTANCES, "None"), "particle_radius": radii},
+            raises=bsc.CollisionMonitor.__init__,
+        ),
+        "ContactLayer": Call(
+            bsc.ContactLayer,
+            {"solver": inner},
+            {
+                "solver": solvers,
+                "thickness": without(POSITIVE, "None"),
+                "friction": coefficient | {"huge": 1e39},
+                "restitution": coefficient | {"above 1": 1.5},
+                "min_distance": without(DISTANCES, "None"),
+                "particle_radius": radii,
+            },
+            raises=bsc.ContactLayer.__init__,
         ),
         "CapturedSteps": Call(
             bsc.CapturedSteps,

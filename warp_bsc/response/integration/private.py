@@ -7,9 +7,9 @@ a fallback that says so in a warning. Tested versions are listed in :mod:`warp_b
 import contextlib
 import copy
 import functools
-import importlib.metadata
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
 from typing import Any
 
 import newton
@@ -24,13 +24,12 @@ _OVERFLOW = "_soft_contact_source_overflow"
 
 def check_versions() -> None:
     """Warns, once for each package, if the installed version of Warp or Newton is not a tested one."""
-    warn_if_untested("warp-lang")
+    warn_if_untested("warp")
     warn_if_untested("newton")
 
 
-def _missing(package: str, name: str, consequence: str) -> RuntimeError:
-    version = importlib.metadata.version(package)
-    return RuntimeError(f"{package} {version} has no {name}, which warp-bsc uses: {consequence}")
+def _missing(package: ModuleType, name: str, consequence: str) -> RuntimeError:
+    return RuntimeError(f"{package.__name__} {package.__version__} has no {name}, which warp-bsc uses: {consequence}")
 
 
 @contextlib.contextmanager
@@ -47,7 +46,7 @@ def paused_tape() -> Iterator[wp.Tape | None]:
     try:
         tape = wp._src.context.runtime.tape
     except AttributeError:
-        raise _missing("warp-lang", "context.runtime.tape", "a step cannot pause the active tape") from None
+        raise _missing(wp, "context.runtime.tape", "a step cannot pause the active tape") from None
     if tape is None:
         yield None
         return
@@ -71,7 +70,7 @@ def empty_struct(value: Any) -> Any:
     if not wp.types.is_struct(value):
         return None
     if not hasattr(value, "_cls"):
-        raise _missing("warp-lang", "attribute _cls of structs", "steps carry no gradients")
+        raise _missing(wp, "attribute _cls of structs", "steps carry no gradients")
     return _make_empty(value._cls)
 
 
@@ -91,7 +90,7 @@ def struct_fields(struct: Any) -> list[str]:
     try:
         return list(struct.vars)
     except AttributeError:
-        raise _missing("warp-lang", "attribute vars of structs", "the stage cannot be constructed") from None
+        raise _missing(wp, "attribute vars of structs", "the stage cannot be constructed") from None
 
 
 def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
@@ -105,7 +104,7 @@ def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
     truncate = getattr(solver, _TRUNCATION, None)
     if truncate is None:
         warnings.warn(
-            f"newton {importlib.metadata.version('newton')} has no SolverVBD.{_TRUNCATION}, which warp-bsc replaces: "
+            f"newton {newton.__version__} has no SolverVBD.{_TRUNCATION}, which warp-bsc replaces: "
             "self-contact of VBD limits the speed of all particles",
             stacklevel=4,
         )
@@ -139,7 +138,7 @@ def has_external_rigid_solver(solver: SolverBase) -> bool:
     """
     name = "integrate_with_external_rigid_solver"
     if isinstance(solver, SolverVBD) and not hasattr(solver, name):
-        raise _missing("newton", f"SolverVBD.{name}", "whether VBD moves bodies is not known")
+        raise _missing(newton, f"SolverVBD.{name}", "whether VBD moves bodies is not known")
     return getattr(solver, name, False)
 
 
@@ -154,7 +153,7 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
     poses = getattr(solver, "body_q_prev", None)
     integrates = isinstance(solver, SolverVBD) and solver.model.body_count > 0 and not has_external_rigid_solver(solver)
     if poses is None and integrates:
-        raise _missing("newton", "SolverVBD.body_q_prev", "the stage cannot push bodies; pass bodies that it leaves")
+        raise _missing(newton, "SolverVBD.body_q_prev", "the stage cannot push bodies; pass bodies that it leaves")
     return poses
 
 
@@ -200,7 +199,7 @@ def without_own_contacts(solver: SolverBase) -> Iterator[None]:
         yield
         return
     if not hasattr(solver, "collision"):
-        raise _missing("newton", "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
+        raise _missing(newton, "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
     own, solver.collision = solver.collision, None
     try:
         yield
@@ -222,7 +221,7 @@ def soft_contact_arrays(contacts: newton.Contacts, names: Sequence[str]) -> dict
     for name in names:
         attribute = _soft_contact_attribute(name)
         if not hasattr(contacts, attribute):
-            raise _missing("newton", f"Contacts.{attribute}", "contacts cannot be left out in steps with substeps")
+            raise _missing(newton, f"Contacts.{attribute}", "contacts cannot be left out in steps with substeps")
         arrays[name] = getattr(contacts, attribute)
     return {name: array for name, array in arrays.items() if array is not None}
 
@@ -245,7 +244,7 @@ def soft_contact_counters(contacts: newton.Contacts, counters: wp.array) -> tupl
         view, array = getattr(contacts, name, None), contacts.contact_counters
         if view is None or array.dtype is not wp.int32 or len(array) <= i or view.ptr != array[i : i + 1].ptr:
             message = "contacts cannot be left out in steps with substeps"
-            raise _missing("newton", f"Contacts.{name} as number {i} of Contacts.contact_counters", message)
+            raise _missing(newton, f"Contacts.{name} as number {i} of Contacts.contact_counters", message)
     return counters[1:2], counters[3:4]
 
 
