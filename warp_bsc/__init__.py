@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from ._version import __version__ as __version__
 
 _KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
 """The device code, which in a checkout stands beside this package, not in it."""
@@ -49,7 +49,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .response.monitor import CollisionMonitor
     from .response.report import SolverReport
     from .response.solver_ccd import SolverCCD
-    from .usd.scene import FrameRange, Scene
+    from .usd.frames import FrameRange
+    from .usd.scene import Scene
     from .usd.selection import Selection
 
 _MODULES = {
@@ -62,7 +63,7 @@ _MODULES = {
     "Collisions": "detection.collisions",
     "ContactLayer": "response.layer.contact_layer",
     "DetectionStats": "detection.collisions",
-    "FrameRange": "usd.scene",
+    "FrameRange": "usd.frames",
     "IntervalResult": "replay.results",
     "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",

@@ -25,7 +25,7 @@ from warp_bsc.response.state.structs import DIVIDED, PROJECTED
 
 
 def check_rest(rollout, dt, steps):
-    """Asserts that cloth which comes to rest is projected in each step, and never cut or left standing."""
+    """Asserts that cloth which comes to rest is projected in each step, and never cut or frozen."""
     touched = 0
     for _ in range(steps):
         rollout.step(dt)

@@ -1,4 +1,4 @@
-"""Contacts passed on to coupled steps: the inner solver gets those that the stage does not resolve, and no others."""
+"""Contacts passed on to steps in substeps: the inner solver gets those that the stage does not resolve, no others."""
 
 import newton
 import numpy as np
@@ -31,7 +31,7 @@ def finalized(builder, device):
 
 
 def roll(model, passes, steps, *, inner="vbd", in_graph=False, **options):
-    """Returns a rollout of coupled steps, with contacts found before each and passed on, or without."""
+    """Returns a rollout of steps in substeps, with contacts found before each and passed on, or without."""
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), **options))
     pipeline = newton.CollisionPipeline(model)
     contacts = pipeline.contacts() if passes else None

@@ -259,7 +259,7 @@ class SolverReport:
     def milliseconds(self) -> float | None:
         """Time of the last step that was not captured [ms]; None if there was none.
 
-        Without the inner solver, but for its substeps in a coupled step.
+        Without the inner solver, except for its substeps.
         """
         if self.span is None:
             return None

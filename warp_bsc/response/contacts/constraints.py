@@ -4,7 +4,7 @@ import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.pairs import points_of_pair
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from ..state.mesh import Connectivity
 from ..state.poses import turn_between
@@ -256,7 +256,7 @@ def add_constraint(
     least: wp.float64,
 ) -> int:
     """Adds a constraint with a position multiplier if it fits; counts it in any case, and returns its place."""
-    i = take_place(constraints.count)
+    i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = corners
         constraints.weights[i] = weights

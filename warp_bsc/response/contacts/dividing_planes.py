@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Vertices
 from ..state.vectors import HALF, ZERO, relative, to_double
 from ..tuning import CLOSE_MARGIN, MARGIN, SLACK, SMALL_DISTANCE
@@ -44,7 +44,7 @@ def add_plane(
         margin: Least distance from it after projection, beside ``half`` [m].
         half: Half of the distance that both sides keep from each other [m].
     """
-    plane = take_place(planes.count)
+    plane = take_slot_int(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal

@@ -1,5 +1,6 @@
 """A solver around another one, which has all attributes of the inner solver."""
 
+import functools
 from typing import NamedTuple
 
 import newton
@@ -54,51 +55,12 @@ class WrappedSolver(SolverBase):
 
     @property
     def contacts(self):
-        """Delegates to the inner solver."""
+        """The contacts of the inner solver."""
         return self.solver.contacts
 
     @contacts.setter
     def contacts(self, value):
         self.solver.contacts = value
-
-    @property
-    def collision_frequency(self):
-        """Delegates to the inner solver."""
-        return self.solver.collision_frequency
-
-    @property
-    def collision_frequency_type(self):
-        """Delegates to the inner solver."""
-        return self.solver.collision_frequency_type
-
-    @property
-    def supported_observables(self):
-        """Delegates to the inner solver."""
-        return self.solver.supported_observables
-
-    def set_collision_frequency(self, **options):
-        """Delegates to the inner solver."""
-        self.solver.set_collision_frequency(**options)
-
-    def observables(self, *arguments, **options):
-        """Delegates to the inner solver."""
-        return self.solver.observables(*arguments, **options)
-
-    def validate_observables(self, *arguments, **options):
-        """Delegates to the inner solver."""
-        return self.solver.validate_observables(*arguments, **options)
-
-    def notify_model_changed(self, flags: int) -> None:
-        """Delegates to the inner solver."""
-        self.solver.notify_model_changed(flags)
-
-    def reset(self, state, world_mask=None, flags=None):
-        """Delegates to the inner solver."""
-        self.solver.reset(state, world_mask, flags)
-
-    def update_contacts(self, contacts, state=None):
-        """Delegates to the inner solver."""
-        self.solver.update_contacts(contacts, state)
 
     def __deepcopy__(self, memo):
         """Raises a TypeError: buffers on the device, and graphs that write to them, cannot be copied."""
@@ -109,3 +71,31 @@ class WrappedSolver(SolverBase):
         if name == "solver":
             raise AttributeError(name)
         return getattr(self.solver, name)
+
+
+def _delegated_method(name):
+    """Returns a method that is that of the inner solver."""
+
+    @functools.wraps(getattr(SolverBase, name))
+    def method(self, *arguments, **options):
+        return getattr(self.solver, name)(*arguments, **options)
+
+    return method
+
+
+def _delegated_property(name):
+    """Returns a property that is that of the inner solver."""
+    return property(lambda self: getattr(self.solver, name), doc=getattr(SolverBase, name).__doc__)
+
+
+for _name in (
+    "notify_model_changed",
+    "observables",
+    "reset",
+    "set_collision_frequency",
+    "update_contacts",
+    "validate_observables",
+):
+    setattr(WrappedSolver, _name, _delegated_method(_name))
+for _name in ("collision_frequency", "collision_frequency_type", "supported_observables"):
+    setattr(WrappedSolver, _name, _delegated_property(_name))

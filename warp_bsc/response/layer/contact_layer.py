@@ -150,7 +150,7 @@ class ContactLayer(WrappedSolver):
         layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
         device = mesh.device
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=layer.distances)
+        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
         n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
         self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
