@@ -14,8 +14,8 @@ from ..substeps.inner_contacts import InnerContacts
 wp.set_module_options({"enable_backward": False})
 
 
-def _make_find_starts(kind: type) -> wp.Kernel:
-    """Returns the kernel below for poses or positions: a graph on the CPU runs the wrong overload of a generic one."""
+def _make_kernels(kind: type, force: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels below for bodies or particles: a graph on the CPU runs wrong overloads of generic ones."""
 
     @wp.kernel(enable_backward=False, module="unique")
     def find_starts(
@@ -38,10 +38,25 @@ def _make_find_starts(kind: type) -> wp.Kernel:
         if flags[i] & proxy != 0 and continues(motion, world[i]):
             starts[i] = ends[i]
 
-    return find_starts
+    @wp.kernel(enable_backward=False, module="unique")
+    def add_forces(
+        # in
+        impulses: wp.array[force],
+        proxy: wp.array[int],
+        dt: float,
+        # out
+        forces: wp.array[force],
+    ):
+        """Adds the forces that make impulses on bodies or particles in a step, at the indices of their proxies."""
+        i = wp.tid()
+        if proxy[i] >= 0:
+            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+
+    return find_starts, add_forces
 
 
-_find_starts_of_bodies, _find_starts_of_particles = _make_find_starts(wp.transform), _make_find_starts(wp.vec3)
+_find_starts_of_bodies, _add_wrenches = _make_kernels(wp.transform, wp.spatial_vector)
+_find_starts_of_particles, _add_forces = _make_kernels(wp.vec3, wp.vec3)
 
 
 @wp.kernel
@@ -63,29 +78,6 @@ def _add_impulses(
         inertia = inertia_at(motion.bodies, i, vertices.bodies.pose[i])
         angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
-
-
-def _make_add_forces(kind: type) -> wp.Kernel:
-    """Returns the kernel below for wrenches or forces, see :func:`_make_find_starts`."""
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def add_forces(
-        # in
-        impulses: wp.array[kind],
-        proxy: wp.array[int],
-        dt: float,
-        # out
-        forces: wp.array[kind],
-    ):
-        """Adds the forces that make impulses on bodies or particles in a step, at the indices of their proxies."""
-        i = wp.tid()
-        if proxy[i] >= 0:
-            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
-
-    return add_forces
-
-
-_add_wrenches, _add_forces = _make_add_forces(wp.spatial_vector), _make_add_forces(wp.vec3)
 
 
 def _is_default(solver, hook):

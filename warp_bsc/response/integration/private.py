@@ -138,7 +138,7 @@ def has_external_rigid_solver(solver: SolverBase) -> bool:
     """
     name = "integrate_with_external_rigid_solver"
     if isinstance(solver, SolverVBD) and not hasattr(solver, name):
-        raise _missing(newton, f"SolverVBD.{name}", "whether VBD moves bodies is not known")
+        raise _missing(newton, f"SolverVBD.{name}", "the stage cannot tell whether VBD moves bodies")
     return getattr(solver, name, False)
 
 
@@ -158,7 +158,7 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
 
 
 def may_allocate(solver: SolverBase) -> bool:
-    """Returns whether a step of a solver may allocate memory, as the body of a condition in a CUDA graph must not.
+    """Returns whether a step of a solver may allocate memory, which the body of a condition in a CUDA graph must not.
 
     Contract: ``SolverVBD`` and ``SolverStyle3D`` without a collision pipeline of their own allocate nothing in a step;
     every other solver, and every class derived from these, counts as one that does. Where the contract is broken, Warp
@@ -239,12 +239,12 @@ def soft_contact_counters(contacts: newton.Contacts, counters: wp.array) -> tupl
     Raises:
         RuntimeError: If this version of Newton has other counters.
     """
-    names = {"rigid_contact_count": 0, "soft_contact_count": 1, _OVERFLOW: 3}
-    for name, i in names.items():
-        view, array = getattr(contacts, name, None), contacts.contact_counters
+    array = contacts.contact_counters
+    for name, i in {"rigid_contact_count": 0, "soft_contact_count": 1, _OVERFLOW: 3}.items():
+        view = getattr(contacts, name, None)
         if view is None or array.dtype is not wp.int32 or len(array) <= i or view.ptr != array[i : i + 1].ptr:
-            message = "contacts cannot be left out in steps with substeps"
-            raise _missing(newton, f"Contacts.{name} as number {i} of Contacts.contact_counters", message)
+            counter = f"Contacts.{name} as number {i} of Contacts.contact_counters"
+            raise _missing(newton, counter, "contacts cannot be left out in steps with substeps")
     return counters[1:2], counters[3:4]
 
 
@@ -254,14 +254,14 @@ def contacts_with(contacts: newton.Contacts, counters: wp.array, arrays: dict[st
     Contract: Solvers can read a shallow copy of ``newton.Contacts``.
 
     Args:
-        contacts: The contacts, which keep what they are.
-        counters: An array like ``contact_counters``.
+        contacts: The contacts, which stay as they are.
+        counters: An array like ``contact_counters``, see :func:`soft_contact_counters`.
         arrays: Arrays by name, as of :func:`soft_contact_arrays`.
     """
     packed = copy.copy(contacts)
-    count, overflow = soft_contact_counters(contacts, counters)
-    packed.contact_counters, packed.rigid_contact_count, packed.soft_contact_count = counters, counters[0:1], count
+    packed.contact_counters, packed.rigid_contact_count = counters, counters[0:1]
+    packed.soft_contact_count = counters[1:2]
+    setattr(packed, _OVERFLOW, counters[3:4])
     for name, array in arrays.items():
         setattr(packed, _soft_contact_attribute(name), array)
-    setattr(packed, _OVERFLOW, overflow)
     return packed

@@ -132,9 +132,9 @@ class InnerContacts:
     """Takes the contacts that the stage resolves out of those that a program passes on.
 
     The stage resolves a contact of particles with a shape if the particles take part in its detection, and start the
-    step outside the shape. What has entered a shape, Newton's contact pushes out, as the stage leaves it alone. The
-    inner solver keeps a contact with a body that it moves, unless the stage pushes that body as well. Contacts of
-    bodies with each other remain.
+    step outside the shape. It excludes particles that have entered a shape: Newton's contacts push them out. The inner
+    solver keeps a contact with a body that it moves, unless the stage pushes that body as well. Contacts of bodies with
+    each other remain.
     """
 
     def __init__(self, mesh: ModelMesh, *, moves_bodies: bool):
@@ -163,7 +163,7 @@ class InnerContacts:
         """Returns the contacts for the inner solver.
 
         Args:
-            contacts: The contacts of the program, which keep what they are.
+            contacts: The contacts of the program, which stay as they are.
             state: The state at the start of the step.
             leaves_bodies: Whether the inner solver, or a coupler around it, moves bodies that the stage does not.
         """
@@ -213,25 +213,15 @@ class InnerContacts:
 
 
 class _Buffers:
-    """Packed contacts, and where they were.
-
-    Attributes:
-        arrays: Arrays of the packed contacts, by name.
-        counters: As ``Contacts.contact_counters``.
-        count: Number of packed contacts.
-        overflow: Whether contacts did not fit into the buffers of the program.
-        places: Place of each packed contact among all.
-        forces: Forces on the packed contacts; None before any.
-        in_graph: Whether the buffers belong to a CUDA graph, so that they are of no use outside it.
-    """
+    """Packed contacts, and where they were."""
 
     def __init__(self, contacts, arrays):
         self.arrays = {name: wp.empty_like(array, requires_grad=False) for name, array in arrays.items()}
         self.counters = wp.zeros_like(contacts.contact_counters)
-        self.count, self.overflow = soft_contact_counters(contacts, self.counters)
-        self.places = wp.zeros(contacts.soft_contact_max, dtype=int, device=contacts.device)
-        self.forces: wp.array | None = None
-        self.in_graph = contacts.device.is_cuda and contacts.device.is_capturing
+        self.count, self.overflow = soft_contact_counters(contacts, self.counters)  # overflow: some were dropped
+        self.places = wp.zeros(contacts.soft_contact_max, dtype=int, device=contacts.device)  # among all contacts
+        self.forces: wp.array | None = None  # on the packed contacts
+        self.in_graph = contacts.device.is_cuda and contacts.device.is_capturing  # of no use outside it
 
 
 def _arrays_of(contacts):
