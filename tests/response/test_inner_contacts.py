@@ -212,18 +212,3 @@ def test_a_single_particle_rests_on_its_contact(device):
     assert rollout.solver.report.totals.substepped_steps > 4
     assert abs(rollout.positions[single, 2] - 0.105) < 5e-4
     assert rollout.positions[:16, 2].min() > 0.1 and rollout.positions[:16, 2].max() < 0.102
-
-
-def test_the_private_names_belong_to_this_newton(device):
-    """Contacts of whole surfaces have attributes without public names, of Newton 1.8."""
-    builder = newton.ModelBuilder()
-    add_drape(builder, 2)
-    contacts = newton.CollisionPipeline(finalized(builder, device)).contacts()
-    for name in (*inner_contacts._FIELDS.values(), inner_contacts._OVERFLOW):
-        assert name in vars(contacts)
-    assert contacts._soft_contact_source_overflow.ptr == contacts.contact_counters[3:4].ptr
-    assert contacts.soft_contact_count.ptr == contacts.contact_counters[1:2].ptr
-    assert {name for name in vars(contacts) if name.startswith("soft_contact_")} == {
-        *(name for name in inner_contacts._FIELDS.values() if not name.startswith("_")),
-        *("soft_contact_count", "soft_contact_max", "soft_contact_tids"),
-    }

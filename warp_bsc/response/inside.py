@@ -1,4 +1,4 @@
-"""The particles that are inside solids in one configuration: rigid shapes, soft bodies and the solids of planes."""
+"""Finds the particles that are inside rigid shapes, soft bodies and the solids of planes, in one configuration."""
 
 import functools
 from dataclasses import dataclass
@@ -13,18 +13,17 @@ from ..detection.containment import ContainmentFinder
 from ..detection.mesh import CollisionMesh
 from .state.mesh import ModelMesh, sides_of
 
-_ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in ``planes.signed_distance``
+_ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in :func:`.state.planes.signed_distance`
 
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """The particles that are inside solids: arrays with a row for each particle and solid, sorted.
+    """The particles that are inside solids: sorted rows of a particle and the solid that holds it.
 
     Attributes:
         particles: The particles, int32, shape [n]. One that is inside several solids has a row for each.
-        shapes: The shape that holds each particle, -1 where a soft body does, int32, shape [n].
-        soft_bodies: The soft body that holds it, as the first of that body's particles, -1 where a shape does, int32,
-            shape [n].
+        shapes: The shapes, -1 for a soft body, int32, shape [n].
+        soft_bodies: The soft bodies, each as the first of its particles, -1 for a shape, int32, shape [n].
     """
 
     particles: np.ndarray
@@ -37,10 +36,10 @@ class Inside:
 
 
 class _Solids(NamedTuple):
-    """The bodies that enclose space: soft bodies, then shapes, those that are in all worlds once for each.
+    """The bodies that enclose space: soft bodies, then shapes, those that are in all worlds once for each world.
 
     Attributes:
-        finder: Finds what is inside them.
+        finder: Finds the points inside them.
         faces: Vertices of their faces, shape [face_count, 3].
         of_face: Body of each face, shape [face_count].
         shape: Shape of each body, -1 for a soft body, shape [n].
@@ -63,30 +62,30 @@ class _Solids(NamedTuple):
 class InsideFinder:
     """Finds the particles of a model that are inside solids, in one configuration after another, on the host.
 
-    Solids are the shapes that collide with particles, as they are in the mesh of the model, the soft bodies, and the
-    solids of infinite planes. A soft body is what tetrahedra with common particles make up. Shapes whose triangles do
-    not close (a finite plane, an open mesh) and cloth enclose nothing, closed cloth neither. A particle is inside if it
-    is strictly inside, by itself: all of a sheet that is wholly inside, and of another one the part that is.
+    Solids are the shapes that collide with particles, as tessellated in the mesh of the model, the soft bodies, and the
+    solids of infinite planes. Tetrahedra with common particles make a soft body. Cloth, closed or not, and shapes whose
+    triangles do not close (a finite plane, an open mesh) enclose nothing. Each particle is tested by itself, and is
+    inside if it is strictly inside: of a sheet, the part that is.
 
-    Not looked for are particles in the soft body that they belong to, in solids of another world, pairs of which the
-    response can move neither (a pinned particle in a static shape), particles that are not active, and positions that
-    are not finite. A soft body or shape with such a position holds nothing.
+    The finder excludes a particle in the soft body that it belongs to or in a solid of another world, pairs that the
+    response cannot move (a pinned particle in a static shape), particles that are not active, and positions that are
+    not finite. A soft body or shape with a position that is not finite holds nothing.
 
-    No floating-point error can change the answer for soft bodies and shapes. A particle is inside the solid of a plane
-    if its distance is certainly negative, as for the response.
+    Floating-point errors cannot change the result for soft bodies and shapes. A particle is inside the solid of a plane
+    if its distance is certainly negative, as in a step.
     """
 
     def __init__(self, mesh: ModelMesh):
-        """Takes the mesh of a model; finds its solids when they are needed first."""
+        """Takes the mesh of a model; the first search finds its solids."""
         self._mesh = mesh
 
     def find(self, x: np.ndarray | wp.array, planes: np.ndarray | wp.array) -> Inside:
-        """Returns which particles are inside solids. Synchronizes with the device where arrays are on one.
+        """Returns which particles are inside solids. Synchronizes with the device of the arrays.
 
         Args:
             x: Positions of all vertices of the mesh [m], float32, shape [vertex_count, 3], or an array of vec3.
             planes: The planes of the mesh, each as the unit normal out of its solid and its offset [m], float64, shape
-                [plane_count, 4], or an array of vec4d, as in :class:`.planes.MovingPlanes`.
+                [plane_count, 4], or an array of vec4d, as in :class:`.state.planes.MovingPlanes`.
 
         Raises:
             ValueError: If an array has another shape.
@@ -100,12 +99,9 @@ class InsideFinder:
         movable = mesh.inverse_masses.numpy() > 0.0
         flags, inverse_mass = _read(model.body_flags, model.body_count), _read(model.body_inv_mass, model.body_count)
         moves = np.append((inverse_mass > 0.0) & ((flags & int(BodyFlags.KINEMATIC)) == 0), False)  # -1 is no body
-        rows = np.concatenate(
-            [
-                self._find_in_bodies(x, particles, finite, movable, moves),
-                self._find_behind_planes(x[particles].astype(np.float64), particles, planes, movable, moves),
-            ]
-        )
+        in_bodies = self._find_in_bodies(x, particles, finite, movable, moves)
+        behind_planes = self._find_behind_planes(x[particles].astype(np.float64), particles, planes, movable, moves)
+        rows = np.concatenate([in_bodies, behind_planes])
         rows = rows[np.lexsort(rows.T[::-1])].astype(np.int32)
         return Inside(*np.ascontiguousarray(rows.T))
 
@@ -162,7 +158,7 @@ class InsideFinder:
         keys = np.column_stack([mesh.shape_vertices.shape[corners - count], world[corners]])
         copies, places, of_shape_face = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         faces = np.concatenate([soft_faces, shape_faces])
-        of_face = np.concatenate([of_soft_face, len(soft_bodies) + of_shape_face.reshape(-1)])
+        of_face = np.concatenate([of_soft_face, len(soft_bodies) + of_shape_face.ravel()])
         none, no_shape = np.full(len(soft_bodies), -1), np.full(len(copies), -1)
         return _Solids(
             ContainmentFinder(CollisionMesh(faces, mesh.vertex_count, device="cpu"), of_face),

@@ -18,6 +18,7 @@ from .._arguments import (
     checked_number,
     given,
 )
+from .integration.private import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh
@@ -107,7 +108,7 @@ class StageOptions:
             return False
         if self.bodies == "pushed":
             integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
-            if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
+            if not integrates or has_external_rigid_solver(solver):
                 return False
         shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
         assert model.body_flags is not None and model.body_inv_mass is not None

@@ -11,6 +11,7 @@ from newton.solvers import SolverBase
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
+from .integration.private import body_q_prev, has_external_rigid_solver, without_own_contacts
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
 from .integration.wrapped_solver import StateArrays
 from .layer.contact_layer import ContactLayer
@@ -20,8 +21,8 @@ from .stage import CollisionStage
 from .state.mesh import ModelMesh
 from .state.record import StepRecorder
 from .step import resolve
-from .substeps.inner_contacts import InnerContacts, without_own_contacts
-from .substeps.substeps import Coupling
+from .substeps.inner_contacts import InnerContacts
+from .substeps.substeps import Substeps
 from .tuning import SUBSTEPS
 from .write_back import count_record, write_back, write_back_bodies
 
@@ -193,7 +194,7 @@ class SolverCCD(CollisionStage):
             self._inner_contacts = InnerContacts(mesh, moves_bodies=moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
             arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
-            self._in_substeps = Coupling(*arguments, moves_bodies=moves_bodies)
+            self._in_substeps = Substeps(*arguments, moves_bodies=moves_bodies)
             self.report.last_substeps = self._in_substeps.substeps
 
     def step(
@@ -243,7 +244,7 @@ class SolverCCD(CollisionStage):
             self._in_substeps.save(state)
         if self._inner_contacts is None:
             return contacts
-        external = getattr(self.solver, "integrate_with_external_rigid_solver", False)
+        external = has_external_rigid_solver(self.solver)
         return self._inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
 
     def _step_inner(self, *arguments, **options):
@@ -329,7 +330,7 @@ class SolverCCD(CollisionStage):
         outputs = [end.particle_q, end.particle_qd, resolution.status]
         self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
         if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, getattr(self.solver, "body_q_prev", None), resolution.status]
+            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), resolution.status]
             self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
         self._count_step(resolution)
 

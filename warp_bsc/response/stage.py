@@ -9,7 +9,7 @@ import warp as wp
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .integration.coupling_interface import CouplingHooks
-from .integration.tape import paused_tape
+from .integration.private import paused_tape
 from .integration.wrapped_solver import WrappedSolver
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS

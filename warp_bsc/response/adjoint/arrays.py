@@ -1,9 +1,10 @@
 """Copies of arrays of structs, and launches of the adjoints of kernels."""
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
+
+from ..integration.private import empty_struct
 
 
 def copy_arrays(struct, into, lengths):
@@ -31,12 +32,6 @@ def attach_gradients(struct, names, gradients=None):
     return into
 
 
-@functools.cache
-def _empty(struct_type):
-    """Returns a struct without arrays, in place of the gradient of one, whose arrays have gradients of their own."""
-    return struct_type()
-
-
 def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
     """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
 
@@ -48,7 +43,7 @@ def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
         dim,
         inputs=inputs,
         outputs=outputs,
-        adj_inputs=[_empty(value._cls) if hasattr(value, "_cls") else None for value in inputs],
+        adj_inputs=[empty_struct(value) for value in inputs],
         adj_outputs=of_outputs,
         adjoint=True,
         device=device,

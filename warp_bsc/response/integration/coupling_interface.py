@@ -1,4 +1,4 @@
-"""The hooks of Newton's coupled solvers for a stage behind another solver: that solver's, and what the stage adds."""
+"""Newton's ``CouplingInterface`` for a stage behind another solver: the hooks of that solver, with two additions."""
 
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
@@ -14,8 +14,8 @@ from ..substeps.inner_contacts import InnerContacts
 wp.set_module_options({"enable_backward": False})
 
 
-def _make_find_starts(kind: type) -> wp.Kernel:
-    """Returns the kernel below for poses or positions: of a generic one, a graph on the CPU runs the wrong overload."""
+def _make_kernels(kind: type, force: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels below for bodies or particles: a graph on the CPU runs wrong overloads of generic ones."""
 
     @wp.kernel(enable_backward=False, module="unique")
     def find_starts(
@@ -25,23 +25,38 @@ def _make_find_starts(kind: type) -> wp.Kernel:
         world: wp.array[int],
         flags: wp.array[int],
         proxy: int,
-        places: wp.array[kind],
+        given: wp.array[kind],
         # out
         starts: wp.array[kind],
     ):
         """Writes where bodies or particles start: proxies where the last step ended, others where they are.
 
-        So are proxies in a world in which no step has ended yet, or that was reset.
+        In a world that was reset, or in which no step has ended yet, proxies also start where they are.
         """
         i = wp.tid()
-        starts[i] = places[i]
+        starts[i] = given[i]
         if flags[i] & proxy != 0 and continues(motion, world[i]):
             starts[i] = ends[i]
 
-    return find_starts
+    @wp.kernel(enable_backward=False, module="unique")
+    def add_forces(
+        # in
+        impulses: wp.array[force],
+        proxy: wp.array[int],
+        dt: float,
+        # out
+        forces: wp.array[force],
+    ):
+        """Adds the forces that make impulses on bodies or particles in a step, at the indices of their proxies."""
+        i = wp.tid()
+        if proxy[i] >= 0:
+            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
+
+    return find_starts, add_forces
 
 
-_find_starts_of_bodies, _find_starts_of_particles = _make_find_starts(wp.transform), _make_find_starts(wp.vec3)
+_find_starts_of_bodies, _add_wrenches = _make_kernels(wp.transform, wp.spatial_vector)
+_find_starts_of_particles, _add_forces = _make_kernels(wp.vec3, wp.vec3)
 
 
 @wp.kernel
@@ -54,7 +69,7 @@ def _add_impulses(
     of_particles: wp.array[wp.vec3],
     of_bodies: wp.array[wp.spatial_vector],
 ):
-    """Adds the changes of momentum by the response, angular momentum about centres of mass [N s, N m s]."""
+    """Adds the changes of momentum by the response [N s], and of angular momentum about centres of mass [N m s]."""
     i = wp.tid()
     if i < of_particles.shape[0] and vertices.outcome[i] != 0:
         of_particles[i] += particle_mass[i] * (vertices.velocity[i] - motion.velocity[i])
@@ -65,56 +80,36 @@ def _add_impulses(
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 
 
-def _make_add_forces(kind: type) -> wp.Kernel:
-    """Returns the kernel below for wrenches or forces, see :func:`_make_find_starts`."""
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def add_forces(
-        # in
-        impulses: wp.array[kind],
-        proxy: wp.array[int],
-        dt: float,
-        # out
-        forces: wp.array[kind],
-    ):
-        """Adds the forces that make impulses on bodies or particles in a step, to the places of their proxies."""
-        i = wp.tid()
-        if proxy[i] >= 0:
-            wp.atomic_add(forces, proxy[i], impulses[i] / dt)
-
-    return add_forces
-
-
-_add_wrenches, _add_forces = _make_add_forces(wp.spatial_vector), _make_add_forces(wp.vec3)
-
-
 def _is_default(solver, hook):
-    """Returns whether a solver has a hook of the interface itself."""
+    """Returns whether a hook of a solver is the default of the interface."""
     return getattr(type(solver), hook, None) in (None, getattr(CouplingInterface, hook))
 
 
 class CouplingHooks(CouplingInterface):
     """Makes a stage with an inner ``solver`` an entry of ``newton.solvers.experimental.coupled``.
 
-    Hooks are those of the inner solver, or those that the interface derives from the model if it has none, with two
-    additions. A proxy, which the coupler sets to the pose of its source before a step, moves from where it was at the
-    end of the last step: so nothing is passed where the two differ. Each pass of a coupler over a step begins where the
-    first one did. And what the response changes of the momentum of a proxy is fed back to its source, also by inner
-    solvers that harvest only the forces of their own contacts.
+    Hooks are those of the inner solver, or the defaults of the interface if it has none, with two additions:
 
-    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, as one of a finger and
-    cloth on another finger does, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of the
-    source along the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which may
-    be more: choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7 in
-    each step behind VBD, whatever the mass and the relaxation, because VBD takes the way from the last pose of a proxy
-    to its source for a velocity: the two bounce apart.
+    - A proxy, which the coupler sets to the pose of its source before a step, starts where the last step ended, so that
+      it passes nothing on the way between. Each pass of a coupler over a step starts where the first one did.
+    - The change of momentum of a proxy by the response is fed back to its source, also if the inner solver harvests
+      only the forces of its own contacts.
 
-    The stage resolves and certifies the motion in the view of its entry: that of the entry's own particles, of proxies,
-    and of the shapes that the entry sees. Particles of another entry without proxies are obstacles if the view has
-    their faces. They take the way of the last step in the present one: two entries may pass through each other in one
-    step, and are pushed back in the next. The report counts a step for each substep of the entry and each pass.
-    ``SolverCoupledADMM`` takes hard attachments of bodies to particles for those of one entry only if its solver is
-    ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
+    The source feels the impulses on its proxy a step late. If a contact stops a proxy outright, for example of a finger
+    that presses cloth on another finger, ``mode="staggered"`` is stable if the proxy has less than 4/3 of the mass of
+    the source along the contact. Some solvers, such as ``SolverMuJoCo``, give proxies an average over directions, which
+    may be more: choose ``mass_scale`` then. With ``mode="lagged"`` and one pass, errors grow by a factor of 1.2 to 1.7
+    in each step behind VBD, whatever the mass and the relaxation, because VBD derives a velocity from the way of a
+    proxy from its last pose to its source: the two bounce apart.
+
+    Limitations:
+        The stage resolves and certifies the motion in the view of its entry: the entry's own particles, proxies, and
+        the shapes that the entry has. Particles of another entry without proxies are obstacles if the view has their
+        faces; they lag a step. Two entries may therefore pass through each other in one step, and are pushed back in
+        the next. The report counts a step for each substep of the entry and each pass.
+
+        ``SolverCoupledADMM`` handles hard attachments of bodies to particles within one entry only if its solver is
+        ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
 
     Attributes:
         solver: The inner solver.
@@ -132,35 +127,36 @@ class CouplingHooks(CouplingInterface):
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation.
 
-        Its first step begins where its state is: joints that the view of the entry lacks may place proxies.
+        The first step starts where its state is: joints that the view of the entry lacks may place proxies.
         """
         self._hook("coupling_notify_iteration_restarts")(enabled)
         self._motion.interrupt()
         self._coupled = _Coupled(self.model, self._motion, restarts=enabled)
 
     def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
-        """Delegates to the inner solver; in a step, makes proxies move from where they were at the end of the last."""
+        """Delegates to the inner solver; in a step, makes proxies start where the last step ended."""
         options = {"iteration_restart": iteration_restart, "dt": dt}
         self._hook("coupling_notify_input_state_update")(state, flags, **options)
         if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
             self._coupled.update_input(**options)
 
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
-        """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
+        """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
+        impulses = None if self._coupled is None else self._coupled.body_impulses
         hook = "coupling_harvest_proxy_wrenches"
-        self._harvest(hook, _add_wrenches, "body_impulses", body_local_to_proxy_global, out_body_f, options)
+        self._harvest(hook, _add_wrenches, impulses, body_local_to_proxy_global, out_body_f, options)
 
     def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
-        """Delegates to the inner solver, and adds the forces of the response if that does not see them."""
+        """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
+        impulses = None if self._coupled is None else self._coupled.particle_impulses
         hook = "coupling_harvest_proxy_particle_forces"
-        self._harvest(hook, _add_forces, "particle_impulses", particle_local_to_proxy_global, out_particle_f, options)
+        self._harvest(hook, _add_forces, impulses, particle_local_to_proxy_global, out_particle_f, options)
 
-    def _harvest(self, hook, kernel, name, proxy, forces, options):
+    def _harvest(self, hook, kernel, impulses, proxy, forces, options):
         if self._inner_contacts is not None and options["contacts"] is not None:
             options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
-        if self._coupled is not None and not _is_default(self.solver, hook):  # that sees the changed velocities
-            impulses = getattr(self._coupled, name)
+        if impulses is not None and not _is_default(self.solver, hook):  # the default includes changes of velocities
             inputs = [impulses, proxy, options["dt"]]
             wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
 
@@ -182,7 +178,7 @@ for _name in dir(CouplingInterface):
 
 
 class _Coupled:
-    """What a stage keeps for a coupler: where proxies were, where a step began, and the impulses on proxies."""
+    """State of a stage in a coupled simulation: where steps started and ended, and the impulses of the response."""
 
     def __init__(self, model, motion, *, restarts):
         self._model, self._motion, device = model, motion, model.device
@@ -194,9 +190,9 @@ class _Coupled:
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
     def update_input(self, *, iteration_restart, dt):
-        """Notes that a coupler has set positions for a pass over a step of length ``dt``; 0 where it has for a reset.
+        """Prepares for a pass over a step, for which a coupler has set positions; ``dt`` is 0 at a reset.
 
-        Each pass begins where the first one did, also where that is not where the positions are.
+        Each pass starts where the first one did, whatever the positions are.
         """
         if dt <= 0.0:  # ``reset`` interrupts the motion
             return
@@ -212,25 +208,23 @@ class _Coupled:
         self.particle_impulses.zero_()
 
     def start_of(self, state):
-        """Returns the state that a step starts from, as far as positions go, given that which it is called with."""
+        """Returns a state with the positions from which a step starts, given the state that it is called with."""
         if not self._continues:
             return state
         self._continues = False
-        model, first, start = self._model, self._first, self._start
-        bodies = first.body_q, model.body_world, model.body_flags, int(BodyFlags.PROXY), state.body_q
-        particles = first.particle_q, model.particle_world, model.particle_flags, int(ParticleFlags.PROXY)
-        particles += (state.particle_q,)
-        for kernel, arrays, starts in (
-            (_find_starts_of_bodies, bodies, start.body_q),
-            (_find_starts_of_particles, particles, start.particle_q),
+        model, device = self._model, self._model.device
+        for kernel, name, proxy in (
+            (_find_starts_of_bodies, "body", BodyFlags.PROXY),
+            (_find_starts_of_particles, "particle", ParticleFlags.PROXY),
         ):
+            ends, given, starts = (getattr(x, f"{name}_q") for x in (self._first, state, self._start))
             if starts is not None:
-                inputs = [self._motion.vertices, *arrays]
-                wp.launch(kernel, len(starts), inputs=inputs, outputs=[starts], device=model.device)
-        return start
+                inputs = [self._motion.vertices, ends, getattr(model, f"{name}_world"), getattr(model, f"{name}_flags")]
+                wp.launch(kernel, len(starts), inputs=[*inputs, int(proxy), given], outputs=[starts], device=device)
+        return self._start
 
     def finish(self, state, motion, vertices):
-        """Notes where a step has ended, and what the response did."""
+        """Keeps the positions at the end of a step, and adds the impulses of the response."""
         _copy_positions(self._last, state)
         outputs = [self.particle_impulses, self.body_impulses]
         inputs, size = [motion, vertices, self._model.particle_mass], max(map(len, outputs))

@@ -5,17 +5,19 @@ from typing import TypeGuard
 
 from newton.solvers import SolverBase, SolverVBD
 
-_TRUNCATION = "_penetration_free_truncation"
-"""Method of Newton 1.8 that cuts displacements; without self-contact it cuts none. It has no public name."""
+from .private import vbd_truncation, vbd_truncation_replaced
 
 
 def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
-    """Returns whether a solver is VBD with self-contact, which cuts the path of every particle, near something or not.
+    """Returns whether a solver is VBD with self-contact, whose limit can be lifted; warns if this Newton forbids it.
 
-    The path between two detections is at most ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at
-    planes between features that are near each other.
+    Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
+    ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
+    other.
     """
-    return isinstance(solver, SolverVBD) and solver.particle_enable_self_contact and hasattr(solver, _TRUNCATION)
+    if not isinstance(solver, SolverVBD) or not solver.particle_enable_self_contact:
+        return False
+    return vbd_truncation(solver) is not None
 
 
 @contextlib.contextmanager
@@ -28,7 +30,8 @@ def without_speed_limit(solver: SolverVBD):
     Args:
         solver: A solver for which :func:`has_speed_limit` is true.
     """
-    truncate = getattr(solver, _TRUNCATION)
+    truncate = vbd_truncation(solver)
+    assert truncate is not None
 
     def truncate_without_self_contact(*arguments, **options):
         solver.particle_enable_self_contact = False
@@ -37,12 +40,5 @@ def without_speed_limit(solver: SolverVBD):
         finally:
             solver.particle_enable_self_contact = True
 
-    own = _TRUNCATION in vars(solver)  # not that of its class
-    setattr(solver, _TRUNCATION, truncate_without_self_contact)
-    try:
+    with vbd_truncation_replaced(solver, truncate_without_self_contact):
         yield
-    finally:
-        if own:
-            setattr(solver, _TRUNCATION, truncate)
-        else:
-            delattr(solver, _TRUNCATION)

@@ -9,6 +9,7 @@ from newton.solvers import SolverBase
 
 from ..._arguments import check_instance
 from ..._one_thread import Occupied
+from .private import check_versions
 
 
 class StateArrays(NamedTuple):
@@ -44,6 +45,7 @@ class WrappedSolver(SolverBase):
             TypeError: If it is no solver of Newton.
         """
         check_instance(solver, "solver", SolverBase, "a solver of Newton")
+        check_versions()
         self._lock = Occupied(type(self).__name__)
         self.solver = solver
         super().__init__(solver.model)

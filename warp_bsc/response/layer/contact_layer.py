@@ -27,7 +27,7 @@ from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import Count
 from ..adjoint.arrays import attach_gradients, launch_adjoint
-from ..integration.tape import paused_tape
+from ..integration.private import paused_tape
 from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh

@@ -17,7 +17,7 @@ def _write_friction(
     vertices: wp.array[float],
     planes: wp.array[float],
 ):
-    """Writes the coefficients of vertices and planes; those below 0 count as 0."""
+    """Writes the coefficients of vertices and planes; negative ones count as 0."""
     i = wp.tid()
     if i < planes.shape[0]:
         planes[i] = wp.max(of_shapes[shape_of_plane[i]], 0.0)
@@ -31,10 +31,10 @@ class Friction:
     """Coefficients of friction; that of a contact is the geometric mean of those of its two sides.
 
     Attributes:
-        vertices: Those of vertices, Warp array of float, shape [vertex_count].
-        planes: Those of infinite planes, Warp array of float.
-        of_particles: What those of particles are read from, one for all or one each.
-        of_shapes: What those of shapes are read from, as ``newton.Model.shape_material_mu``.
+        vertices: Coefficients of vertices, Warp array of float, shape [vertex_count].
+        planes: Coefficients of infinite planes, Warp array of float, shape [plane_count].
+        of_particles: The coefficients of particles from which they are read, shape [1] or [particle_count].
+        of_shapes: The coefficients of shapes from which they are read, as ``newton.Model.shape_material_mu``.
     """
 
     def __init__(self, mesh: ModelMesh, of_particles: wp.array[float], of_shapes: wp.array[float]):
@@ -42,8 +42,8 @@ class Friction:
 
         Args:
             mesh: The mesh.
-            of_particles: Those of particles, shape [1] or [particle_count].
-            of_shapes: Those of shapes, shape [shape_count].
+            of_particles: Coefficients of particles, shape [1] or [particle_count].
+            of_shapes: Coefficients of shapes, shape [shape_count].
         """
         self._mesh, self.of_particles, self.of_shapes = mesh, of_particles, of_shapes
         self.vertices = wp.zeros(mesh.vertex_count, dtype=float, device=mesh.device)
@@ -55,14 +55,12 @@ class Friction:
         self._launch([self.vertices, self.planes])
 
     def backward(self, of_vertices: wp.array[float], of_planes: wp.array[float]) -> None:
-        """Adds to the gradients of what coefficients are read from, given those of vertices and planes."""
-        outputs = [of_vertices, of_planes]  # which stand in for the outputs: the adjoint neither reads nor writes these
-        inputs = 5 * [None]
-        self._launch(outputs, adjoint=True, adj_inputs=inputs, adj_outputs=outputs)
+        """Adds to the gradients of :attr:`of_particles` and :attr:`of_shapes`, given those of vertices and planes."""
+        outputs = [of_vertices, of_planes]  # stand in for the outputs, which the adjoint does not read or write
+        self._launch(outputs, adjoint=True, adj_inputs=5 * [None], adj_outputs=outputs)
 
     def _launch(self, outputs, **options):
-        mesh = self._mesh
-        shapes = mesh.device_shape_vertices.shape, mesh.device_planes.shape
-        inputs = [self.of_particles, self.of_shapes, mesh.model.particle_count, *shapes]
-        size = max(map(len, outputs))
+        mesh, size = self._mesh, max(map(len, outputs))
+        inputs = [self.of_particles, self.of_shapes, mesh.model.particle_count]
+        inputs += [mesh.device_shape_vertices.shape, mesh.device_planes.shape]
         wp.launch(_write_friction, size, inputs=inputs, outputs=outputs, device=mesh.device, **options)

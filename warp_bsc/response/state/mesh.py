@@ -60,6 +60,16 @@ class Incidence:
     items: wp.array[int]
 
 
+@wp.struct
+class Connectivity:
+    """The elements of a mesh, and the elements that each belongs to."""
+
+    faces: wp.array2d[int]
+    edges: wp.array2d[int]
+    vertex_edges: Incidence
+    edge_faces: Incidence
+
+
 class ModelMesh(CollisionMesh):
     """The triangles of a Newton model that particles can collide with, as one mesh.
 
@@ -69,8 +79,7 @@ class ModelMesh(CollisionMesh):
     vertices in each. Infinite planes have no triangles and are listed separately.
 
     Later changes of the model do not change the mesh, except for positions and inverse masses. Margins of shapes and
-    radii of particles are ignored. Springs and particles without faces take part only where pairs keep distances, see
-    :meth:`keep_distances`.
+    radii of particles are ignored.
 
     Attributes:
         model: The model.
@@ -91,26 +100,25 @@ class ModelMesh(CollisionMesh):
         Args:
             model: The ``newton.Model``.
             strands: Whether springs without faces take part as edges, and particles without springs as points. Only a
-                minimum distance keeps these apart from each other. A spring that runs along two others, against
+                minimum distance keeps these apart from each other. A spring that runs along two others, to resist
                 bending, takes no part.
 
         Raises:
             NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
                 cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
         """
-        particle_world = _finalized(model.particle_world).numpy()
+        particle_world = host_array(model.particle_world)
         if model.world_count == 1:
             particle_world = np.zeros_like(particle_world)
         elif (particle_world < 0).any():
             raise NotImplementedError(
                 f"particle {np.argmax(particle_world < 0)} is in all of {model.world_count} worlds; add it to one world"
             )
-        shape_body, shape_world = _finalized(model.shape_body).numpy(), _finalized(model.shape_world).numpy()
-        shape_type, shape_scale = _finalized(model.shape_type).numpy(), _finalized(model.shape_scale).numpy()
-        transform = _finalized(model.shape_transform).numpy().astype(np.float64)
-        collides = (_finalized(model.shape_flags).numpy() & ShapeFlags.COLLIDE_PARTICLES) != 0
-        infinite = (shape_type == GeoType.PLANE) & (shape_scale[:, :2] <= 0.0).any(axis=1)
-
+        shape_body, shape_world = host_array(model.shape_body), host_array(model.shape_world)
+        transform = host_array(model.shape_transform).astype(np.float64)
+        collides = (host_array(model.shape_flags) & ShapeFlags.COLLIDE_PARTICLES) != 0
+        shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
+        infinite = are_infinite_planes(model)
         tessellations = {}
         shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
         vertex_count = model.particle_count
@@ -126,23 +134,16 @@ class ModelMesh(CollisionMesh):
                 positions.append(shape_positions)
                 faces.append(vertex_count + shape_faces)
                 vertex_count += len(shape_positions)
-        world = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)])
-        worlds = world if model.world_count > 1 else None
-        faces = np.concatenate(faces)
+        world, faces = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)]), np.concatenate(faces)
         edges, points = _strands(model, faces) if strands else (None, None)
+        worlds = world if model.world_count > 1 else None
         super().__init__(faces, vertex_count, edges=edges, points=points, world=worlds, device=model.device)
-
-        shapes = np.array(shapes, dtype=np.int32)
-        planes = np.flatnonzero(collides & infinite).astype(np.int32)
         self.model = model
+        shapes, planes = np.array(shapes, dtype=np.int32), np.flatnonzero(collides & infinite).astype(np.int32)
+        normals = _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0]))
         self.shape_vertices = ShapeVertices(np.concatenate(positions).astype(np.float32), shape_body[shapes], shapes)
-        self.planes = Planes(
-            transform[planes, :3].astype(np.float32),
-            _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0])).astype(np.float32),
-            shape_body[planes],
-            planes,
-            shape_world[planes],
-        )
+        of_planes = shape_body[planes], planes, shape_world[planes]
+        self.planes = Planes(transform[planes, :3].astype(np.float32), normals.astype(np.float32), *of_planes)
         self.device_world = self._on_device(world)
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
@@ -160,7 +161,7 @@ class ModelMesh(CollisionMesh):
     def keep_distances(
         self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
     ) -> None:
-        """Sets the minimum distances of pairs, with arguments as of :meth:`min_distances`."""
+        """Sets the minimum distances of pairs, with arguments and errors as of :meth:`min_distances`."""
         self.distances = self.min_distances(min_distance, radius, reach=reach)
 
     def min_distances(
@@ -171,17 +172,16 @@ class ModelMesh(CollisionMesh):
         Args:
             min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
             radius: Radius of each particle [m], as the distance, shape [particle_count], or one for all; None for 0.
-            reach: How much farther apart than their distance near pairs are at most [m].
+            reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
 
         Raises:
-            TypeError: If the distance or the radii are no numbers.
-            ValueError: If they have another shape or are out of range.
+            TypeError: If ``min_distance`` or ``radius`` is no number.
+            ValueError: If one of them has another shape or is out of range.
         """
         distance, count = checked_distance(min_distance, "min_distance"), self.model.particle_count
-        given = 0.0 if radius is None else radius.numpy() if isinstance(radius, wp.array) else radius
-        radii = checked_distances(given, "radius", count)
+        radii = radius.numpy() if isinstance(radius, wp.array) else radius
         every = np.full(self.vertex_count, 0.5 * distance)
-        every[:count] += radii
+        every[:count] += checked_distances(0.0 if radii is None else radii, "radius", count)
         group = np.full(self.vertex_count, -1)
         group[count:] = self.shape_vertices.body + 1
         return make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
@@ -277,10 +277,10 @@ def _write_inverse_masses(
     inverse_masses[particle] = inverse_mass
 
 
-def _finalized(array: wp.array | None) -> wp.array:
-    """Returns an array that a model has once it is finalized."""
+def host_array(array: wp.array | None) -> np.ndarray:
+    """Returns an array that a model has once it is finalized, on the host."""
     assert array is not None
-    return array
+    return array.numpy()
 
 
 def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
@@ -293,6 +293,11 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
     incidence.first = wp.array(first, dtype=int, device=device)
     incidence.items = wp.array(rows[order], dtype=int, device=device)
     return incidence
+
+
+def are_infinite_planes(model: Model) -> np.ndarray:
+    """Returns which shapes of a model are infinite planes, shape [shape_count]."""
+    return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)
 
 
 def _soft_faces(model):
@@ -313,9 +318,9 @@ def sides_of(tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _strands(model, faces):
-    """Returns the springs with an end that no face has, without those along two others, and particles without springs.
+    """Returns the springs that take part, and the particles without faces and springs that do.
 
-    The inner particles of soft bodies are left out.
+    Springs have an end without faces, and do not run along two others. Inner particles of soft bodies take no part.
     """
     count = model.particle_count
     bare = np.ones(count, dtype=bool)
@@ -342,19 +347,9 @@ def _strands(model, faces):
 
 
 def _tessellate(model, shape, shape_type, scale):
-    """Returns the surface of a shape as triangles, without two vertices in one place.
+    """Returns the surface of a shape: positions in its frame [m], float64, shape [n, 3], and faces, shape [m, 3].
 
-    Args:
-        model: The ``newton.Model``.
-        shape: Index of the shape.
-        shape_type: Its type.
-        scale: Its scale, whose meaning depends on the type.
-
-    Returns:
-        Positions [m] in the frame of the shape, float64, shape [n, 3], and faces, shape [m, 3].
-
-    Raises:
-        NotImplementedError: If there are no triangles for the type.
+    No two vertices are in one place. Raises NotImplementedError if there are no triangles for the type.
     """
     x, y, z = scale.astype(np.float64)
     match shape_type:
@@ -386,12 +381,9 @@ def _tessellate(model, shape, shape_type, scale):
 
 
 def _weld(mesh):
-    """Returns the triangles of a ``newton.Mesh``, with its vertices that are in one place merged.
+    """Returns the vertices and triangles of a ``newton.Mesh``, with vertices that are in one place merged.
 
     Seams of texture or normals have several, and the triangles on both sides would always collide with each other.
-
-    Returns:
-        Positions [m], float64, shape [n, 3], and faces, shape [m, 3].
     """
     positions, vertex = np.unique(mesh.vertices.astype(np.float64), axis=0, return_inverse=True)
     return positions, vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
@@ -433,13 +425,3 @@ def _rotate(quaternion, vectors):
     axis = quaternion[..., :3]
     twist = 2.0 * np.cross(axis, vectors)
     return vectors + quaternion[..., 3:] * twist + np.cross(axis, twist)
-
-
-@wp.struct
-class Connectivity:
-    """The elements of a mesh, and the elements that each belongs to."""
-
-    faces: wp.array2d[int]
-    edges: wp.array2d[int]
-    vertex_edges: Incidence
-    edge_faces: Incidence

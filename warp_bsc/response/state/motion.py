@@ -30,23 +30,15 @@ class _Placement:
 
 
 @wp.func
-def _position(placement: _Placement, vertex: int) -> wp.vec3:
-    return vertex_position(
-        vertex,
-        placement.particle_q,
-        placement.body_q,
-        placement.shape_vertex_position,
-        placement.shape_vertex_body,
-    )
+def _position(place: _Placement, vertex: int) -> wp.vec3:
+    return vertex_position(vertex, place.particle_q, place.body_q, place.shape_vertex_position, place.shape_vertex_body)
 
 
 @wp.func
-def _place_plane(placement: _Placement, i: int, planes: wp.array[wp.vec4d]):
+def _place_plane(place: _Placement, i: int, planes: wp.array[wp.vec4d]):
     """Writes a plane, if there is one of that number."""
     if i < planes.shape[0]:
-        planes[i] = transformed_plane(
-            placement.plane_point[i], placement.plane_normal[i], placement.plane_body[i], placement.body_q
-        )
+        planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
 
 
 @wp.func
@@ -66,6 +58,13 @@ def moves_with_body(motion: Motion, vertex: int) -> bool:
 
 
 @wp.func
+def predicted_position(motion: Motion, vertex: int) -> wp.vec3:
+    """Returns the predicted position of a vertex of a body that the response can move [m]."""
+    bodies = motion.bodies
+    return wp.transform_point(bodies.end[bodies.of_vertex[vertex]], bodies.position[vertex - bodies.particle_count])
+
+
+@wp.func
 def predicted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
     """Returns the predicted velocity of a vertex of a body, whose predicted position is ``x1`` [m/s]."""
     body = motion.bodies.of_vertex[vertex]
@@ -75,7 +74,7 @@ def predicted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
 
 @wp.func
 def continues(motion: Motion, world: int) -> bool:
-    """Returns whether a step begins where the last one ended, as far as movable particles of a world go."""
+    """Returns whether the step of a world begins where the last one ended; no movable particle was moved between."""
     last = motion.interrupted.shape[0] - 1
     return motion.interrupted[wp.where(world < 0, last, world)] == 0
 
@@ -87,7 +86,7 @@ def _interrupt(
     # out
     interrupted: wp.array[int],
 ):
-    """Marks worlds as interrupted, and what is in all of them if any world is."""
+    """Marks worlds as interrupted, and as the last entry everything that is in all worlds, if any world is."""
     i = wp.tid()
     last = world_mask.shape[0] - 1
     if world_mask[wp.min(i, last)] or world_mask[last]:
@@ -98,7 +97,7 @@ def _interrupt(
 @wp.kernel(enable_backward=False)
 def _write_start(
     # in
-    placement: _Placement,
+    place: _Placement,
     last: wp.array[wp.vec3],
     inverse_mass: wp.array[float],
     world: wp.array[int],
@@ -109,10 +108,10 @@ def _write_start(
 ):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
-    _place_plane(placement, i, planes)
+    _place_plane(place, i, planes)
     if i >= x0.shape[0]:
         return
-    x = _position(placement, i)
+    x = _position(place, i)
     x0[i] = x
     if last and inverse_mass[i] > 0.0:
         for axis in range(3):
@@ -151,35 +150,32 @@ def _write_bodies(
 @wp.kernel(enable_backward=False)
 def _write_end(
     # in
-    placement: _Placement,
+    place: _Placement,
     particle_qd: wp.array[wp.vec3],
     dt: float,
     last: wp.array[wp.vec3],
-    plane_world: wp.array[int],
     # in and out
     motion: Motion,
-    # out
-    plane_starts: wp.array[wp.vec4d],
-    plane_ends: wp.array[wp.vec4d],
+    planes: MovingPlanes,
 ):
     """Writes positions, velocities and planes at the end of a step.
 
-    Velocities are those of particles and movable bodies as they are, and those of other shapes from their positions. A
-    vertex without a finite position at the end stands where it was. What nothing moves starts where the last step left
-    it: a program that animates it between steps would otherwise take it past what is in its way unseen.
+    Velocities of particles and movable bodies are the predicted ones, those of other shapes follow from their paths. A
+    vertex without a finite position at the end stays where it was. A vertex that the response cannot move starts where
+    the last step left it: it would otherwise pass undetected what is in its way, if a program moves it between steps.
     """
     i = wp.tid()
-    if last and i < plane_ends.shape[0] and not _is_movable(motion, placement.plane_body[i]):
-        if continues(motion, plane_world[i]) and wp.isfinite(plane_ends[i]):
-            plane_starts[i] = plane_ends[i]
-    _place_plane(placement, i, plane_ends)
+    if last and i < planes.end.shape[0] and not _is_movable(motion, place.plane_body[i]):
+        if continues(motion, planes.world[i]) and wp.isfinite(planes.end[i]):
+            planes.start[i] = planes.end[i]
+    _place_plane(place, i, planes.end)
     if i >= motion.x1.shape[0]:
         return
     if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
         if continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
             motion.x0[i] = last[i]
     x0 = motion.x0[i]
-    x1 = _position(placement, i)
+    x1 = _position(place, i)
     velocity = (x1 - x0) / dt
     if i < particle_qd.shape[0]:
         velocity = particle_qd[i]
@@ -205,24 +201,22 @@ def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
 
 
 class ModelMotion:
-    """The input of :meth:`.response.Response.resolve`, whose buffers are reused from step to step.
+    """The predicted motion of a model in a step, the input of :func:`.step.resolve`. Each step overwrites its buffers.
+
+    :meth:`set_start` and then :meth:`set_end` write it from the states at both ends of a step.
 
     Attributes:
-        vertices: The vertices, :class:`.buffers.Motion`.
-        planes: The infinite planes, :class:`.planes.MovingPlanes`.
+        vertices: The vertices, :class:`.state.structs.Motion`.
+        planes: The infinite planes, :class:`.state.planes.MovingPlanes`.
         mesh: The mesh.
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
-        keeps_poses: Whether poses of bodies at the start and end are kept: then, or if the model requires gradients.
+        keeps_poses: Whether ``vertices.bodies`` has the poses of bodies at the start and end: if the response can move
+            bodies, or if the model requires gradients.
     """
 
     def __init__(
-        self,
-        mesh: ModelMesh,
-        friction: Friction,
-        *,
-        moves_bodies: bool = False,
-        responds_to_bodies: bool = False,
+        self, mesh: ModelMesh, friction: Friction, *, moves_bodies: bool = False, responds_to_bodies: bool = False
     ):
         """Allocates buffers.
 
@@ -233,31 +227,32 @@ class ModelMotion:
             responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
         """
         self.mesh, self.friction = mesh, friction
+        device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
         for name in ("x0", "x1", "velocity"):
-            setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=mesh.device))
-        vertices.is_not_finite = wp.zeros(mesh.vertex_count, dtype=int, device=mesh.device)
-        vertices.interrupted = wp.zeros(max(1, mesh.model.world_count) + 1, dtype=int, device=mesh.device)
+            setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=device))
+        vertices.is_not_finite = wp.zeros(mesh.vertex_count, dtype=int, device=device)
+        vertices.interrupted = wp.zeros(max(1, model.world_count) + 1, dtype=int, device=device)
         self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
         if mesh.distances is not None:
             vertices.distances = mesh.distances
         self.planes = planes = MovingPlanes()
-        planes.friction, planes.world = friction.planes, mesh.device_planes.world
-        planes.shape, planes.body = mesh.device_planes.shape, mesh.device_planes.body
+        of_planes = mesh.device_planes
+        planes.friction, planes.world = friction.planes, of_planes.world
+        planes.shape, planes.body = of_planes.shape, of_planes.body
         for name in ("start", "end"):
-            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=mesh.device))
+            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=device))
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
-        self.keeps_poses = moves_bodies or bool(mesh.model.requires_grad and mesh.model.body_count)
+        self.keeps_poses = moves_bodies or bool(model.requires_grad and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             for name in ("start", "end"):
-                poses = wp.zeros(mesh.model.body_count, dtype=wp.transform, device=mesh.device)
-                setattr(vertices.bodies, name, poses)
+                setattr(vertices.bodies, name, wp.zeros(model.body_count, dtype=wp.transform, device=device))
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
@@ -279,12 +274,12 @@ class ModelMotion:
         return bodies
 
     def remember(self, last: wp.array[wp.vec3]) -> None:
-        """Makes what the response cannot move start a step where it was at the end of the last one.
+        """Makes vertices and planes that the response cannot move start each step where they ended the last one.
 
-        Not in worlds in which a movable particle is elsewhere than then: those were set to another state. The first
-        step starts where the model puts vertices and planes, as set by :meth:`set_start` and :meth:`set_end`; but those
-        of bodies that the joint coordinates of the model put elsewhere start where the state of the step has them,
-        since a program that evaluates these does not move them.
+        Worlds in which a movable particle is elsewhere than at that end were set to another state, and start there. The
+        first step starts where the model puts vertices and planes, as set by :meth:`set_start` and :meth:`set_end`;
+        those of bodies that joint coordinates of the model put elsewhere start where the state of the step has them,
+        since a program that evaluates the joints does not move them.
 
         Args:
             last: Positions of the vertices at the end of the last step, which the response keeps.
@@ -302,7 +297,8 @@ class ModelMotion:
         """Makes the next step begin where its state is.
 
         Args:
-            world_mask: The worlds, then whether what is in all of them, shape [world_count + 1]; None for everything.
+            world_mask: Which worlds, and as the last entry whether also everything that is in all worlds, shape
+                [world_count + 1]; None for everything.
         """
         interrupted = self.vertices.interrupted
         if world_mask is None:
@@ -312,15 +308,15 @@ class ModelMotion:
             wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def starts(self) -> list[wp.array]:
-        """Returns the arrays that say where the next step begins: to repeat a step, set them to what they were."""
+        """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
         arrays: list[wp.array] = [self.vertices.interrupted]
         return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
-        """Copies the positions at the start of a step, from arrays as of :meth:`.model_mesh.ModelMesh.positions`."""
+        """Copies the positions at the start of a step, from arrays as of :meth:`.state.mesh.ModelMesh.positions`."""
         vertices = self.vertices
         self.mesh.check_lengths(particle_q, body_q, vertices.x0)
-        inputs = [self._placement(particle_q, body_q), self._last, vertices.inverse_mass, vertices.world]
+        inputs = [self._place(particle_q, body_q), self._last, vertices.inverse_mass, vertices.world]
         outputs = [vertices.x0, self.planes.start, vertices.interrupted]
         wp.launch(_write_start, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
         if self.keeps_poses:
@@ -336,16 +332,15 @@ class ModelMotion:
     ) -> None:
         """Copies the predicted positions and velocities at the end of a step of length ``dt`` [s], after its start.
 
-        Velocities of bodies are needed only where the response can move bodies.
+        Velocities of bodies are read only if the response can move bodies.
         """
         self.mesh.check_lengths(particle_q, body_q, self.vertices.x1)
         if self.moves_bodies:
             self.set_body_ends(body_q, body_qd)
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, body_q)
-        inputs = [self._placement(particle_q, body_q), particle_qd, dt, self._last, self.planes.world]
-        outputs = [self.vertices, self.planes.start, self.planes.end]
-        wp.launch(_write_end, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        inputs = [self._place(particle_q, body_q), particle_qd, dt, self._last, self.vertices, self.planes]
+        wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
     def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
         """Copies the predicted poses and velocities of bodies, but not the positions of their vertices."""
@@ -353,11 +348,11 @@ class ModelMotion:
         inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
         wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)
 
-    def _placement(self, particle_q, body_q):
-        mesh, placement = self.mesh, _Placement()
-        placement.particle_q, placement.body_q = particle_q, body_q
-        placement.shape_vertex_position = mesh.device_shape_vertices.position
-        placement.shape_vertex_body = mesh.device_shape_vertices.body
-        planes = mesh.device_planes
-        placement.plane_point, placement.plane_normal, placement.plane_body = planes.point, planes.normal, planes.body
-        return placement
+    def _place(self, particle_q, body_q):
+        """Returns where the vertices and the planes are in a state."""
+        mesh, place = self.mesh, _Placement()
+        place.particle_q, place.body_q = particle_q, body_q
+        vertices, planes = mesh.device_shape_vertices, mesh.device_planes
+        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
+        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
+        return place

@@ -4,15 +4,18 @@ import warp as wp
 
 from ..contacts.constraints import PLANE_CONTACT, approach_of
 from ..schedule import SolveStatus
-from ..state.motion import moves_with_body, predicted_velocity
+from ..state.motion import moves_with_body, predicted_position, predicted_velocity
+from ..state.planes import MovingPlanes
 from ..state.structs import Constraints, Motion, Vertices
 
 wp.set_module_options({"enable_backward": False})
 
-_UNCOUPLED = wp.constant(-2)
-"""Iteration of the last contact of a world without constraints, so that no projection moves its vertices."""
-
+_NOT_PROJECTED = wp.constant(-2)
+"""Iteration of the last contact of a world that takes no substeps: no iteration projects its vertices."""
 _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
+"""Separation of a constraint that no motion violates, so that it never acts [m]."""
+_NO_SWEEP = wp.constant(-2)
+"""Last sweep of a constraint that has been active in none; sweep -1 would be the one before the first."""
 
 
 @wp.kernel
@@ -30,11 +33,26 @@ def find_worlds(motion: Motion, constraints: Constraints, has_constraints: wp.ar
 
 
 @wp.kernel
-def keep_counts(constraints: Constraints, status: SolveStatus, detected: wp.array[int]):
-    """Keeps the numbers of constraints and contacts."""
-    detected[0] = constraints.count[0]
-    detected[1] = status.results.first_hits[0]
-    status.loop.recount[0] = 0  # the start remains where crossings are counted
+def keep_detection(constraints: Constraints, status: SolveStatus, detected: wp.array[int], is_fast: wp.array[int]):
+    """Keeps the numbers of constraints and contacts, and which worlds have fast or pushing contacts."""
+    world = wp.tid()
+    is_fast[world] = status.is_fast[world]
+    if world == 0:
+        detected[0] = constraints.count[0]
+        detected[1] = status.results.first_hits[0]
+        status.loop.recount[0] = 0  # the start remains where crossings are counted
+
+
+@wp.kernel
+def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: SolveStatus):
+    """Counts the contacts of the step as the inner solver predicted it, and its worlds with fast or pushing contacts.
+
+    Where something immovable pushes, substeps that follow it may end in contacts that do not look fast; but to divide
+    them could leave vertices in its way.
+    """
+    world = wp.tid()
+    status.is_fast[world] = wp.max(status.is_fast[world], is_fast[world])
+    status.results.first_hits[0] = detected[1]
 
 
 @wp.kernel
@@ -46,23 +64,28 @@ def begin_substeps(
     # in and out
     status: SolveStatus,
     # out
-    is_coupled: wp.array[int],
+    takes_substeps: wp.array[int],
     remaining: wp.array[int],
 ):
     """Marks the worlds that have constraints and take this number of substeps, and starts the count."""
     world = wp.tid()
     if world == 0:
         remaining[0] = substeps
-    is_coupled[world] = wp.where(number[world] == substeps, has_constraints[world], 0)
-    status.contact_iteration[world] = wp.where(is_coupled[world] == 1, 0, _UNCOUPLED)
+    takes_substeps[world] = wp.where(number[world] == substeps, has_constraints[world], 0)
+    status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
+
+
+@wp.func
+def _share(substeps: int, done: int) -> float:
+    """Returns the share of the whole step that a number of substeps makes."""
+    return float(done) / float(substeps)
 
 
 @wp.kernel
 def start_substep(
     # in
     motion: Motion,
-    start: wp.array[wp.vec4d],
-    end: wp.array[wp.vec4d],
+    planes: MovingPlanes,
     substeps: int,
     dt: float,
     remaining: wp.array[int],
@@ -74,26 +97,27 @@ def start_substep(
     constraints: Constraints,
     status: SolveStatus,
     # out
-    substep_start: wp.array[wp.vec4d],
-    substep_end: wp.array[wp.vec4d],
+    substep_planes: MovingPlanes,
     vertices: Vertices,
 ):
     """Writes the motion of a substep.
 
-    Particles, and bodies that the response can move, go where the inner solver wants them, shapes a share of their way.
+    Particles, and bodies that the response can move, end where the inner solver predicts them; shapes go a share of
+    their path in the whole step.
     """
     i = wp.tid()
-    before = float(substeps - remaining[0]) / float(substeps)
-    after = float(substeps - remaining[0] + 1) / float(substeps)
+    before = _share(substeps, substeps - remaining[0])
+    after = _share(substeps, substeps - remaining[0] + 1)
     if i == 0:
         constraints.count[0] = detected[0]
         status.loop.iteration[0] = 0
-    if i < start.shape[0]:
-        substep_start[i] = start[i] + wp.float64(before) * (end[i] - start[i])
-        substep_end[i] = start[i] + wp.float64(after) * (end[i] - start[i])
+    if i < planes.start.shape[0]:
+        path = planes.end[i] - planes.start[i]
+        substep_planes.start[i] = planes.start[i] + wp.float64(before) * path
+        substep_planes.end[i] = planes.start[i] + wp.float64(after) * path
     if i >= motion.x0.shape[0]:
         return
-    lost = int(0)
+    is_not_finite = int(0)
     if i < particle_q.shape[0]:
         x0 = substep.x0[i]
         x1 = particle_q[i]
@@ -101,21 +125,18 @@ def start_substep(
         if not (wp.isfinite(x1) and wp.isfinite(velocity)):
             x1 = x0
             velocity = wp.vec3()
-            lost = 1
+            is_not_finite = 1
     elif moves_with_body(substep, i):
-        x0 = substep.x0[i]
-        place = i - motion.bodies.particle_count
-        x1 = wp.transform_point(substep.bodies.end[motion.bodies.of_vertex[i]], motion.bodies.position[place])
+        x1 = predicted_position(substep, i)
         velocity = predicted_velocity(substep, i, x1)
     else:
-        path = motion.x1[i] - motion.x0[i]
-        x0 = motion.x0[i] + before * path
-        x1 = motion.x0[i] + after * path
-        velocity = path / dt
-        substep.x0[i] = x0
+        way = motion.x1[i] - motion.x0[i]
+        x1 = motion.x0[i] + after * way
+        velocity = way / dt
+        substep.x0[i] = motion.x0[i] + before * way
     substep.x1[i] = x1
     substep.velocity[i] = velocity
-    substep.is_not_finite[i] = lost
+    substep.is_not_finite[i] = is_not_finite
     vertices.x1[i] = x1
     vertices.velocity[i] = velocity
     vertices.outcome[i] = 0
@@ -145,7 +166,7 @@ def reset_constraints(
     constraints.position_multiplier[i] = wp.vec3d()
     constraints.velocity_multiplier[i] = wp.vec3d()
     constraints.previous_multiplier[i] = wp.vec3d()
-    constraints.last_sweep[i] = -2
+    constraints.last_sweep[i] = _NO_SWEEP
     if i < detected[0] and constraints.kind[i] == PLANE_CONTACT:
         constraints.separation[i] = _NEVER_VIOLATED
         return
@@ -214,23 +235,22 @@ def move_bodies(
     if motion.bodies.of_vertex:
         if motion.bodies.inverse_mass[body] > 0.0:
             return
-    for end in range(2):
-        share = float(substeps - remaining[0] + end) / float(substeps)
-        start_pose = body_q_start[body]
-        end_pose = body_q_end[body]
-        p = wp.transform_get_translation(start_pose)
-        p += share * (wp.transform_get_translation(end_pose) - p)
-        r = wp.quat_slerp(wp.transform_get_rotation(start_pose), wp.transform_get_rotation(end_pose), share)
-        if end == 0:
-            body_q_in[body] = wp.transform(p, r)
-        else:
-            body_q_out[body] = wp.transform(p, r)
+    done = substeps - remaining[0]
+    body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done))
+    body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done + 1))
+
+
+@wp.func
+def _pose_between(start: wp.transform, end: wp.transform, share: float) -> wp.transform:
+    p = wp.transform_get_translation(start)
+    p += share * (wp.transform_get_translation(end) - p)
+    return wp.transform(p, wp.quat_slerp(wp.transform_get_rotation(start), wp.transform_get_rotation(end), share))
 
 
 @wp.kernel
 def end_substeps(
     # in
-    is_coupled: wp.array[int],
+    takes_substeps: wp.array[int],
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
     # in and out
@@ -240,27 +260,22 @@ def end_substeps(
     particle_qd_out: wp.array[wp.vec3],
     vertices: Vertices,
 ):
-    """Makes the substeps the predicted motion, in worlds that have constraints, and puts vertices back to the start."""
-    particle = wp.tid()
-    vertices.x1[particle] = motion.x0[particle]
-    if particle >= particle_q.shape[0]:
+    """Makes the substeps the predicted motion, in worlds that take them, and puts vertices back to the start."""
+    i = wp.tid()
+    vertices.x1[i] = motion.x0[i]
+    if i >= particle_q.shape[0] or takes_substeps[motion.world[i]] == 0:
         return
-    if (
-        is_coupled[motion.world[particle]] == 0
-        or motion.is_not_finite[particle] != 0
-        or motion.inverse_mass[particle] == 0.0
-    ):
-        return
-    motion.x1[particle] = particle_q[particle]
-    motion.velocity[particle] = particle_qd[particle]
-    particle_q_out[particle] = particle_q[particle]
-    particle_qd_out[particle] = particle_qd[particle]
+    if motion.is_not_finite[i] == 0 and motion.inverse_mass[i] != 0.0:
+        motion.x1[i] = particle_q[i]
+        motion.velocity[i] = particle_qd[i]
+        particle_q_out[i] = particle_q[i]
+        particle_qd_out[i] = particle_qd[i]
 
 
 @wp.kernel
 def end_body_substeps(
     # in
-    is_coupled: wp.array[int],
+    takes_substeps: wp.array[int],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     # in and out
@@ -269,9 +284,9 @@ def end_body_substeps(
     body_q_out: wp.array[wp.transform],
     body_qd_out: wp.array[wp.spatial_vector],
 ):
-    """Makes the poses after the substeps the predicted ones, in worlds that have constraints."""
+    """Makes the poses after the substeps the predicted ones, in worlds that take substeps."""
     body = wp.tid()
-    if motion.bodies.inverse_mass[body] == 0.0 or is_coupled[wp.max(motion.bodies.world[body], 0)] == 0:
+    if motion.bodies.inverse_mass[body] == 0.0 or takes_substeps[wp.max(motion.bodies.world[body], 0)] == 0:
         return
     motion.bodies.end[body] = body_q[body]
     motion.bodies.velocity[body] = body_qd[body]
@@ -282,26 +297,8 @@ def end_body_substeps(
 @wp.kernel
 def place_bodies(motion: Motion):
     """Writes the predicted positions and velocities of the vertices of bodies."""
-    place = wp.tid()
-    vertex = motion.bodies.particle_count + place
+    vertex = motion.bodies.particle_count + wp.tid()
     if moves_with_body(motion, vertex):
-        x1 = wp.transform_point(motion.bodies.end[motion.bodies.of_vertex[vertex]], motion.bodies.position[place])
+        x1 = predicted_position(motion, vertex)
         motion.x1[vertex] = x1
         motion.velocity[vertex] = predicted_velocity(motion, vertex, x1)
-
-
-@wp.kernel
-def restore_fast(has_fast: wp.array[int], status: SolveStatus):
-    """Counts worlds with fast or pushing contacts in the motion that the inner solver predicted as such.
-
-    Where something immovable pushes, substeps that obey it may end in contacts that do not look like it; but to divide
-    them could leave vertices in its way.
-    """
-    world = wp.tid()
-    status.is_fast[world] = wp.max(status.is_fast[world], has_fast[world])
-
-
-@wp.kernel
-def restore_hits(detected: wp.array[int], status: SolveStatus):
-    """Makes the contacts of the step the inner solver predicted those that the status counts."""
-    status.results.first_hits[0] = detected[1]

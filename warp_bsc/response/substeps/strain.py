@@ -1,4 +1,4 @@
-"""How much contacts strain the elements of a model, and how many substeps that asks for."""
+"""How much contacts strain the elements of a model, and how many substeps follow from that."""
 
 import newton
 import numpy as np

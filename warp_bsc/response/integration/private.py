@@ -1,0 +1,267 @@
+"""What the stage uses of Warp and Newton beyond their public interfaces: one function for each name or contract.
+
+Each function says which contract it relies on, and what happens in a version that breaks it: an error that names it, or
+a fallback that says so in a warning. Tested versions are listed in :mod:`warp_bsc._private_names`.
+"""
+
+import contextlib
+import copy
+import functools
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from types import ModuleType
+from typing import Any
+
+import newton
+import warp as wp
+from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
+
+from ..._private_names import warn_if_untested
+
+_TRUNCATION = "_penetration_free_truncation"
+_OVERFLOW = "_soft_contact_source_overflow"
+
+
+def check_versions() -> None:
+    """Warns, once for each package, if the installed version of Warp or Newton is not a tested one."""
+    warn_if_untested("warp")
+    warn_if_untested("newton")
+
+
+def _missing(package: ModuleType, name: str, consequence: str) -> RuntimeError:
+    return RuntimeError(f"{package.__name__} {package.__version__} has no {name}, which warp-bsc uses: {consequence}")
+
+
+@contextlib.contextmanager
+def paused_tape() -> Iterator[wp.Tape | None]:
+    """Pauses the active tape, if any, so that it records no launches, and yields it; None if there is none.
+
+    Contract: ``warp._src.context.runtime.tape`` is the active :class:`warp.Tape`, or None. A tape that is left and
+    entered again continues its record.
+
+    Raises:
+        RuntimeError: If this version of Warp has no such name: a tape would record kernels of the stage, and gradients
+            would be wrong.
+    """
+    try:
+        tape = wp._src.context.runtime.tape
+    except AttributeError:
+        raise _missing(wp, "context.runtime.tape", "a step cannot pause the active tape") from None
+    if tape is None:
+        yield None
+        return
+    tape.__exit__(None, None, None)
+    try:
+        yield tape
+    finally:
+        tape.__enter__()
+
+
+def empty_struct(value: Any) -> Any:
+    """Returns a struct without arrays, of the type of a value that is a Warp struct; None for other values.
+
+    It takes the place of the gradient of a struct whose arrays have gradients of their own.
+
+    Contract: Instances of a :class:`warp.struct` have their type as ``_cls``.
+
+    Raises:
+        RuntimeError: If they do not: adjoints cannot be launched then.
+    """
+    if not wp.types.is_struct(value):
+        return None
+    if not hasattr(value, "_cls"):
+        raise _missing(wp, "attribute _cls of structs", "steps carry no gradients")
+    return _make_empty(value._cls)
+
+
+@functools.cache
+def _make_empty(struct):
+    return struct()
+
+
+def struct_fields(struct: Any) -> list[str]:
+    """Returns the names of the fields of a Warp struct, in their order.
+
+    Contract: A :class:`warp.struct` has its fields by name as ``vars``.
+
+    Raises:
+        RuntimeError: If it does not.
+    """
+    try:
+        return list(struct.vars)
+    except AttributeError:
+        raise _missing(wp, "attribute vars of structs", "the stage cannot be constructed") from None
+
+
+def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
+    """Returns the method by which VBD cuts displacements of particles; None, with a warning, if it is gone.
+
+    Contract: ``SolverVBD._penetration_free_truncation`` makes all cuts by self-contact. It reads
+    ``particle_enable_self_contact`` when it is called, and without self-contact it cuts before rigid shapes only.
+
+    Without the method, the speed limit of VBD's self-contact stays, and ``report.speed_limit_lifted`` is False.
+    """
+    truncate = getattr(solver, _TRUNCATION, None)
+    if truncate is None:
+        warnings.warn(
+            f"newton {newton.__version__} has no SolverVBD.{_TRUNCATION}, which warp-bsc replaces: "
+            "self-contact of VBD limits the speed of all particles",
+            stacklevel=4,
+        )
+    return truncate
+
+
+@contextlib.contextmanager
+def vbd_truncation_replaced(solver: SolverVBD, truncate: Callable[..., None]) -> Iterator[None]:
+    """Replaces the method of :func:`vbd_truncation` in one solver.
+
+    Contract: VBD looks the method up in the solver at each call, so that an attribute of the solver takes its place.
+    """
+    replaced = vars(solver).get(_TRUNCATION)
+    setattr(solver, _TRUNCATION, truncate)
+    try:
+        yield
+    finally:
+        if replaced is None:
+            delattr(solver, _TRUNCATION)
+        else:
+            setattr(solver, _TRUNCATION, replaced)
+
+
+def has_external_rigid_solver(solver: SolverBase) -> bool:
+    """Returns whether a solver is VBD that leaves bodies to another solver.
+
+    Contract: ``SolverVBD`` keeps its argument of this name as the attribute ``integrate_with_external_rigid_solver``.
+
+    Raises:
+        RuntimeError: If VBD does not: the stage would push bodies that VBD does not move.
+    """
+    name = "integrate_with_external_rigid_solver"
+    if isinstance(solver, SolverVBD) and not hasattr(solver, name):
+        raise _missing(newton, f"SolverVBD.{name}", "the stage cannot tell whether VBD moves bodies")
+    return getattr(solver, name, False)
+
+
+def body_q_prev(solver: SolverBase) -> wp.array | None:
+    """Returns the poses from which a solver takes the velocities of bodies in its next step, None if it has none.
+
+    Contract: ``SolverVBD`` that integrates bodies has the array ``body_q_prev``, which it reads at the start of a step.
+
+    Raises:
+        RuntimeError: If VBD integrates bodies and has no such array: pushed bodies would keep their old velocities.
+    """
+    poses = getattr(solver, "body_q_prev", None)
+    integrates = isinstance(solver, SolverVBD) and solver.model.body_count > 0 and not has_external_rigid_solver(solver)
+    if poses is None and integrates:
+        raise _missing(newton, "SolverVBD.body_q_prev", "the stage cannot push bodies; pass bodies that it leaves")
+    return poses
+
+
+def may_allocate(solver: SolverBase) -> bool:
+    """Returns whether a step of a solver may allocate memory, which the body of a condition in a CUDA graph must not.
+
+    Contract: ``SolverVBD`` and ``SolverStyle3D`` without a collision pipeline of their own allocate nothing in a step;
+    every other solver, and every class derived from these, counts as one that does. Where the contract is broken, Warp
+    raises an error when the step is captured.
+    """
+    return type(solver) not in (SolverVBD, SolverStyle3D) or solver.collision_pipeline is not None
+
+
+def attributes_of(solver: SolverBase) -> dict[str, Any]:
+    """Returns the attributes of a solver by name, in the dictionary that holds them.
+
+    Contract: All that a step changes of a solver is in this dictionary: Warp arrays, in place, and other attributes, by
+    assignment. To write the old values back repeats a step.
+
+    Raises:
+        RuntimeError: If the solver has slots, which this dictionary lacks: they would not be restored.
+    """
+    slots = {name for base in type(solver).__mro__ for name in vars(base).get("__slots__", ())}
+    if slots - {"__dict__", "__weakref__"}:
+        message = f"{type(solver).__name__} has slots, {', '.join(sorted(slots))}, which substeps cannot restore"
+        raise RuntimeError(f"{message}: omit substeps")
+    return vars(solver)
+
+
+@contextlib.contextmanager
+def without_own_contacts(solver: SolverBase) -> Iterator[None]:
+    """Keeps Style3D from resolving contacts of cloth with itself while it steps: the stage resolves them.
+
+    Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between
+    both, layers that the stage has moved together are thrown apart. Has no effect on other solvers.
+
+    Contract: ``SolverStyle3D.collision`` holds these contacts; None disables them.
+
+    Raises:
+        RuntimeError: If Style3D has no such attribute.
+    """
+    if not isinstance(solver, SolverStyle3D):
+        yield
+        return
+    if not hasattr(solver, "collision"):
+        raise _missing(newton, "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
+    own, solver.collision = solver.collision, None
+    try:
+        yield
+    finally:
+        solver.collision = own
+
+
+def soft_contact_arrays(contacts: newton.Contacts, names: Sequence[str]) -> dict[str, wp.array]:
+    """Returns arrays of soft contacts by name, those that contacts have.
+
+    Contract: Arrays are attributes ``soft_contact_*``. ``features``, the features of meshes that contacts are of, are
+    ``_soft_contact_mesh_features``, None if contacts are of particles alone. No solver reads other arrays of soft
+    contacts: these would no longer belong to the contacts that are left.
+
+    Raises:
+        RuntimeError: If this version of Newton has not all of them.
+    """
+    arrays = {}
+    for name in names:
+        attribute = _soft_contact_attribute(name)
+        if not hasattr(contacts, attribute):
+            raise _missing(newton, f"Contacts.{attribute}", "contacts cannot be left out in steps with substeps")
+        arrays[name] = getattr(contacts, attribute)
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def _soft_contact_attribute(name: str) -> str:
+    return "_soft_contact_mesh_features" if name == "features" else f"soft_contact_{name}"
+
+
+def soft_contact_counters(contacts: newton.Contacts, counters: wp.array) -> tuple[wp.array, wp.array]:
+    """Returns the number of soft contacts and whether some were dropped, views of an array like ``contact_counters``.
+
+    Contract: ``Contacts.contact_counters`` holds the number of contacts between bodies, that of soft contacts, an
+    overflow of no interest here, and ``_soft_contact_source_overflow``: 1 if soft contacts did not fit.
+
+    Raises:
+        RuntimeError: If this version of Newton has other counters.
+    """
+    array = contacts.contact_counters
+    for name, i in {"rigid_contact_count": 0, "soft_contact_count": 1, _OVERFLOW: 3}.items():
+        view = getattr(contacts, name, None)
+        if view is None or array.dtype is not wp.int32 or len(array) <= i or view.ptr != array[i : i + 1].ptr:
+            counter = f"Contacts.{name} as number {i} of Contacts.contact_counters"
+            raise _missing(newton, counter, "contacts cannot be left out in steps with substeps")
+    return counters[1:2], counters[3:4]
+
+
+def contacts_with(contacts: newton.Contacts, counters: wp.array, arrays: dict[str, wp.array]) -> newton.Contacts:
+    """Returns a copy of contacts with other counters and arrays of soft contacts; everything else is shared.
+
+    Contract: Solvers can read a shallow copy of ``newton.Contacts``.
+
+    Args:
+        contacts: The contacts, which stay as they are.
+        counters: An array like ``contact_counters``, see :func:`soft_contact_counters`.
+        arrays: Arrays by name, as of :func:`soft_contact_arrays`.
+    """
+    packed = copy.copy(contacts)
+    packed.contact_counters, packed.rigid_contact_count = counters, counters[0:1]
+    packed.soft_contact_count = counters[1:2]
+    setattr(packed, _OVERFLOW, counters[3:4])
+    for name, array in arrays.items():
+        setattr(packed, _soft_contact_attribute(name), array)
+    return packed
