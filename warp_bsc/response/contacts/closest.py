@@ -14,17 +14,23 @@ def _are_positive(a: wp.float64, b: wp.float64) -> bool:
 
 
 @wp.func
+def closest_weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
+    """Returns the weights of four points in the vector between the closest points of two elements."""
+    if kind == EDGE_EDGE:
+        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
+    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
+
+
+@wp.func
 def _closest_weights(motion: Motion, corners: wp.vec4i, edges: int) -> wp.vec4d:
     """Returns the weights of four vertices in the vector between the closest points of two elements at the start."""
     a = to_double(motion.x0[corners[0]])
     b = to_double(motion.x0[corners[1]])
     c = to_double(motion.x0[corners[2]])
     d = to_double(motion.x0[corners[3]])
-    if edges == 1:
-        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
-        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
-    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
-    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
+    return closest_weights(wp.where(edges == 1, EDGE_EDGE, VERTEX_FACE), a, b, c, d)
 
 
 @wp.func

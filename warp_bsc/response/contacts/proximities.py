@@ -47,7 +47,7 @@ class Proximities:
 
 
 @wp.func
-def _weights_across(motion: Motion, corners: wp.vec4i, edges: int):
+def weights_across(motion: Motion, corners: wp.vec4i, edges: int):
     """Returns where the line across both elements at the start meets them.
 
     Returns:
@@ -105,7 +105,7 @@ def find_nearest(motion: Motion, vertex_face: Proximities, nearest: wp.array2d[f
     if not is_filled(i, vertex_face.pairs, vertex_face.counts, _QUEUED):
         return
     corners = vertices_of_pair(0, vertex_face.elements, vertex_face.pairs[i])
-    _weights, normal, distance = _weights_across(motion, corners, 0)
+    _weights, normal, distance = weights_across(motion, corners, 0)
     if distance > ZERO:
         wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
 
@@ -138,7 +138,7 @@ def _collect_proximity(
     if not is_filled(i, near.pairs, near.counts, _QUEUED):
         return
     corners = vertices_of_pair(near.edges, near.elements, near.pairs[i])
-    weights, normal, distance = _weights_across(motion, corners, near.edges)
+    weights, normal, distance = weights_across(motion, corners, near.edges)
     if distance == ZERO:
         return
     least = ZERO

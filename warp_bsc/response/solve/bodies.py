@@ -168,18 +168,30 @@ def begin_bodies(motion: Motion, vertices: Vertices):
     moved.outcome[body] = 0
 
 
+@wp.func
+def move_body(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Moves a body by the sum of what constraints did to it, if it has active ones; returns whether it has."""
+    moved = vertices.bodies
+    moves = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    if moves:
+        pose = motion.bodies.end[body]
+        shift, turn = sums_of(moved.delta_x, body)
+        if wp.length_sq(shift) + wp.length_sq(turn) > ZERO:  # else it keeps every bit of its pose
+            pose = turned_pose(motion.bodies, body, pose, shift, turn)
+        moved.pose[body] = pose
+    return moves
+
+
 @wp.kernel
 def move_bodies(motion: Motion, vertices: Vertices, last: bool):
     """Moves each body by the sum of what its constraints did to it in a sweep; ``last`` empties its active set."""
     body = wp.tid()
     moved = vertices.bodies
-    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
-    moved.moved[body] = wp.where(active, 1, 0)
+    moves = move_body(motion, vertices, body)
+    moved.moved[body] = wp.where(moves, 1, 0)
     if last:
         moved.active[body] = 0
-    if active:
-        shift, turn = sums_of(moved.delta_x, body)
-        moved.pose[body] = turned_pose(motion.bodies, body, motion.bodies.end[body], shift, turn)
+    if moves:
         moved.outcome[body] = moved.outcome[body] | PROJECTED
 
 
@@ -202,12 +214,16 @@ def move_to_end(motion: Motion, vertices: Vertices):
 
 
 @wp.func
-def changed_velocity(predicted: wp.spatial_vector, sums: wp.array2d[wp.int64], body: int) -> wp.spatial_vector:
-    """Returns the velocity of a body by the one that was predicted, and the sum of what constraints did to it."""
-    linear, angular = sums_of(sums, body)
-    linear += to_double(wp.spatial_top(predicted))
-    angular += to_double(wp.spatial_bottom(predicted))
-    return wp.spatial_vector(to_single(linear), to_single(angular))
+def change_body_velocity(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Changes the velocity of a body as :func:`.velocities.change_velocity` that of a vertex."""
+    moved = vertices.bodies
+    is_free = motion.bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
+    if is_free:
+        linear, angular = sums_of(moved.delta_v, body)
+        linear += to_double(wp.spatial_top(motion.bodies.velocity[body]))
+        angular += to_double(wp.spatial_bottom(motion.bodies.velocity[body]))
+        moved.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
+    return is_free
 
 
 @wp.kernel
@@ -215,11 +231,10 @@ def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
     """Changes the velocity of each body that was not truncated; ``last`` empties its active set."""
     body = wp.tid()
     moved = vertices.bodies
-    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    if moved.active[body] != 0:
+        change_body_velocity(motion, vertices, body)
     if last:
         moved.active[body] = 0
-    if active and not has_final_velocity(moved.outcome[body]):
-        moved.velocity[body] = changed_velocity(motion.bodies.velocity[body], moved.delta_v, body)
 
 
 @wp.kernel

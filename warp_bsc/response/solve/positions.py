@@ -131,6 +131,15 @@ def project_positions(
         add_body_delta(motion, vertices, constraints, i, new - old, motion.x1, vertices.bodies.delta_x)
 
 
+@wp.func
+def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+    """Moves a vertex by the sum of what constraints did to it, if it has active ones; returns whether it has."""
+    moves = vertices.active[vertex] != 0 and motion.inverse_mass[vertex] > 0.0
+    if moves:
+        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+    return moves
+
+
 @wp.kernel
 def update_positions(
     motion: Motion, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool
@@ -139,12 +148,10 @@ def update_positions(
     vertex = wp.tid()
     if vertex == 0:
         finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
-        return
+    moves = move_vertex(motion, vertices, vertex)
     if last:
         vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+    if moves:
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 

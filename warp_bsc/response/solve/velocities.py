@@ -146,6 +146,15 @@ def project_velocities(
         add_body_delta(motion, vertices, constraints, i, new - old, vertices.x1, vertices.bodies.delta_v)
 
 
+@wp.func
+def change_velocity(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+    """Changes a velocity by the sum of what constraints did to it, if they may change it; returns whether they may."""
+    is_free = motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex])
+    if is_free:
+        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
+    return is_free
+
+
 @wp.kernel
 def update_velocities(
     motion: Motion, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool
@@ -158,8 +167,7 @@ def update_velocities(
         return
     if last:
         vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
-        vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
+    change_velocity(motion, vertices, vertex)
 
 
 def project(work: Workspace, dt: float) -> None:
