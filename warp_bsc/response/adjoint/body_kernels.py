@@ -6,9 +6,9 @@ from the pose that was predicted, and from the sums of the changes by constraint
 
 import warp as wp
 
+from ..contacts.first_contact import share_before
 from ..solve.angular_momentum import body_change_by_turn, body_moments, body_turns
 from ..solve.bodies import changed_velocity
-from ..solve.division import share_before
 from ..state.fixed_sum import sums_of
 from ..state.motion import moves_with_body, predicted_velocity
 from ..state.planes import transformed_plane

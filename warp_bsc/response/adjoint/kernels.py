@@ -9,18 +9,15 @@ from ...detection.settings import TOLERANCE, Count
 from ..contacts.closest import closest_vector
 from ..contacts.collect import level, offset_from
 from ..contacts.constraints import (
-    EDGE_EDGE_CONTACT,
-    EDGE_EDGE_PROXIMITY,
-    PLANE_CONTACT,
     approach_of,
     contact_friction,
     contact_weights,
     feasible,
-    feasible_in_contact,
     has_pushed,
+    kind_of_pair,
     sagitta,
-    truncated_path,
 )
+from ..contacts.first_contact import truncated_path
 from ..contacts.impacts import impact_of
 from ..schedule import MAX_TRUNCATIONS, SolveStatus, is_reversible, widened
 from ..solve.angular_momentum import (
@@ -39,8 +36,8 @@ from ..solve.velocities import initial_velocity_multiplier, velocity_multiplier_
 from ..state.fixed_sum import with_delta
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import NO_CONTACT, StepRecord, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, PROJECTED, Constraints, Motion, Vertices
-from ..state.vectors import ONE, ZERO, to_double, to_single
+from ..state.structs import HELD, MASS, MOMENTS, PROJECTED, Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.vectors import ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_SAGITTA
 
 
@@ -135,7 +132,7 @@ def change_multipliers(
         old = constraints.velocity_multiplier[i]
         multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
     else:
-        pushes_only = not is_reversible(status, constraints.pace[i] != 0)
+        pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
         multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
     previous = constraints.previous_multiplier[i]
     change = with_momentum(multiplier, previous, record.momentum[entry]) - old
@@ -263,28 +260,28 @@ def make_constraints(
     normal = constraints.normal[i]
     separation = constraints.separation[i]
     friction = float(0.0)
-    if kind == PLANE_CONTACT:
+    if kind == ContactKind.PLANE:
         plane = planes.end[constraints.plane[i]]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         separation = offset_from(motion, planes, constraints.plane[i], corners[0], status, least)
         friction = contact_friction(motion.friction[corners[0]], planes.friction[constraints.plane[i]])
     else:
         friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    if kind < PLANE_CONTACT:
-        edges = wp.where(kind == EDGE_EDGE_CONTACT, 1, 0)
+    if kind < ContactKind.PLANE:
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
-        if edges == 1:
+        if kind == ContactKind.EDGE_EDGE:
             coordinates = wp.vec3d(weight[1], -weight[3], ZERO)
         within_tolerance = constraints.within_tolerance[i]
         impact = impact_of(motion, vertices, corners, kind, within_tolerance, constraints.toi[i], coordinates, normal)
-        weight = contact_weights(edges, impact.coordinates)
+        weight = contact_weights(kind_of_pair(kind), impact.coordinates)
         normal = impact.normal
         separation = widened(least, status)
-        if constraints.pace[i] == 1:
-            separation = feasible_in_contact(motion, corners, weight, normal, separation, least, wp.float64(0.0))
+        if constraints.pace[i] == Pace.SLOW:
+            before = wp.dot(normal, relative(weight, corners, motion.x0))
+            separation = feasible(motion, corners, separation, before, least)
         separation += sagitta(motion, vertices, corners, MAX_SAGITTA * least)
-    elif kind > PLANE_CONTACT:
-        weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
+    elif kind > ContactKind.PLANE:
+        weight, between = closest_vector(motion, corners, kind_of_pair(kind))
         distance = wp.length(between)
         normal = between / distance
         separation = feasible(motion, corners, least, distance, least)
@@ -311,7 +308,7 @@ def find_truncation_times(
     if entry < 0 or record.kind[entry] == NO_CONTACT:
         return
     corners = record.contact[entry]
-    if record.kind[entry] == PLANE_CONTACT:
+    if record.kind[entry] == ContactKind.PLANE:
         vertex = corners[0]
         plane = corners[1]
         before, _error = signed_distance(planes.start[plane], motion.x0[vertex])

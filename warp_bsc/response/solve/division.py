@@ -2,24 +2,18 @@
 
 import warp as wp
 
-from ..contacts.constraints import (
-    EDGE_EDGE_CONTACT,
-    EDGE_EDGE_PROXIMITY,
-    NO_CONSTRAINT,
-    PLANE_CONTACT,
-    RESTING,
+from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
+from ..contacts.dividing_planes import add_dividing_plane, has_all_planes
+from ..contacts.first_contact import (
     TIME_UNITS,
-    TOUCH,
-    VERTEX_FACE_PROXIMITY,
-    Contacts,
-    contact_vertices,
-    has_pushed,
-    least_distance,
-    moves_body,
+    contact_index,
+    contact_kind,
+    contact_time,
+    packed_vertex,
+    share_before,
     truncated_path,
 )
-from ..contacts.detect import contacts_of
-from ..contacts.dividing_planes import add_dividing_plane, has_all_planes
+from ..contacts.queue import PairQueue, queues_of, vertices_of
 from ..schedule import SolveStatus, divides_all_proximities, divides_proximities
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
@@ -31,13 +25,14 @@ from ..state.structs import (
     TRUNCATED,
     UNCONSTRAINED,
     Constraints,
+    ContactKind,
     DividingPlanes,
     Motion,
+    Pace,
     Vertices,
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
-from ..tuning import SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -62,35 +57,23 @@ def divide_proximities(
     if i >= constraints.count[0]:
         return
     kind = constraints.kind[i]
-    if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
+    if kind != ContactKind.VERTEX_FACE_PROXIMITY and kind != ContactKind.EDGE_EDGE_PROXIMITY:
         return
     corners = constraints.vertices[i]
     if not divides_proximities(status, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
-    edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
     all_pairs = divides_all_proximities(status)
-    if not all_pairs and constraints.pace[i] != RESTING:
+    if not all_pairs and constraints.pace[i] != Pace.RESTING:
         return
-    least = least_distance(constraints, i)
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False, all_pairs)
+    kept = min_distance_of(constraints, i)
+    pair_kind = kind_of_pair(kind)
+    meets = add_dividing_plane(motion, vertices, corners, pair_kind, separation, kept, dividing, False, all_pairs)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):
             vertex = corners[j]
             if motion.inverse_mass[vertex] > 0.0:
                 vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
-
-
-@wp.func
-def share_before(time: wp.float64) -> wp.float64:
-    """Returns the share of the path of a body that is left before a contact, at ``time`` in [0, 1]."""
-    return SHARE_OF_PATH * time
-
-
-@wp.func
-def first_contact_of_body(key: wp.int64, vertex: int) -> wp.int64:
-    """Returns a key that orders the first contacts of the vertices of a body by time, then by vertex."""
-    return ((key >> wp.int64(32)) << wp.int64(32)) | wp.int64(vertex)
 
 
 @wp.kernel
@@ -105,12 +88,12 @@ def find_body_shares(
     are left for :func:`.kernels.record_body_truncations`.
     """
     vertex = motion.bodies.particle_count + wp.tid()
-    key = vertices.first_contact[vertex]
+    packed = vertices.first_contact[vertex]
     body = motion.bodies.of_vertex[vertex]
-    if key == NEVER or body < 0:
+    if packed == NEVER or body < 0:
         return
     if is_recording(record):
-        wp.atomic_min(vertices.bodies.first_contact, body, first_contact_of_body(key, vertex))
+        wp.atomic_min(vertices.bodies.first_contact, body, packed_vertex(packed, vertex))
     else:
         vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
@@ -127,8 +110,8 @@ def find_body_shares(
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, share_before(wp.float64(key >> wp.int64(32)) / TIME_UNITS))
-    if not complete or int(key & wp.int64(3)) == NO_CONSTRAINT:
+        share = wp.min(share, share_before(contact_time(packed)))
+    if not complete or contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
 
@@ -181,9 +164,9 @@ def _record_truncation(
     vertex: int,
     body: int,
     cuts: bool,
-    key: wp.int64,
-    vertex_face: Contacts,
-    edge_edge: Contacts,
+    packed: wp.int64,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
 ):
     """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
     entry = wp.atomic_add(record.counts.truncations, 0, 1)
@@ -194,24 +177,22 @@ def _record_truncation(
     record.body[entry] = body
     if body >= 0:
         record.pose[entry] = vertices.bodies.pose[body]
-    first = int(key & wp.int64(0xFFFFFFFF))
-    if first & 3 == EDGE_EDGE_CONTACT:
-        _record_contact(record, entry, vertex, cuts, key, edge_edge)
+    if contact_kind(packed) == ContactKind.EDGE_EDGE:
+        _record_contact(record, entry, vertex, cuts, packed, edge_edge)
     else:
-        _record_contact(record, entry, vertex, cuts, key, vertex_face)
+        _record_contact(record, entry, vertex, cuts, packed, vertex_face)
 
 
 @wp.func
-def _record_contact(record: StepRecord, entry: int, vertex: int, cuts: bool, key: wp.int64, contacts: Contacts):
+def _record_contact(record: StepRecord, entry: int, vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue):
     """Records the contact that a path is truncated before."""
-    first = int(key & wp.int64(0xFFFFFFFF))
-    kind = wp.where(cuts, first & 3, NO_CONTACT)
-    i = first >> 2
+    kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
+    i = contact_index(packed)
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = wp.float64(key >> wp.int64(32)) / TIME_UNITS
-    if kind != PLANE_CONTACT and kind != NO_CONTACT:
-        record.contact[entry] = contact_vertices(contacts, i)
+    record.toi[entry] = contact_time(packed)
+    if kind != ContactKind.PLANE and kind != NO_CONTACT:
+        record.contact[entry] = vertices_of(contacts, i)
         record.within_tolerance[entry] = contacts.within_tolerance[i]
         record.toi[entry] = contacts.toi[i]
         record.coordinates[entry] = contacts.coordinates[i]
@@ -243,8 +224,8 @@ def truncate_vertices(
     status: SolveStatus,
     record: StepRecord,
     dividing: DividingPlanes,
-    vertex_face: Contacts,
-    edge_edge: Contacts,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
     dt: wp.float64,
 ):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
@@ -253,18 +234,18 @@ def truncate_vertices(
     ``max_truncations`` iterations vertices that still collide are frozen.
     """
     vertex = wp.tid()
-    key = vertices.first_contact[vertex]
-    if key == NEVER:
+    packed = vertices.first_contact[vertex]
+    if packed == NEVER:
         if dividing.first:
             _keep_on_sides(motion, vertices, dividing, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
         return
-    time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
+    time = contact_time(packed)
     cuts = status.loop.iteration[0] <= status.max_iterations + status.max_truncations
     if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
-        _record_truncation(vertices, record, vertex, -1, cuts, key, vertex_face, edge_edge)
+        _record_truncation(vertices, record, vertex, -1, cuts, packed, vertex_face, edge_edge)
     outcome = vertices.outcome[vertex]
     if cuts:
         x0 = motion.x0[vertex]
@@ -283,7 +264,7 @@ def truncate_vertices(
             outcome = outcome | TRUNCATED
             if not divides:
                 vertices.velocity[vertex] = to_single(path / dt)
-        if divides and int(key & wp.int64(3)) == NO_CONSTRAINT:
+        if divides and contact_kind(packed) == ContactKind.NONE:
             vertices.velocity[vertex] = (end - x0) / float(dt)
             outcome = outcome | UNCONSTRAINED
         vertices.x1[vertex] = end
@@ -299,20 +280,20 @@ def truncate_vertices(
 
 @wp.kernel
 def record_body_truncations(
-    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: Contacts, edge_edge: Contacts
+    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: PairQueue, edge_edge: PairQueue
 ):
     """Records the pose of each body whose path is to be truncated before the first contact of its vertices."""
     vertex = motion.bodies.particle_count + wp.tid()
-    key = vertices.first_contact[vertex]
-    if key == NEVER:
+    packed = vertices.first_contact[vertex]
+    if packed == NEVER:
         return
     vertices.first_contact[vertex] = NEVER
     body = motion.bodies.of_vertex[vertex]
     if body < 0 or motion.bodies.inverse_mass[body] == 0.0 or vertices.bodies.outcome[body] & FROZEN != 0:
         return
-    if vertices.bodies.first_contact[body] == first_contact_of_body(key, vertex):
+    if vertices.bodies.first_contact[body] == packed_vertex(packed, vertex):
         cuts = vertices.bodies.share[body] >= wp.int64(0)
-        _record_truncation(vertices, record, vertex, body, cuts, key, vertex_face, edge_edge)
+        _record_truncation(vertices, record, vertex, body, cuts, packed, vertex_face, edge_edge)
 
 
 @wp.kernel
@@ -334,7 +315,7 @@ def divide(work: Workspace, dt: float) -> None:
     """
     work.reserve_truncations()
     motion, vertices, status, record = work.motion.vertices, work.vertices, work.status, work.record
-    contacts = contacts_of(work)[0]
+    contacts = queues_of(work.detector)[:2]
     if not work.differentiable:
         inputs = [motion, vertices, work.constraints, work.dividing, status, work.separation]
         work.launch_over_constraints(divide_proximities, inputs)

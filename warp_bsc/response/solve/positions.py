@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from ..contacts.constraints import EDGE_EDGE_PROXIMITY, PLANE_CONTACT, RESTING, gap, least_distance
+from ..contacts.constraints import gap, min_distance_of
 from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord, is_recording, record_entry
-from ..state.structs import PROJECTED, Constraints, Motion, Vertices
+from ..state.structs import PROJECTED, Constraints, ContactKind, Motion, Pace, Vertices
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, RELAXATION, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
@@ -49,27 +49,27 @@ def activate_position_constraints(
     if i >= constraints.count[0]:
         return
     world = motion.world[constraints.vertices[i][0]]
-    resting_edges = constraints.kind[i] == EDGE_EDGE_PROXIMITY and constraints.pace[i] == RESTING
+    resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
     if resting_edges and is_dividing(status, world, status.loop.iteration[0]):
         start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
-        least = least_distance(constraints, i)
+        least = min_distance_of(constraints, i)
         if wp.dot(constraints.normal[i], start) - least >= CLOSE_EDGES * (constraints.separation[i] - least):
             return
     past = status.loop.sweep[0] >= max_sweeps(motion, constraints, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
     distance = gap(vertices, constraints, i)
-    if constraints.kind[i] == PLANE_CONTACT:  # whose separation is an offset
+    if constraints.kind[i] == ContactKind.PLANE:  # whose separation is an offset
         predicted = wp.dot(constraints.normal[i], relative(constraints.weights[i], constraints.vertices[i], motion.x1))
         if predicted < constraints.separation[i]:
             tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (constraints.separation[i] - predicted))
     else:
         tolerance = wp.min(
-            tolerance, TOLERANCE_OF_DISTANCE * (constraints.separation[i] - least_distance(constraints, i))
+            tolerance, TOLERANCE_OF_DISTANCE * (constraints.separation[i] - min_distance_of(constraints, i))
         )
     tolerance = tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
-    if not active and is_reversible(status, constraints.pace[i] != 0):
+    if not active and is_reversible(status, constraints.pace[i] != Pace.FAST):
         multiplier = constraints.position_multiplier[i]
         if wp.length_sq(multiplier) > ZERO:
             friction = wp.float64(constraints.friction[i])
@@ -113,7 +113,7 @@ def project_positions(
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    pushes_only = not is_reversible(status, constraints.pace[i] != 0)
+    pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
     last_sweep = max_sweeps(motion, constraints, status, i, status.slow_position_sweeps) - 1
     momentum = momentum_of(constraints, status, i, last_sweep)
     if pushes_only:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..contacts.constraints import gap, has_pushed, least_distance
+from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of
 from ..schedule import SolveStatus
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord, is_recording, record_entry
@@ -81,7 +81,7 @@ def initialize_velocity_multipliers(motion: Motion, vertices: Vertices, constrai
             impulse = constraints.velocity_multiplier[i]
             add_body_delta(motion, vertices, constraints, i, impulse, vertices.x1, vertices.bodies.delta_v)
     constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
-    constraints.last_sweep[i] = -2
+    constraints.last_sweep[i] = NEVER_SWEPT
 
 
 @wp.kernel
@@ -104,7 +104,7 @@ def activate_velocity_constraints(
     if wp.length_sq(multiplier) == ZERO:
         if not has_pushed(constraints, i):
             return
-        if gap(vertices, constraints, i) > constraints.separation[i] - least_distance(constraints, i):
+        if gap(vertices, constraints, i) > constraints.separation[i] - min_distance_of(constraints, i):
             return
     tolerance = tolerance_of(motion, constraints, i, tolerance) / dt
     normal = constraints.normal[i]
