@@ -7,7 +7,7 @@ from the pose that was predicted, and from the sums of the changes by constraint
 import warp as wp
 
 from ..contacts.first_contact import share_before
-from ..solve.angular_momentum import body_change_by_turn, body_moments, body_turns
+from ..solve.angular_momentum import body_moments, body_turns, change_by_turn
 from ..solve.bodies import changed_velocity
 from ..state.fixed_sum import sums_of
 from ..state.motion import moves_with_body, predicted_velocity
@@ -132,7 +132,7 @@ def turn_body_velocities(
     world = wp.max(motion.bodies.world[body], 0)
     if body_turns(motion, vertices, body) and totals[world, HELD] == ZERO:
         torque, total = torque_and_moments(totals, world)
-        change, turn = body_change_by_turn(torque, total, vertices.bodies.centre[body])
+        change, turn = change_by_turn(torque, total, vertices.bodies.centre[body])
         changes[body] = _spatial(change, turn)
 
 

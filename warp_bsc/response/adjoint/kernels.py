@@ -29,10 +29,15 @@ from ..solve.angular_momentum import (
     torque_of,
     turns,
 )
-from ..solve.bodies import add_body_delta, body_change
-from ..solve.positions import position_multiplier_after
-from ..solve.sweeps import add_delta, count_active, with_momentum
-from ..solve.velocities import initial_velocity_multiplier, velocity_multiplier_after
+from ..solve.bodies import body_change
+from ..solve.sweeps import (
+    add_delta,
+    count_active,
+    initial_velocity_multiplier,
+    position_multiplier_after,
+    velocity_multiplier_after,
+    with_momentum,
+)
 from ..state.fixed_sum import with_delta
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import NO_CONTACT, StepRecord, truncation_at
@@ -223,7 +228,8 @@ def turn_velocities(
     if not turns(motion, vertices, vertex) or totals[world, HELD] != ZERO:
         return
     torque, total = torque_and_moments(totals, world)
-    changes[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
+    change, _turn = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
+    changes[vertex] = to_single(change)
 
 
 @wp.kernel
@@ -464,9 +470,7 @@ def restore_multipliers(
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
-    add_delta(motion, constraints, i, old - multiplier[i], sums)
-    if motion.bodies.of_vertex:
-        add_body_delta(motion, vertices, constraints, i, old - multiplier[i], x, body_sums)
+    add_delta(motion, vertices, constraints, i, old - multiplier[i], x, sums, body_sums)
     multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     count_active(motion, vertices, constraints, i)

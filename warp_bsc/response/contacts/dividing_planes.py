@@ -34,7 +34,7 @@ def add_plane(
     margin: wp.float64,
     half: wp.float64,
 ):
-    """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` says so.
+    """Adds a plane to the lists of up to four vertices; where it does not fit, their lists end in INCOMPLETE.
 
     Args:
         planes: The planes.
@@ -60,12 +60,18 @@ def add_plane(
 
 
 @wp.func
-def has_all_planes(planes: DividingPlanes, vertex: int) -> bool:
-    """Returns whether all contacts of a vertex have a plane: of those that touch at the start, there is none."""
+def has_planes(planes: DividingPlanes, vertex: int):
+    """Returns whether a vertex has planes, and whether it has one for each of its contacts.
+
+    Contacts of elements that touch at the start have none, nor do those whose plane did not fit.
+    """
+    if not planes.first:
+        return False, False
     node = planes.first[vertex]
+    has_any = node >= 0
     while node >= 0:
         node = planes.next[node]
-    return node != INCOMPLETE
+    return has_any, has_any and node != INCOMPLETE
 
 
 @wp.struct
