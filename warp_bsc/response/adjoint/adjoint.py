@@ -50,7 +50,7 @@ from .restore import (
     restore_velocities,
 )
 
-_UNUSED_OF_CONSTRAINTS = {"count", "least", "last_sweep", "active_set", "active_count"}
+_UNUSED_OF_CONSTRAINTS = {"count", "min_distance", "last_sweep", "active_set", "active_count"}
 
 _MULTIPLIERS = "position_multiplier", "velocity_multiplier", "previous_multiplier"
 

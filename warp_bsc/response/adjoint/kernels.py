@@ -8,24 +8,20 @@ import warp as wp
 from ..contacts.closest import closest_vector
 from ..contacts.collect import level, offset_from
 from ..contacts.constraints import (
-    EDGE_EDGE_CONTACT,
-    EDGE_EDGE_PROXIMITY,
-    PLANE_CONTACT,
     approach_of,
     contact_friction,
     contact_weights,
     feasible,
-    feasible_in_contact,
     has_pushed,
+    kind_of_pair,
     sagitta,
-    truncated_path,
 )
+from ..contacts.first_contact import share_before, truncated_path
 from ..contacts.impacts import impact_of
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
     Moments,
     acts,
-    body_change_by_turn,
     body_moments,
     body_turns,
     change_by_turn,
@@ -35,16 +31,18 @@ from ..solve.angular_momentum import (
     turns,
 )
 from ..solve.bodies import body_change
-from ..solve.division import share_before
-from ..solve.positions import position_multiplier_after
-from ..solve.sweeps import with_momentum
-from ..solve.velocities import initial_velocity_multiplier, velocity_multiplier_after
+from ..solve.sweeps import (
+    initial_velocity_multiplier,
+    position_multiplier_after,
+    velocity_multiplier_after,
+    with_momentum,
+)
 from ..state.motion import moves_with_body, predicted_velocity
 from ..state.planes import signed_distance, time_of_entry, transformed_plane
 from ..state.poses import centre_of, inverse_inertia_at, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, Constraints, Motion, Vertices
-from ..state.vectors import ONE, ZERO, to_double, to_single
+from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.vectors import ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_SAGITTA
 from .restore import RestoredStep, entry_of, is_movable
 
@@ -106,7 +104,7 @@ def change_multipliers(
         old = constraints.velocity_multiplier[i]
         multiplier = velocity_multiplier_after(motion, vertices, constraints, i, step.restitution)
     else:
-        pushes_only = not is_reversible(step.status, constraints.pace[i] != 0)
+        pushes_only = not is_reversible(step.status, constraints.pace[i] != Pace.FAST)
         multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
     previous = constraints.previous_multiplier[i]
     change = with_momentum(multiplier, previous, step.record.momentum[entry]) - old
@@ -213,13 +211,14 @@ def turn_velocities(
         world = motion.world[vertex]
         if turns(motion, vertices, vertex) and totals[world, HELD] == ZERO:
             torque, total = _torque_and_moments(totals, world)
-            changes[vertex] = to_single(change_by_turn(torque, total, to_double(vertices.x1[vertex])))
+            of_vertex, _turn = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
+            changes[vertex] = to_single(of_vertex)
     else:
         own = wp.max(motion.bodies.world[body], 0)
         if body_turns(motion, vertices, body) and totals[own, HELD] == ZERO:
             own_torque, own_total = _torque_and_moments(totals, own)
-            change, turn = body_change_by_turn(own_torque, own_total, vertices.bodies.centre[body])
-            body_changes[body] = wp.spatial_vector(to_single(change), to_single(turn))
+            of_body, turn = change_by_turn(own_torque, own_total, vertices.bodies.centre[body])
+            body_changes[body] = wp.spatial_vector(to_single(of_body), to_single(turn))
 
 
 @wp.kernel
@@ -252,28 +251,28 @@ def make_constraints(
     normal = found.normal[i]
     separation = found.separation[i]
     friction = float(0.0)
-    if kind == PLANE_CONTACT:
+    if kind == ContactKind.PLANE:
         plane = step.planes.end[found.plane[i]]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         separation = offset_from(motion, step.planes, found.plane[i], corners[0], step.status, step.separation)
         friction = contact_friction(motion.friction[corners[0]], step.planes.friction[found.plane[i]])
     else:
         friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    if kind < PLANE_CONTACT:
-        edges = wp.where(kind == EDGE_EDGE_CONTACT, 1, 0)
+    if kind < ContactKind.PLANE:
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
-        if edges == 1:
+        if kind == ContactKind.EDGE_EDGE:
             coordinates = wp.vec3d(weight[1], -weight[3], ZERO)
         within_tolerance = found.within_tolerance[i]
         impact = impact_of(motion, vertices, corners, kind, within_tolerance, found.toi[i], coordinates, normal)
-        weight = contact_weights(edges, impact.coordinates)
+        weight = contact_weights(kind_of_pair(kind), impact.coordinates)
         normal = impact.normal
         separation = widened(step.separation, step.status)
-        if found.pace[i] == 1:
-            separation = feasible_in_contact(motion, corners, weight, normal, separation, step.separation, ZERO)
+        if found.pace[i] == Pace.SLOW:
+            before = wp.dot(normal, relative(weight, corners, motion.x0))
+            separation = feasible(motion, corners, separation, before, step.separation)
         separation += sagitta(motion, vertices, corners, MAX_SAGITTA * step.separation)
-    elif kind > PLANE_CONTACT:
-        weight, between = closest_vector(motion, corners, wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0))
+    elif kind > ContactKind.PLANE:
+        weight, between = closest_vector(motion, corners, kind_of_pair(kind))
         distance = wp.length(between)
         normal = between / distance
         separation = feasible(motion, corners, step.separation, distance, step.separation)
@@ -293,7 +292,7 @@ def find_truncation_times(step: RestoredStep, times: wp.array[wp.float64]):
     if entry < 0 or record.kind[entry] == NO_CONTACT:
         return
     corners = record.contact[entry]
-    if record.kind[entry] == PLANE_CONTACT:
+    if record.kind[entry] == ContactKind.PLANE:
         vertex = corners[0]
         plane = corners[1]
         before, _error = signed_distance(step.planes.start[plane], motion.x0[vertex])

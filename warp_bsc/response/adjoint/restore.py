@@ -9,7 +9,7 @@ import enum
 import warp as wp
 
 from ..schedule import SolveStatus
-from ..solve.bodies import add_body_delta, change_body_velocity, move_body
+from ..solve.bodies import change_body_velocity, move_body
 from ..solve.positions import move_vertex
 from ..solve.sweeps import add_delta, count_active
 from ..solve.velocities import change_velocity
@@ -204,9 +204,7 @@ def restore_multipliers(
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
-    add_delta(step.motion, constraints, i, old - multiplier[i], sums)
-    if step.motion.bodies.of_vertex:
-        add_body_delta(step.motion, step.vertices, constraints, i, old - multiplier[i], x, body_sums)
+    add_delta(step.motion, step.vertices, constraints, i, old - multiplier[i], x, sums, body_sums)
     multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     count_active(step.motion, step.vertices, constraints, i)

@@ -21,8 +21,8 @@ import warp as wp
 from ...detection.approach_phase import MinDistances
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ...detection.settings import Count
 from ..adjoint.arrays import attach_gradients, launch_adjoint
+from ..contacts.queue import PairQueue, queues_of
 from ..state.friction import Friction
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion
@@ -31,7 +31,6 @@ from ..state.structs import Motion
 from ..tuning import PAIRS_PER_FACE
 from .kernels import (
     Layer,
-    Pairs,
     add_pushes,
     add_pushes_of_planes,
     add_shares,
@@ -60,7 +59,7 @@ class PushedStep:
 
     motion: Motion
     planes: MovingPlanes
-    pairs: list[Pairs]
+    pairs: list[PairQueue]
     shares: wp.array
     dt: float
 
@@ -133,7 +132,7 @@ class ContactLayer:
         self.prepare(motion)
         vertices, layer, detector = motion.vertices, self._layer, self._detector
         n = len(vertices.x1)
-        pairs = [self._pairs_of(narrow_phase) for narrow_phase in detector.narrow_phases]
+        pairs = queues_of(detector)
         for of_kind in pairs:
             self._launch_over(sum_shares, of_kind, [vertices, layer, of_kind, self._share_sums])
         inputs = [vertices, motion.planes, layer, detector.counters.array, detector.capacities]
@@ -193,11 +192,11 @@ class ContactLayer:
         """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
-            copy = Pairs()
-            copy.kind, copy.elements = of_kind.kind, of_kind.elements
+            copy = PairQueue()
+            copy.kind, copy.count, copy.elements = of_kind.kind, of_kind.count, of_kind.elements
             count = len(of_kind.pairs)
             if not self._device.is_capturing:
-                count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+                count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
             if count:
                 copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
                 copies.append(copy)
@@ -211,12 +210,6 @@ class ContactLayer:
             setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
         return PushedStep(kept, planes, copies, wp.clone(self._shares), dt)
 
-    def _pairs_of(self, narrow_phase):
-        pairs = Pairs()
-        pairs.kind, pairs.elements = int(narrow_phase.kind), self._mesh.device_elements(narrow_phase.kind)
-        pairs.pairs, pairs.counts = narrow_phase.contacts.pairs, narrow_phase.counts
-        return pairs
-
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self._device)
 
@@ -224,5 +217,5 @@ class ContactLayer:
         """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
         count = len(of_kind.pairs)
         if self._device.is_cpu:
-            count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+            count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
         self._launch(kernel, count, inputs)

@@ -4,12 +4,11 @@ import warp as wp
 
 from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
-from ...detection.settings import Count
 from ...kernels.closest import closest_coordinates
-from ...kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
-from ...kernels.pipeline.queues import is_filled
+from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..contacts.constraints import contact_friction
+from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
 from ..schedule import has_overflowed
 from ..state.fixed_sum import with_delta
@@ -18,22 +17,10 @@ from ..state.structs import Motion
 from ..state.vectors import ONE, ZERO, to_double, to_single
 from ..tuning import PARALLEL_IN_LAYER
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-
 _UNITS = wp.constant(wp.float64(2.0**40))
 """Units in a metre and in 1; sums are of integers in these units, so that they are the same in any order."""
 
 _ROOT_OF_2 = wp.constant(2.0**0.5)
-
-
-@wp.struct
-class Pairs:
-    """The pairs of one kind that may be in the layer."""
-
-    kind: int
-    elements: wp.array2d[int]
-    pairs: wp.array[wp.vec2i]
-    counts: wp.array[wp.int64]
 
 
 @wp.struct
@@ -219,12 +206,12 @@ def place_vertices_between(motion: Motion, layer: Layer, y: wp.array[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
-def sum_shares(motion: Motion, layer: Layer, of_kind: Pairs, sums: wp.array[wp.int64]):
+def sum_shares(motion: Motion, layer: Layer, of_kind: PairQueue, sums: wp.array[wp.int64]):
     """Adds what contacts count, by their weights, to the sums of their vertices."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+    if not has_pair(of_kind, i):
         return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    corners = vertices_of(of_kind, i)
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > ZERO:
         for j in range(4):
@@ -257,12 +244,14 @@ def finish_shares(
 
 
 @wp.kernel(enable_backward=False)
-def sum_pushes(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]):
+def sum_pushes(
+    motion: Motion, layer: Layer, of_kind: PairQueue, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]
+):
     """Adds what contacts move vertices by to their sums."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+    if not has_pair(of_kind, i):
         return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    corners = vertices_of(of_kind, i)
     weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
     for j in range(4):
         vertex = corners[j]
@@ -302,12 +291,12 @@ def move_particles(
 
 
 @wp.kernel
-def add_shares(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64]):
+def add_shares(motion: Motion, layer: Layer, of_kind: PairQueue, shares: wp.array[wp.float64]):
     """Computes what :func:`sum_shares` does."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+    if not has_pair(of_kind, i):
         return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    corners = vertices_of(of_kind, i)
     weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
     if depth > ZERO:
         for j in range(4):
@@ -323,12 +312,14 @@ def add_shares_of_planes(motion: Motion, planes: MovingPlanes, layer: Layer, sha
 
 
 @wp.kernel
-def add_pushes(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]):
+def add_pushes(
+    motion: Motion, layer: Layer, of_kind: PairQueue, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
+):
     """Computes what :func:`sum_pushes` does."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
+    if not has_pair(of_kind, i):
         return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
+    corners = vertices_of(of_kind, i)
     weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
     for j in range(4):
         share = weights[j] * wp.float64(motion.inverse_mass[corners[j]])

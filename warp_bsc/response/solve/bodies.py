@@ -8,7 +8,7 @@ pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of
 
 import warp as wp
 
-from ..state.fixed_sum import _UNITS, sums_of
+from ..state.fixed_sum import add_to_sum, sums_of
 from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
 from ..state.structs import NEVER, PROJECTED, Bodies, Constraints, Motion, MovedBodies, Vertices, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
@@ -17,7 +17,6 @@ wp.set_module_options({"enable_backward": False})
 
 WHOLE_PATH = wp.constant(wp.int64(2**30))
 """The share of a path that is not cut, in units of TIME_UNITS."""
-
 FREEZES = wp.constant(wp.int64(-1))
 """In place of a share: the body is frozen."""
 
@@ -136,9 +135,8 @@ def add_body_delta(
     for side in range(2):
         body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
         if body >= 0:
-            for axis in range(3):
-                wp.atomic_add(sums, body, axis, wp.int64(wp.rint(_UNITS * shift[axis])))
-                wp.atomic_add(sums, body, 3 + axis, wp.int64(wp.rint(_UNITS * turn[axis])))
+            add_to_sum(sums, body, 0, shift)
+            add_to_sum(sums, body, 3, turn)
 
 
 @wp.func

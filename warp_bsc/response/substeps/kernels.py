@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from ..contacts.constraints import PLANE_CONTACT, approach_of
+from ..contacts.constraints import NEVER_SWEPT, approach_of
 from ..schedule import SolveStatus
 from ..state.motion import moves_with_body, predicted_velocity
-from ..state.structs import Constraints, Motion, Vertices
+from ..state.structs import Constraints, ContactKind, Motion, Vertices
 
 wp.set_module_options({"enable_backward": False})
 
@@ -145,8 +145,8 @@ def reset_constraints(
     constraints.position_multiplier[i] = wp.vec3d()
     constraints.velocity_multiplier[i] = wp.vec3d()
     constraints.previous_multiplier[i] = wp.vec3d()
-    constraints.last_sweep[i] = -2
-    if i < detected[0] and constraints.kind[i] == PLANE_CONTACT:
+    constraints.last_sweep[i] = NEVER_SWEPT
+    if i < detected[0] and constraints.kind[i] == ContactKind.PLANE:
         constraints.separation[i] = _NEVER_VIOLATED
         return
     corners = constraints.vertices[i]
