@@ -5,7 +5,6 @@ Threads over vertices and bodies are as in :mod:`.adjoint.restore`.
 
 import warp as wp
 
-from ..contacts.closest import closest_vector
 from ..contacts.collect import level, offset_from
 from ..contacts.constraints import (
     approach_of,
@@ -18,6 +17,7 @@ from ..contacts.constraints import (
 )
 from ..contacts.first_contact import share_before, truncated_path
 from ..contacts.impacts import impact_of
+from ..contacts.proximities import weights_across
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
     Moments,
@@ -272,9 +272,9 @@ def make_constraints(
             separation = feasible(motion, corners, separation, before, step.separation)
         separation += sagitta(motion, vertices, corners, MAX_SAGITTA * step.separation)
     elif kind > ContactKind.PLANE:
-        weight, between = closest_vector(motion, corners, kind_of_pair(kind))
-        distance = wp.length(between)
-        normal = between / distance
+        across, direction, distance = weights_across(motion, corners, kind_of_pair(kind))
+        weight = across
+        normal = direction
         separation = feasible(motion, corners, step.separation, distance, step.separation)
     weights[i] = weight
     normals[i] = normal
