@@ -5,14 +5,26 @@ import warp as wp
 from .vectors import to_double, to_single
 
 _UNITS = wp.constant(wp.float64(2.0**40))
-"""Units in a metre, a radian, and in these per second."""
+"""Units in 1, a metre, a radian, and in these per second."""
+
+
+@wp.func
+def to_units(x: wp.float64) -> wp.int64:
+    """Returns a number in units, rounded."""
+    return wp.int64(wp.rint(_UNITS * x))
+
+
+@wp.func
+def from_units(units: wp.int64) -> wp.float64:
+    """Returns the number that an integer in units stands for."""
+    return wp.float64(units) / _UNITS
 
 
 @wp.func
 def add_to_sum(sums: wp.array2d[wp.int64], i: int, column: int, x: wp.vec3d):
     """Adds a vector to three columns of the sums of a vertex or body, from ``column`` on."""
     for axis in range(3):
-        wp.atomic_add(sums, i, column + axis, wp.int64(wp.rint(_UNITS * x[axis])))
+        wp.atomic_add(sums, i, column + axis, to_units(x[axis]))
 
 
 @wp.func
@@ -20,7 +32,7 @@ def sum_of(sums: wp.array2d[wp.int64], i: int, column: int) -> wp.vec3d:
     """Returns what :func:`add_to_sum` has added."""
     total = wp.vec3d()
     for axis in range(3):
-        total[axis] = wp.float64(sums[i, column + axis]) / _UNITS
+        total[axis] = from_units(sums[i, column + axis])
     return total
 
 
