@@ -244,7 +244,7 @@ class StepAdjoint:
         self._launch(finish_body_gradients, model.body_count, *inputs, *outputs)
 
     def _through_turn(self):
-        """Goes back through the turn that conserves angular momentum."""
+        """Goes back through the turn that restores angular momentum."""
         motion, vertices, constraints = self._step.motion, self._step.vertices, self._step.constraints
         both, gradients, shape = self._vertices_and_bodies, self._gradients, (self._work.worlds, int(SUMS))
         totals = wp.zeros(shape, dtype=wp.float64, device=self._mesh.device, requires_grad=True)

@@ -1,6 +1,6 @@
 """The kernels that an adjoint differentiates: each computes what a kernel of a step changes, by the same functions.
 
-Threads over vertices and bodies are as in :mod:`.adjoint.restore`.
+For launches over vertices and bodies see :mod:`.adjoint.restore`.
 """
 
 import warp as wp
@@ -91,9 +91,7 @@ def change_multipliers(
 
     See :func:`.solve.positions.project_positions` and :func:`.solve.velocities.project_velocities`.
     """
-    motion = step.motion
-    vertices = step.vertices
-    constraints = step.constraints
+    motion, vertices, constraints = step.motion, step.vertices, step.constraints
     entry = entry_of(step.record, step.cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
@@ -136,7 +134,7 @@ def initialize_multipliers(
 
 @wp.kernel
 def add_torques(motion: Motion, vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
-    """Adds the torques of contacts to the totals of their worlds, see :func:`.angular_momentum.sum_torques`."""
+    """Adds the torques of contacts to the totals of their worlds, see :func:`.solve.angular_momentum.sum_torques`."""
     i = wp.tid()
     if i >= constraints.count[0] or not acts(constraints, i):
         return
@@ -153,7 +151,7 @@ def add_torques(motion: Motion, vertices: Vertices, constraints: Constraints, to
 def add_moments(motion: Motion, vertices: Vertices, totals: wp.array2d[wp.float64]):
     """Adds the moments of vertices and bodies, and the torques of bodies, to the totals of their worlds.
 
-    See :func:`.angular_momentum.sum_moments` and :func:`.angular_momentum.sum_body_moments`.
+    See :func:`.solve.angular_momentum.sum_moments` and :func:`.solve.angular_momentum.sum_body_moments`.
     """
     vertex = wp.tid()
     body = vertex - motion.x0.shape[0]
@@ -175,19 +173,9 @@ def add_moments(motion: Motion, vertices: Vertices, totals: wp.array2d[wp.float6
 def _torque_and_moments(totals: wp.array2d[wp.float64], world: int):
     """Returns the torque on a world and its moments."""
     torque = wp.vec3d(totals[world, 0], totals[world, 1], totals[world, 2])
-    total = Moments(
-        totals[world, MASS],
-        totals[world, MASS + 1],
-        totals[world, MASS + 2],
-        totals[world, MASS + 3],
-        totals[world, MASS + 4],
-        totals[world, MASS + 5],
-        totals[world, MASS + 6],
-        totals[world, MASS + 7],
-        totals[world, MASS + 8],
-        totals[world, MASS + 9],
-        totals[world, MASS + 10],
-    )
+    total = Moments()
+    for i in range(MOMENTS):
+        total[i] = totals[world, MASS + i]
     return torque, total
 
 
@@ -203,7 +191,7 @@ def turn_velocities(
 ):
     """Computes how the turn of each world changes the velocities of its vertices and bodies.
 
-    See :func:`.angular_momentum.turn_vertices` and :func:`.angular_momentum.turn_bodies`.
+    See :func:`.solve.angular_momentum.turn_vertices` and :func:`.solve.angular_momentum.turn_bodies`.
     """
     vertex = wp.tid()
     body = vertex - motion.x0.shape[0]
@@ -353,17 +341,11 @@ def truncate_paths(
 
 
 @wp.func
-def _has_moved(motion: Motion, vertices: Vertices, body: int) -> bool:
-    """Returns whether the response moved a body; others keep every bit of their pose."""
-    return is_movable(motion, body) and vertices.bodies.outcome[body] != 0
-
-
-@wp.func
 def _pose_by(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], body: int) -> wp.transform:
-    """Returns the pose of a body by what constraints did to it."""
+    """Returns the pose of a body by what constraints did to it; without any it keeps every bit."""
     change = sums[body]
     pose = motion.bodies.end[body]
-    if _has_moved(motion, vertices, body):
+    if is_movable(motion, body) and vertices.bodies.outcome[body] != 0:
         pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
     return pose
 
@@ -410,10 +392,7 @@ def vertex_velocities(motion: Motion, vertices: Vertices, velocities: wp.array[w
 
 @wp.kernel
 def set_centres(
-    motion: Motion,
-    poses: wp.array[wp.transform],
-    centres: wp.array[wp.vec3d],
-    inverse_inertias: wp.array[wp.mat33d],
+    motion: Motion, poses: wp.array[wp.transform], centres: wp.array[wp.vec3d], inverse_inertias: wp.array[wp.mat33d]
 ):
     """Computes where impulses act on bodies in given poses, see :func:`.solve.bodies.move_to_end`."""
     body = wp.tid()

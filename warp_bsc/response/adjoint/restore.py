@@ -1,7 +1,6 @@
 """The kernels of an adjoint that are not differentiated: they restore a step from its record, and gather gradients.
 
-Threads over vertices and bodies take the vertices first, then the bodies, of which there are none where the response
-cannot move them.
+A launch over vertices and bodies has a thread for each vertex, then one for each body if the response can move bodies.
 """
 
 import enum
@@ -45,7 +44,7 @@ class RestoredStep:
     record: StepRecord
     cursor: Cursor
     restitution: wp.array[float]
-    separation: wp.float64  # that constraints have at least [m]
+    separation: wp.float64  # smallest separation of constraints [m]
     dt: wp.float64  # length of the step [s]
 
 
@@ -252,7 +251,7 @@ def restore_velocities(step: RestoredStep, gradients: Gradients):
 
 @wp.kernel
 def restore_unturned(motion: Motion, vertices: Vertices):
-    """Restores velocities as they were before angular momentum was conserved, over vertices and bodies."""
+    """Restores velocities as they were before the turn that restores angular momentum, over vertices and bodies."""
     vertex = wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:

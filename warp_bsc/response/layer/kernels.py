@@ -22,7 +22,7 @@ _ROOT_OF_2 = wp.constant(2.0**0.5)
 
 @wp.struct
 class Layer:
-    """The layer and what is at its bottom."""
+    """Thickness, minimum distances and restitution of the layer."""
 
     thickness: wp.float64  # [m]
     distances: MinDistances  # of pairs [m]
@@ -70,7 +70,7 @@ def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i)
     if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(motion, corners):
         return weights, normal, ZERO
     _weights, at_start = closest_vector(motion, corners, kind)
-    if wp.dot(normal, at_start) <= ZERO:
+    if not wp.dot(normal, at_start) > ZERO:  # nor if it is not a number
         return weights, normal, ZERO
     if kind == EDGE_EDGE:
         u = b - a
@@ -90,8 +90,8 @@ def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: Layer, plan
         return normal, ZERO
     before, error = signed_distance(planes.start[plane], motion.x0[vertex])
     after, _error = signed_distance(end, motion.x1[vertex])
-    least = layer.distances.radius[vertex] + layer.distances.of_planes
-    depth = layer.thickness + least - after - theta * (before - after)
+    min_distance = layer.distances.radius[vertex] + layer.distances.of_planes
+    depth = layer.thickness + min_distance - after - theta * (before - after)
     if not (depth > ZERO and before >= -error):
         return normal, ZERO
     return normal, depth

@@ -118,7 +118,9 @@ def project_positions(
 @wp.func
 def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
     """Moves a vertex by the sum of what constraints did to it, if it has active ones; returns whether it has."""
-    moves = vertices.active[vertex] != 0 and motion.inverse_mass[vertex] > 0.0
+    if vertices.active[vertex] == 0:
+        return False
+    moves = motion.inverse_mass[vertex] > 0.0
     if moves:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
     return moves
