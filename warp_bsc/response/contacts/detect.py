@@ -69,8 +69,9 @@ def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase, motion = work.detector.broad_phase, work.motion.vertices
     broad_phase.fit(motion.x0, work.vertices.x1)
-    arguments = work.connectivity, motion, work.vertices, work.dividing, work.status, work.separation
-    find_contacts_without_queues(broad_phase, *arguments)
+    arrays = {"mesh": work.connectivity, "motion": motion, "vertices": work.vertices}
+    arrays |= {"dividing": work.dividing, "status": work.status}
+    find_contacts_without_queues(broad_phase, work.separation, **arrays)
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
     work.launch(decide, 1, [work.constraints, *overflow], [work.status])

@@ -236,7 +236,7 @@ def _turn_of(torque: wp.vec3d, total: Moments):
 
 @wp.func
 def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
-    """Returns the change of velocity at ``x`` by a turn of a world that removes a torque [m/s], and the turn [rad/s]."""
+    """Returns the change of velocity at ``x`` by the turn of a world that removes a torque [m/s], and that turn."""
     turn, centre = _turn_of(torque, total)
     return wp.cross(turn, x - centre), turn
 

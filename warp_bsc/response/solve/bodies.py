@@ -63,12 +63,7 @@ def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints
 
 @wp.func
 def body_inverse_masses(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    x: wp.array[wp.vec3],
-    relaxation: wp.float64,
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
 ):
     """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
 

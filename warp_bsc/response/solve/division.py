@@ -170,7 +170,6 @@ def cut_bodies(
 
 @wp.func
 def _record_truncation(
-    # in
     vertices: Vertices,
     vertex: int,
     body: int,
@@ -178,7 +177,6 @@ def _record_truncation(
     packed: wp.int64,
     vertex_face: PairQueue,
     edge_edge: PairQueue,
-    # in and out
     record: StepRecord,
 ):
     """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
@@ -197,16 +195,7 @@ def _record_truncation(
 
 
 @wp.func
-def _record_contact(
-    # in
-    vertex: int,
-    cuts: bool,
-    packed: wp.int64,
-    contacts: PairQueue,
-    entry: int,
-    # out
-    record: StepRecord,
-):
+def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
     """Records the contact that a path is truncated before."""
     kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
     i = contact_index(packed)

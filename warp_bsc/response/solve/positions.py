@@ -128,13 +128,8 @@ def update_positions(
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    if vertex == 0:
-        finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
-        return
-    if last:
-        vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0:
+    moved = finish_sweep(motion, vertices, constraints, status, record, last, vertex)
+    if moved:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED

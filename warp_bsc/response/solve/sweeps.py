@@ -22,12 +22,7 @@ from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 @wp.func
 def _effective_inverse_masses(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    x: wp.array[wp.vec3],
-    relaxation: wp.float64,
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
 ):
     """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
 
@@ -209,18 +204,15 @@ def add_delta(
 
 @wp.func
 def change_multiplier(
-    # in
     motion: Motion,
     place: int,
     multiplier: wp.vec3d,
     momentum: wp.float64,
     x: wp.array[wp.vec3],
-    # in and out
     vertices: Vertices,
     constraints: Constraints,
     record: StepRecord,
     multipliers: wp.array[wp.vec3d],
-    # out
     sums: wp.array2d[wp.int64],
     body_sums: wp.array2d[wp.int64],
 ):
@@ -240,7 +232,7 @@ def change_multiplier(
 
 
 @wp.func
-def finish_sweep(constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool):
+def _finish_sweep(constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool):
     """Counts a sweep; after the last over an active set, empties it, and decides whether another batch is needed."""
     sweep = status.loop.sweep[0] + 1
     active = constraints.active_count[0] > wp.int64(0)
@@ -250,6 +242,29 @@ def finish_sweep(constraints: Constraints, status: SolveStatus, record: StepReco
         end_sweep(record, int(constraints.active_count[0]))
     if last:
         constraints.active_count[0] = wp.int64(0)
+
+
+@wp.func
+def finish_sweep(
+    motion: Motion,
+    vertices: Vertices,
+    constraints: Constraints,
+    status: SolveStatus,
+    record: StepRecord,
+    last: bool,
+    vertex: int,
+) -> bool:
+    """Returns whether constraints of a sweep moved a vertex, and, for vertex 0, finishes the sweep.
+
+    After the ``last`` sweep over an active set, empties it.
+    """
+    if vertex == 0:
+        _finish_sweep(constraints, status, record, last)
+    if vertices.active[vertex] == 0:
+        return False
+    if last:
+        vertices.active[vertex] = 0
+    return motion.inverse_mass[vertex] > 0.0
 
 
 def repeat(status: SolveStatus, reserve_entries: Callable[[int], None], sweep: Callable[[bool, bool], None]) -> None:

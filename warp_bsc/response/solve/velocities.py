@@ -141,13 +141,8 @@ def update_velocities(
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    if vertex == 0:
-        finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
-        return
-    if last:
-        vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
+    moved = finish_sweep(motion, vertices, constraints, status, record, last, vertex)
+    if moved and not has_final_velocity(vertices.outcome[vertex]):
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
 
 
