@@ -35,9 +35,7 @@ def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
 def detect(work: Workspace, *, only_changed: bool = False) -> None:
     """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again.
 
-    Args:
-        work: The workspace of the step.
-        only_changed: Whether only vertices that changed since the last detection are looked at.
+    With ``only_changed``, only vertices that changed since the last detection are looked at.
     """
     detector, motion, vertices = work.detector, work.motion.vertices, work.vertices
     changed = vertices.changed if only_changed else None

@@ -34,16 +34,10 @@ def add_plane(
     margin: wp.float64,
     half: wp.float64,
 ):
-    """Adds a plane to the lists of up to four vertices; where it does not fit, their lists end in INCOMPLETE.
+    """Adds a plane with a unit normal to the lists of up to four vertices, -1 for none; see :class:`.DividingPlanes`.
 
-    Args:
-        planes: The planes.
-        corners: The vertices, -1 for none. Those before ``split`` stay above the plane, the others below.
-        split: The first that stays below.
-        normal: Unit normal of the plane.
-        offset: Its coordinate along the normal [m].
-        margin: Least distance from it after projection, beside ``half`` [m].
-        half: Half of the distance that both sides keep from each other [m].
+    Vertices before ``split`` stay above the plane, the others below. Where it does not fit, their lists end in
+    INCOMPLETE.
     """
     plane = take_place(planes.count)
     fits = plane < planes.normal.shape[0]
@@ -141,7 +135,7 @@ def add_dividing_plane(
     cannot bring together.
 
     Args:
-        motion: The motion of the step.
+        motion: The motion.
         vertices: The vertices as they were moved so far.
         corners: The vertices of both elements.
         kind: The kind of pair.

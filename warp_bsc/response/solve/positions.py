@@ -29,13 +29,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def activate_position_constraints(
-    # in
-    motion: Motion,
-    status: SolveStatus,
-    tolerance: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
+    motion: Motion, status: SolveStatus, tolerance: wp.float64, vertices: Vertices, constraints: Constraints
 ):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
@@ -80,13 +74,7 @@ def activate_position_constraints(
 
 @wp.kernel
 def project_positions(
-    # in
-    motion: Motion,
-    status: SolveStatus,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    record: StepRecord,
+    motion: Motion, status: SolveStatus, vertices: Vertices, constraints: Constraints, record: StepRecord
 ):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     place = wp.tid()
@@ -117,14 +105,7 @@ def project_positions(
 
 @wp.kernel
 def update_positions(
-    # in
-    motion: Motion,
-    last: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-    record: StepRecord,
+    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
@@ -138,9 +119,7 @@ def update_positions(
 def project(work: Workspace, tolerance: float = 1.0) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met.
 
-    Args:
-        work: The workspace of the step.
-        tolerance: Tolerance as a share of that of a whole step.
+    The tolerance is a share of that of a whole step.
     """
     repeat(work.status, work.reserve_entries, lambda first, last: _sweep(work, first, last, tolerance))
 

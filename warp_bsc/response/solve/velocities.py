@@ -30,14 +30,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def initialize_velocity_multipliers(
-    # in
-    motion: Motion,
-    dt: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-):
+def initialize_velocity_multipliers(motion: Motion, dt: wp.float64, vertices: Vertices, constraints: Constraints):
     """Initializes the velocity multipliers of all constraints that pushed, as if contacts had acted at their times.
 
     This conserves angular momentum, because the two sides of a contact meet in one point at that time only.
@@ -130,14 +123,7 @@ def project_velocities(
 
 @wp.kernel
 def update_velocities(
-    # in
-    motion: Motion,
-    last: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-    record: StepRecord,
+    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
@@ -147,11 +133,9 @@ def update_velocities(
 
 
 def project(work: Workspace, dt: float) -> None:
-    """Solves friction and restitution of all contacts that moved a vertex, and restores angular momentum.
+    """Solves friction and restitution of all contacts that moved a vertex in a step of length ``dt`` [s].
 
-    Args:
-        work: The workspace of the step.
-        dt: Length of the step [s].
+    Then restores angular momentum.
     """
     work.launch_over_bodies(move_to_end)
     inputs = [work.motion.vertices, dt, work.vertices, work.constraints]
