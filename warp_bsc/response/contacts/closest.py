@@ -1,4 +1,4 @@
-"""Closest points of two elements at the start of a step."""
+"""Closest points of two elements."""
 
 import warp as wp
 
@@ -9,9 +9,8 @@ from ..state.vectors import ONE, ZERO, corners_of, relative
 
 
 @wp.func
-def _closest_weights(motion: Motion, corners: wp.vec4i, kind: int) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between the closest points of two elements at the start."""
-    a, b, c, d = corners_of(motion.x0, corners)
+def closest_weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
+    """Returns the weights of four vertices in the vector between the closest points of two elements."""
     if kind == EDGE_EDGE:
         at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
         return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
@@ -31,7 +30,8 @@ def _are_within(weights: wp.vec4d, kind: int) -> bool:
 @wp.func
 def closest_vector(motion: Motion, corners: wp.vec4i, kind: int):
     """Returns the weights of the closest points of two elements at the start, and the vector between them [m]."""
-    weights = _closest_weights(motion, corners, kind)
+    a, b, c, d = corners_of(motion.x0, corners)
+    weights = closest_weights(kind, a, b, c, d)
     return weights, relative(weights, corners, motion.x0)
 
 

@@ -4,9 +4,9 @@ import warp as wp
 
 from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
-from ...kernels.closest import closest_coordinates
 from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.polynomials import EDGE_EDGE
+from ..contacts.closest import closest_weights
 from ..contacts.constraints import contact_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
@@ -14,7 +14,7 @@ from ..schedule import has_overflowed
 from ..state.fixed_sum import with_delta
 from ..state.planes import MovingPlanes, signed_distance
 from ..state.structs import Motion
-from ..state.vectors import ONE, ZERO, to_double, to_single
+from ..state.vectors import ONE, ZERO, corners_of, to_double, to_single
 from ..tuning import PARALLEL_IN_LAYER
 
 _UNITS = wp.constant(wp.float64(2.0**40))
@@ -53,16 +53,6 @@ def _between(x0: wp.vec3, x1: wp.vec3, theta: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def _weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between the closest points of two elements."""
-    if kind == EDGE_EDGE:
-        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
-        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
-    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
-    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
-
-
-@wp.func
 def _vector(weights: wp.vec4d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3d:
     return weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
 
@@ -70,11 +60,8 @@ def _vector(weights: wp.vec4d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3
 @wp.func
 def _is_on_the_same_side(motion: Motion, kind: int, corners: wp.vec4i, normal: wp.vec3d) -> bool:
     """Returns whether two elements were on the same sides of each other at the start: not if they have passed."""
-    a = to_double(motion.x0[corners[0]])
-    b = to_double(motion.x0[corners[1]])
-    c = to_double(motion.x0[corners[2]])
-    d = to_double(motion.x0[corners[3]])
-    return wp.dot(normal, _vector(_weights(kind, a, b, c, d), a, b, c, d)) > ZERO
+    a, b, c, d = corners_of(motion.x0, corners)
+    return wp.dot(normal, _vector(closest_weights(kind, a, b, c, d), a, b, c, d)) > ZERO
 
 
 @wp.func
@@ -85,7 +72,7 @@ def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i)
     b = _between(motion.x0[corners[1]], motion.x1[corners[1]], theta)
     c = _between(motion.x0[corners[2]], motion.x1[corners[2]], theta)
     d = _between(motion.x0[corners[3]], motion.x1[corners[3]], theta)
-    weights = _weights(kind, a, b, c, d)
+    weights = closest_weights(kind, a, b, c, d)
     vector = _vector(weights, a, b, c, d)
     distance = wp.length(vector)
     depth = layer.thickness + distance_of_corners(kind, corners, layer.distances.radius) - distance
