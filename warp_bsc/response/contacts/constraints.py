@@ -51,12 +51,7 @@ def kind_of_pair(kind: int) -> int:
 
 @wp.func
 def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector from the second contact point to the first.
-
-    Args:
-        kind: The kind of pair.
-        c: The coordinates of the contact.
-    """
+    """Returns the weights of four vertices in the vector between contact points, by kind and coordinates of a pair."""
     if kind == EDGE_EDGE:
         return wp.vec4d(ONE - c[0], c[0], c[1] - ONE, -c[1])
     if kind == VERTEX_EDGE:
@@ -142,14 +137,10 @@ def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
 def feasible(
     motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
 ) -> wp.float64:
-    """Returns the separation of slow elements: hardly more than at the start, so that standing still nearly meets it.
+    """Returns the separation of slow elements [m]: hardly more than at the start, as standing still should nearly do.
 
-    Args:
-        motion: The motion.
-        corners: The vertices of both elements.
-        target: The separation of fast elements, which is the most [m].
-        start: Distance at the start, beyond the minimum distance [m].
-        separation: Distance that projection moves contacts apart [m].
+    Fast elements get ``target``, which is the most; ``start`` is the distance at the start. Both, like the result, are
+    without minimum distances.
     """
     path = longest_path(motion, corners)
     before = start

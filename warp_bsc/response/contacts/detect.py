@@ -56,9 +56,7 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
         work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
         work.launch_over(count_grazing, counted(queues[:2]), [motion, vertices, mesh, *queues[:2], work.record])
-    if work.max_penetrations:
-        detect_penetrations(work, ahead=False)
-    work.launch(decide, 1, [work.constraints, *overflow], [work.status])
+    _decide(work, overflow)
     if can_search:
         wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
 
@@ -70,6 +68,10 @@ def _search(work, overflow):
     arrays = {"mesh": work.connectivity, "motion": motion, "vertices": work.vertices}
     arrays |= {"dividing": work.dividing, "status": work.status}
     find_contacts_without_queues(broad_phase, work.separation, **arrays)
+    _decide(work, overflow)
+
+
+def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
     work.launch(decide, 1, [work.constraints, *overflow], [work.status])

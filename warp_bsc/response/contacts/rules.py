@@ -56,7 +56,7 @@ def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
 
 @wp.func
 def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether the response can move one of two elements, apart from the other."""
+    """Returns whether the response can move one of two elements; of two bodies, only if it keeps them apart."""
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True

@@ -37,7 +37,7 @@ _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
 
 @wp.struct
 class _Arguments:
-    """What a thread needs in order to find the contacts of two faces and to act on them."""
+    """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
     mesh: Connectivity
