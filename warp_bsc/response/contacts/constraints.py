@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
 from ..state.structs import Constraints, ContactKind, Motion, Pace, Vertices
@@ -185,7 +185,7 @@ def approach_of(
 @wp.func
 def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constraints: Constraints):
     """Adds a constraint if it fits; counts it in any case."""
-    i = take_place(constraints.count)
+    i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = added.vertices
         constraints.weights[i] = added.weights

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...kernels.pipeline.pairs import firsts_of
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Vertices
 from ..state.vectors import HALF, ZERO, relative, to_double
 from ..tuning import CLOSE_MARGIN, MARGIN, SLACK, SMALL_DISTANCE
@@ -39,7 +39,7 @@ def add_plane(
     Vertices before ``split`` stay above the plane, the others below. Where it does not fit, their lists end in
     INCOMPLETE.
     """
-    plane = take_place(planes.count)
+    plane = take_slot_int(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal

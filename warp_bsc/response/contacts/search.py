@@ -4,19 +4,15 @@ import functools
 
 import warp as wp
 
-from ...detection.broad_phase_hierarchy import (
-    BroadPhaseHierarchy,
-    FaceHierarchy,
-    overlapping_edges,
-    overlapping_vertices,
-    traversal_kernel,
-)
+from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.element_pairs import overlapping_edges, overlapping_vertices
+from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.settings import TOLERANCE
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
 from ...kernels.motion import motion_and_distance, relative_motion
-from ...kernels.pipeline.hierarchy import lowest_place
+from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
@@ -177,7 +173,7 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
     def visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
         mesh = arguments.faces
         while found != wp.uint32(0):
-            other = first + lowest_place(found)
+            other = first + lowest_set_bit(found)
             found = found & (found - wp.uint32(1))
             left = _pairs_of_faces(mesh, place, other)
             point = int(-1)
@@ -189,7 +185,7 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
                 if point >= 0 and place != other:
                     left = left | _POINTS
             while left != 0:  # one body for all, which is large
-                bit = lowest_place(wp.uint32(left))
+                bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)
                 kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
                 if wp.static(keep_distances):
