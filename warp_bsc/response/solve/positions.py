@@ -13,7 +13,8 @@ from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERAN
 from .bodies import move_bodies, place_vertices
 from .sweeps import (
     activate,
-    change_multiplier,
+    add_delta,
+    after_sweep,
     finish_sweep,
     is_held_by_friction,
     max_sweeps,
@@ -88,19 +89,11 @@ def project_positions(
         violated = gap(vertices, constraints, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
     multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
-    change_multiplier(
-        motion,
-        place,
-        multiplier,
-        momentum,
-        motion.x1,
-        vertices,
-        constraints,
-        record,
-        constraints.position_multiplier,
-        vertices.particle_delta_x,
-        vertices.bodies.delta_x,
-    )
+    old = constraints.position_multiplier[i]
+    new = after_sweep(constraints, record, place, old, multiplier, momentum)
+    constraints.position_multiplier[i] = new
+    sums = vertices.particle_delta_x
+    add_delta(motion, vertices, constraints, i, new - old, motion.x1, sums, vertices.bodies.delta_x)
 
 
 @wp.kernel
@@ -109,8 +102,8 @@ def update_positions(
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    moved = finish_sweep(motion, vertices, constraints, status, record, last, vertex)
-    if moved:
+    active = finish_sweep(vertices, constraints, status, record, last, vertex)
+    if active and motion.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED

@@ -203,32 +203,16 @@ def add_delta(
 
 
 @wp.func
-def change_multiplier(
-    motion: Motion,
-    place: int,
-    multiplier: wp.vec3d,
-    momentum: wp.float64,
-    x: wp.array[wp.vec3],
-    vertices: Vertices,
-    constraints: Constraints,
-    record: StepRecord,
-    multipliers: wp.array[wp.vec3d],
-    sums: wp.array2d[wp.int64],
-    body_sums: wp.array2d[wp.int64],
-):
-    """Changes a multiplier of the active set to ``multiplier`` and beyond, by its momentum, and records what it was.
-
-    Adds what this does to vertices and bodies, at positions ``x``, to their sums.
-    """
+def after_sweep(
+    constraints: Constraints, record: StepRecord, place: int, old: wp.vec3d, multiplier: wp.vec3d, momentum: wp.float64
+) -> wp.vec3d:
+    """Returns a multiplier of the active set moved on by its momentum, and records what it was before the sweep."""
     i = constraints.active_set[place]
-    old = multipliers[i]
     previous = constraints.previous_multiplier[i]
     if is_recording(record):
         record_entry(record, place, i, old, previous, momentum)
-    new = with_momentum(multiplier, previous, momentum)
     constraints.previous_multiplier[i] = multiplier
-    multipliers[i] = new
-    add_delta(motion, vertices, constraints, i, new - old, x, sums, body_sums)
+    return with_momentum(multiplier, previous, momentum)
 
 
 @wp.func
@@ -246,25 +230,18 @@ def _finish_sweep(constraints: Constraints, status: SolveStatus, record: StepRec
 
 @wp.func
 def finish_sweep(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-    record: StepRecord,
-    last: bool,
-    vertex: int,
+    vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool, vertex: int
 ) -> bool:
-    """Returns whether constraints of a sweep moved a vertex, and, for vertex 0, finishes the sweep.
+    """Returns whether constraints of a sweep act on a vertex; for vertex 0, finishes the sweep.
 
-    After the ``last`` sweep over an active set, empties it.
+    The ``last`` sweep over an active set empties it.
     """
     if vertex == 0:
         _finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
-        return False
-    if last:
+    active = vertices.active[vertex] != 0
+    if active and last:
         vertices.active[vertex] = 0
-    return motion.inverse_mass[vertex] > 0.0
+    return active
 
 
 def repeat(status: SolveStatus, reserve_entries: Callable[[int], None], sweep: Callable[[bool, bool], None]) -> None:

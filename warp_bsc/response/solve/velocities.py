@@ -14,7 +14,7 @@ from .bodies import activate_bodies, change_body_velocities, move_to_end, set_ve
 from .sweeps import (
     activate,
     add_delta,
-    change_multiplier,
+    after_sweep,
     excess_speed,
     finish_sweep,
     initial_velocity_multiplier,
@@ -106,19 +106,11 @@ def project_velocities(
     last_sweep = max_sweeps(motion, constraints, status, i, status.slow_velocity_sweeps) - 1
     momentum = momentum_of(constraints, status, i, last_sweep)
     multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
-    change_multiplier(
-        motion,
-        place,
-        multiplier,
-        momentum,
-        vertices.x1,
-        vertices,
-        constraints,
-        record,
-        constraints.velocity_multiplier,
-        vertices.particle_delta_v,
-        vertices.bodies.delta_v,
-    )
+    old = constraints.velocity_multiplier[i]
+    new = after_sweep(constraints, record, place, old, multiplier, momentum)
+    constraints.velocity_multiplier[i] = new
+    sums = vertices.particle_delta_v
+    add_delta(motion, vertices, constraints, i, new - old, vertices.x1, sums, vertices.bodies.delta_v)
 
 
 @wp.kernel
@@ -127,8 +119,8 @@ def update_velocities(
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    moved = finish_sweep(motion, vertices, constraints, status, record, last, vertex)
-    if moved and not has_final_velocity(vertices.outcome[vertex]):
+    active = finish_sweep(vertices, constraints, status, record, last, vertex)
+    if active and motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
 
 
