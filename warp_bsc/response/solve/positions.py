@@ -102,8 +102,9 @@ def update_positions(
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    active = finish_sweep(vertices, constraints, status, record, last, vertex)
-    if active and motion.inverse_mass[vertex] > 0.0:
+    if not finish_sweep(vertices, constraints, status, record, last, vertex):
+        return
+    if motion.inverse_mass[vertex] > 0.0:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED

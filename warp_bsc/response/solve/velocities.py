@@ -119,8 +119,9 @@ def update_velocities(
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    active = finish_sweep(vertices, constraints, status, record, last, vertex)
-    if active and motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
+    if not finish_sweep(vertices, constraints, status, record, last, vertex):
+        return
+    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
 
 
