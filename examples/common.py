@@ -83,7 +83,7 @@ class ExampleBase:
     def test_final(self):
         """Checks that the stage certified all steps and left no intersections."""
         if self.ccd:
-            uncertified = self.solver.report.uncertified_steps
+            uncertified = self.solver.report.totals.uncertified_steps
             assert uncertified == 0, f"{uncertified} steps are not certified"
             intersections = self.solver.report.intersections
             assert len(intersections) == 0, f"{len(intersections)} edges cross faces in the last step"

@@ -143,7 +143,7 @@ class DiffsimExample(ExampleBase):
         if self.ccd:
             assert self.distance.max() < 0.02, self.distance
             report = self.solver.report
-            assert report.uncertified_steps + report.lost_gradients == 0, report
+            assert report.totals.uncertified_steps + report.gradients.lost_steps == 0, report
 
     def print_report(self):
         """Prints what the stage did, and how far from the mark the cloths end."""

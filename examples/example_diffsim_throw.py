@@ -51,7 +51,8 @@ class Example(DiffsimExample):
         model.soft_contact_restitution = 0.6
         model.particle_mu = 0.2
         solver = newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
-        self.start(model, solver, (wp.vec3(-0.3, -3.2, 0.5), -5.0, 90.0))
+        # no layer: the cloth flies farther in a step than a layer may be thick
+        self.start(model, solver, (wp.vec3(-0.3, -3.2, 0.5), -5.0, 90.0), contact_layer=False)
         self.throws = wp.array(STARTS, dtype=wp.vec3, device=model.device, requires_grad=True)
         self.prepare_descent([self.throws], FIRST_RATE, patch, MARK, STEPS)
 

@@ -45,7 +45,7 @@ class Example(ExampleBase):
 
         solver = newton.solvers.SolverXPBD(model, iterations=8)
         camera = wp.vec3(0.7, -0.7, 0.4), -20.0, 135.0
-        self.start(model, solver, camera, radius=model.particle_radius, friction=0.4)
+        self.start(model, solver, camera, particle_radius=model.particle_radius, friction=0.4)
 
     def distance(self):
         """Returns the least distance between springs that no other spring joins, up to 4 radii [m]."""

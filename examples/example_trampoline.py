@@ -64,7 +64,7 @@ class Example(ExampleBase):
         model.particle_mu = 0.5
 
         solver = newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False)
-        self.start(model, solver, camera=(wp.vec3(0.8, -0.8, 0.4), -22.0, 135.0), bodies=True, coupling=4)
+        self.start(model, solver, camera=(wp.vec3(0.8, -0.8, 0.4), -22.0, 135.0), bodies="separated", substeps=4)
         self.lowest, self.thrown = self.heights(), np.zeros(2)
 
     @staticmethod

@@ -4,8 +4,8 @@
 return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. With a last
 argument, a minimum distance in double precision, ``ccd_vertex_face``, ``ccd_edge_edge``, ``ccd_vertex_edge`` and
 ``ccd_vertex_vertex`` return whether the features come within that distance, without gradients. FREE and HIT are
-certain whatever the options of the calling module, ``fast_math`` among them, and on processors that flush subnormal
-numbers to zero, as long as these round to nearest. Each of the other modules holds one idea of the method.
+certain with any options of the calling module, ``fast_math`` among them, and on processors that flush subnormal numbers
+to zero, as long as these round to nearest. Each of the other modules holds one part of the method.
 
 References:
     Min Tang, Ruofeng Tong, Zhendong Wang, and Dinesh Manocha. "Fast and Exact Continuous Collision Detection with

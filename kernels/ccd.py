@@ -25,7 +25,7 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
     result = Impact()
     result.toi = wp.float64(2.0)
     y = coplanarity(motion)
-    # this cull first: of the pairs whose boxes overlap it decides more than the other one, which is for flat sheets
+    # this cull first: it decides more of the pairs whose boxes overlap than the other one, which is for flat sheets
     if certified_sign_cubic(y.k, y.bound) != 0 or direction_separates(motion, centroid_direction(motion)):
         return result
     status = classify(motion, y)
@@ -36,7 +36,7 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
 
 
 @wp.func
-def _answer(
+def _find_impact(
     kind: int,
     # points at the start
     a0: wp.vec3d,
@@ -52,7 +52,7 @@ def _answer(
     timed: bool,
     tolerance: wp.float64,
 ) -> Impact:
-    """Returns the status of a query and, if ``timed``, its first contact; differentiation takes both as constants."""
+    """Returns the status of a query and, if ``timed``, its first contact, both constants for differentiation."""
     result = Impact()
     if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
         result.status = UNSURE
@@ -70,8 +70,8 @@ def _answer(
     return solve(relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), timed, tolerance)
 
 
-@wp.func_grad(_answer)
-def _adjoint_of_answer(
+@wp.func_grad(_find_impact)
+def _adjoint_of_find_impact(
     kind: int,
     # points at the start
     a0: wp.vec3d,
@@ -88,7 +88,7 @@ def _adjoint_of_answer(
     tolerance: wp.float64,
     adj_ret: Impact,
 ):
-    """Does nothing, and keeps Warp from differentiating the code behind :func:`_answer`."""
+    """Does nothing, and keeps Warp from differentiating the code behind :func:`_find_impact`."""
 
 
 @wp.func
@@ -116,7 +116,7 @@ def impact_vertex_face(
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    found = _answer(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, True, tolerance)
+    found = _find_impact(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, True, tolerance)
     return with_gradients(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, found, tolerance)
 
 
@@ -145,7 +145,7 @@ def impact_edge_edge(
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    found = _answer(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, True, tolerance)
+    found = _find_impact(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, True, tolerance)
     return with_gradients(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, found, tolerance)
 
 
@@ -159,7 +159,7 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
     """
     p, a, b, c = doubles(p0, a0, b0, c0)
     to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    return _answer(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, False, _TOLERANCE).status
+    return _find_impact(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, False, _TOLERANCE).status
 
 
 @wp.func
@@ -172,7 +172,7 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     """
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    return _answer(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, False, _TOLERANCE).status
+    return _find_impact(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, False, _TOLERANCE).status
 
 
 @wp.func

@@ -72,8 +72,8 @@ def between(kind: int, coordinates: wp.vec2d, u: wp.vec3d, v: wp.vec3d, w: wp.ve
 
 
 @wp.func
-def _to_unit_scale(x: wp.vec3d) -> wp.vec3d:
-    """Returns a vector divided by its max-norm, so that squares do not underflow; zero stays zero."""
+def unit_scale(x: wp.vec3d) -> wp.vec3d:
+    """Returns a vector divided by its largest component, so that squares do not underflow; zero stays zero."""
     size = wp.max(wp.abs(x))
     if size > _ZERO:
         return x / size
@@ -93,11 +93,11 @@ def contact_at(motion: Motion, time: wp.float64):
     v = (_ONE - time) * motion.v0 + time * motion.v1
     w = (_ONE - time) * motion.w0 + time * motion.w1
     closest = closest_coordinates(motion.kind, u, v, w)
-    velocity = _to_unit_scale(
+    velocity = unit_scale(
         between(motion.kind, closest, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
     )
-    unit_u = _to_unit_scale(u)
-    unit_v = _to_unit_scale(v)
+    unit_u = unit_scale(u)
+    unit_v = unit_scale(v)
     normal = wp.cross(unit_u, unit_v)
     if wp.length_sq(normal) <= _FLAT * wp.length_sq(unit_u) * wp.length_sq(unit_v):
         normal = velocity

@@ -17,7 +17,7 @@ def _orientation(x: wp.vec3d, y: wp.vec3d, z: wp.vec3d) -> int:
     """Returns the certified sign of the determinant of three vectors, each with one rounding.
 
     Bound, with P the sum of the sizes of its six products: 3 roundings of the vectors, 2 of the products, 3 of the
-    sums, 8r P to first order. Products of three lose less to underflow than the added UNDERFLOW, also where subnormal
+    sums, 8r P to first order. The underflow of products of three is less than the added UNDERFLOW, also where subnormal
     numbers are flushed, 2^-1022 in a vector, as long as no coordinate exceeds 1e70. If one does, no sign is certain.
     """
     ax = wp.abs(x)
@@ -78,7 +78,7 @@ def _plane_orientation(a: wp.vec2d, b: wp.vec2d, p: wp.vec2d) -> int:
 
 @wp.func
 def _edge_beside_face(p: wp.vec2d, q: wp.vec2d, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d) -> bool:
-    """Whether a line along a side of the triangle, or along the edge, certainly separates the two in a plane."""
+    """Returns whether a line along a side of the triangle, or the edge, certainly separates the two in a plane."""
     of_a = _plane_orientation(p, q, a)
     apart = of_a != 0 and of_a == _plane_orientation(p, q, b) and of_a == _plane_orientation(p, q, c)
     for _side in range(3):
@@ -94,9 +94,9 @@ def _edge_beside_face(p: wp.vec2d, q: wp.vec2d, a: wp.vec2d, b: wp.vec2d, c: wp.
 
 @wp.func
 def edge_beside_face(p: Any, q: Any, a: Any, b: Any, c: Any) -> bool:
-    """Whether the edge p q and the triangle a b c are certainly apart in a coordinate plane, thus in space.
+    """Returns whether the edge p q and the triangle a b c are certainly apart in a coordinate plane, thus in space.
 
-    This decides most pairs of one plane, of which no orientation in space is certain: those of a flat floor, say.
+    This decides most pairs in one plane, such as those of a flat floor, where no orientation in space is certain.
     """
     beside = bool(False)
     for axis in range(3):

@@ -54,7 +54,7 @@ def gaps_along(motion: Motion, direction: wp.vec3d):
     difference: 9r times the sum of the sizes of all products.
 
     Returns:
-        The least difference along the direction, the greatest one, and the bound on the error of both.
+        The smallest and the largest difference along the direction, and the bound on the error of both.
     """
     u0 = wp.dot(direction, motion.u0)
     u1 = wp.dot(direction, motion.u1)

@@ -1,10 +1,10 @@
 """Closest points of the two features of a query at rest, and their distance with a bound on its error.
 
-Features are given as in :mod:`.closest`. The distance is the least one of several pairs of points: the closest points
-of all borders, and those of the insides. Each of these is a valid pair, so that the distance is an upper bound but for
-the rounding of the vector between them, some roundoffs of the size s, the largest component of u, v and w.
+Features are given as in :mod:`.closest`. The distance is the minimum over several pairs of points: the closest points
+of all borders, and those of the insides. Each of these is a valid pair, so that the distance is an upper bound up to
+the rounding of the vector between them, a few roundoffs of the size s, the largest component of u, v and w.
 
-It is a lower bound as well, up to some roundoffs r of s. A point and an edge: the square of the distance along the
+It is a lower bound as well, up to a few roundoffs r of s. A point and an edge: the square of the distance along the
 edge is a parabola, and an error of r |w| / |u| in the coordinate of the closest point moves this by r |w|. The insides
 of two edges at an angle a: one coordinate comes from cross products, with errors of about r s / (|u| sin a) and
 r d / (|u| sin^2 a) at the distance d; the other one is the closest to it. The point then moves by r s + r d / sin a
@@ -74,7 +74,7 @@ def nearest_pair(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def closest_points(kind: int, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
-    """Finds the closest points of two features.
+    """Returns the closest points of two features and their distance.
 
     Returns:
         Coordinates of the two points as of :func:`.closest.closest_coordinates`; their distance; and the bound on its

@@ -5,24 +5,24 @@ between them and the unit normal N = x / |x|. As the points are closest, moving 
 in the second order only. So with their weights w_i in x = sum w_i p_i held fixed (in a vertex and a face 1 and minus
 the barycentric coordinates), and with the velocity e of the one point relative to the other,
 
-    dt = -N . sum w_i dp_i / (N . e),
+    dt = -N . sum w_i dp_i / (N . e).
 
-of which a point's start has the share 1 - t and its end t. The returned time is a lower bound; gradients are those at
-the root of |x| = d within the tolerance after it, which Newton's method finds. Where several pairs of points are
-closest, as of parallel edges, gradients are those of one pair.
+The start of a point has the share 1 - t of dp_i, its end the share t. The returned time is a lower bound; gradients are
+those at the root of |x| = d within the tolerance after it, which Newton's method finds. Where several pairs of points
+are closest, as on parallel edges, gradients are those of one pair.
 
 **Grazing.** Gradients grow without bound where N . e goes to zero. As in :mod:`.gradients`, 1 / (N . e) becomes
 N . e / max((N . e)^2, (sigma max(|e|, f))^2), with sigma = 2^-10 and f = 2^-22 of the largest coordinate of the
 relative motion. Where this has an effect ``grazing`` is 1, and also where the root is not certain to be within the
-tolerance, or is not found there. Of features that are nearer than the distance from the start, whose time is 0 whatever
-the points, gradients are zero.
+tolerance, or is not found there. Features that are nearer than the distance at the start have the time 0, and gradients
+of zero.
 """
 
 import warp as wp
 
 from .closest import between
 from .distance import nearest_pair
-from .gradients import LEAST_SQUARE_LENGTH, SQUARE_SINE
+from .gradients import MIN_SQUARE_LENGTH, SQUARE_SINE
 from .motion import all_finite, relative_motion
 from .polynomials import VERTEX_FACE, Motion
 from .signs import FREE
@@ -67,7 +67,7 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
         normal = gap / size
         velocity = between(motion.kind, at, motion.u1 - motion.u0, motion.v1 - motion.v0, motion.w1 - motion.w0)
         speed = wp.dot(normal, velocity)
-        slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), LEAST_SQUARE_LENGTH)
+        slowest = SQUARE_SINE * wp.max(wp.length_sq(velocity), MIN_SQUARE_LENGTH)
         approach = speed / wp.max(speed * speed, slowest)
         reach.weights = wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
         if motion.kind != VERTEX_FACE:
@@ -99,11 +99,11 @@ def with_distance_gradients(
     c1: wp.vec3d,
     d1: wp.vec3d,
     distance: wp.float64,
-    # what was found
+    # first contact
     found: Impact,
     tolerance: wp.float64,
 ) -> Impact:
-    """Returns the answer to a query with a minimum distance, its time as a differentiable function of the points.
+    """Returns the first contact of a query with a minimum distance, with a time that is differentiable by the points.
 
     Args:
         kind: VERTEX_FACE or EDGE_EDGE; points of a vertex and an edge are p a b a, of two vertices p q q q.
@@ -116,11 +116,11 @@ def with_distance_gradients(
         c1: Third point at the end.
         d1: Fourth point at the end.
         distance: The minimum distance.
-        found: The answer.
+        found: First contact of these points.
         tolerance: Tolerance of its time of impact.
 
     Returns:
-        The answer ``found``, with ``grazing``. Its time has gradients, coordinates and normal have none.
+        The contact ``found``, with ``grazing``; its time has gradients, its coordinates and normal have none.
     """
     result = found
     result.grazing = 0
@@ -147,7 +147,7 @@ def _adjoint_of_with_distance_gradients(
     c1: wp.vec3d,
     d1: wp.vec3d,
     distance: wp.float64,
-    # what was found
+    # first contact
     found: Impact,
     tolerance: wp.float64,
     adj_ret: Impact,

@@ -52,7 +52,7 @@ from .time_of_impact import Impact, approximate_root, clamped_tolerance, mix_vec
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 SQUARE_SINE = wp.constant(wp.float64(2.0**-20))  # sigma^2
-LEAST_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
+MIN_SQUARE_LENGTH = wp.constant(wp.float64(2.0**-44))  # f^2
 _NEWTON_STEPS = wp.constant(8)
 _NEWTON_END = wp.constant(wp.float64(2.0**-50))
 _CONVERGED = wp.constant(wp.float64(2.0**-40))
@@ -78,7 +78,7 @@ class Touch:
 @wp.func
 def _square_length(x: wp.vec3d) -> wp.float64:
     """Returns the squared length of a vector, at least f^2."""
-    return wp.max(wp.length_sq(x), LEAST_SQUARE_LENGTH)
+    return wp.max(wp.length_sq(x), MIN_SQUARE_LENGTH)
 
 
 @wp.func

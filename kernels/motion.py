@@ -97,8 +97,8 @@ def _scaled(
     The motion is zero, which makes all its signs uncertain, if its size, its largest coordinate, is zero or out of
     range.
 
-    Flushing subnormal numbers to zero loses 2^-1022 in each of two points and in their difference, less than 2^-540
-    after scaling. In a product of three the loss is below 2^-532, less than the UNDERFLOW that bounds add, times the
+    Flushing subnormal numbers to zero changes each of two points and their difference by at most 2^-1022, less than
+    2^-540 after scaling. A product of three changes by less than 2^-532, below the UNDERFLOW that bounds add, times the
     roundoff, 2^-518. Numbers that scaling makes subnormal are smaller still.
     """
     motion = Motion()
@@ -259,7 +259,7 @@ def motion_and_distance(
     """Returns the relative motion of a query as of :func:`relative_motion`, and a distance in the same scale.
 
     A distance out of the range of that scale becomes infinite, where it is more than all distances of the query, or
-    loses what is below 2^-1022 of the largest coordinate.
+    changes by up to 2^-1022 of the largest coordinate.
     """
     from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)

@@ -91,7 +91,7 @@ def cross_middle(x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d) -> wp.v
 
 
 @wp.func
-def _cross_size(x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
+def cross_size(x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
     """Returns bounds on the components of a cross product, from the sizes of the components of its factors."""
     return wp.vec3d(x[1] * y[2] + x[2] * y[1], x[2] * y[0] + x[0] * y[2], x[0] * y[1] + x[1] * y[0])
 
@@ -115,7 +115,7 @@ def coplanarity(motion: Motion) -> Coplanarity:
         (TWO * wp.dot(motion.w1, y.nh) + wp.dot(motion.w0, y.n1)) * _THIRD,
         wp.dot(motion.w1, y.n1),
     )
-    size = wp.dot(motion.w_size, _cross_size(motion.u_size, motion.v_size))
+    size = wp.dot(motion.w_size, cross_size(motion.u_size, motion.v_size))
     y.bound = motion.roundoff * (COPLANARITY_ERROR * size + UNDERFLOW)
     return y
 
@@ -167,9 +167,9 @@ def inside_tests(motion: Motion, y: Coplanarity, axis: int) -> InsideTests:
     """
     n = wp.vec3d(component(y.n0, axis), component(y.nh, axis), component(y.n1, axis))
     w_v = _cross_component(motion.w0, motion.w1, motion.v0, motion.v1, axis)
-    uv = component(_cross_size(motion.u_size, motion.v_size), axis)
-    wv = component(_cross_size(motion.w_size, motion.v_size), axis)
-    wu = component(_cross_size(motion.w_size, motion.u_size), axis)
+    uv = component(cross_size(motion.u_size, motion.v_size), axis)
+    wv = component(cross_size(motion.w_size, motion.v_size), axis)
+    wu = component(cross_size(motion.w_size, motion.u_size), axis)
     tests = InsideTests()
     tests.q0 = w_v
     if motion.kind == VERTEX_FACE:

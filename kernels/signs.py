@@ -8,8 +8,8 @@ absolute value exceeds the bound. Bounds have the form
 valid to first order in the roundoff for every order of evaluation and with or without fused multiply-add (fusing only
 leaves a rounding out); the constants c are rounded up by enough to cover the terms of second order. The docstring of
 each function derives its bound. Because a query is scaled to coordinates below 2, no product overflows, and underflow
-loses far less than the UNDERFLOW that bounds add: 2^-1074 in a product, or 2^-1022 in an operation of a processor that
-flushes subnormal numbers to zero. Rounding is to nearest.
+changes far less than the UNDERFLOW that bounds add: 2^-1074 in a product, or 2^-1022 in an operation of a processor
+that flushes subnormal numbers to zero. Rounding is to nearest.
 
 With ``roundoff = 0`` all bounds are zero, and signs are those that floating point computes: the paper's BSC-float.
 """
@@ -26,8 +26,8 @@ UNSURE = wp.constant(2)
 ROUNDOFF = wp.constant(wp.float64(2.0**-53))
 """Unit roundoff of double precision, for certified signs."""
 UNDERFLOW = wp.constant(wp.float64(1.0e-140))
-"""Every bound adds this times the roundoff, or times a bound, which is at least as much. Operations lose far less than
-1e-296 to underflow: 2^-1022 each."""
+"""Every bound adds this times the roundoff, or times a bound, which is at least as large. The underflow of an operation
+is far below 1e-296: 2^-1022."""
 
 
 @wp.func

@@ -18,8 +18,8 @@ from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 MAX_VISITS = wp.constant(256)
 """Number of intervals after which the search stops, unsure."""
 
-LEAST_DIGITS = 10
-"""Fewest binary digits of a time of impact, however large the tolerance."""
+MIN_DIGITS = 10
+"""Smallest number of binary digits of a time of impact, for any tolerance."""
 
 FINEST = wp.constant(wp.float64(2.0**-8))
 """Length of the shortest intervals, as a share of the tolerance."""
@@ -32,7 +32,7 @@ _NEWTON_STEPS = wp.constant(12)
 _NEWTON_END = wp.constant(wp.float64(2.0**-40))
 _CUBIC_ERROR = wp.constant(wp.float64(2.0))
 _SMALLEST_TOLERANCE = wp.constant(wp.float64(2.0**-38))
-_LARGEST_TOLERANCE = wp.constant(wp.float64(2.0**-LEAST_DIGITS))
+_LARGEST_TOLERANCE = wp.constant(wp.float64(2.0**-MIN_DIGITS))
 _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 
 
@@ -58,7 +58,7 @@ def clamped_tolerance(tolerance: wp.float64) -> wp.float64:
     """Returns the tolerance clamped to [2^-38, 2^-10]; 2^-38 for NaN.
 
     Times are exact down to the lower limit. A tolerance above the upper one would save nothing, because the search goes
-    straight to the root, but leave intervals in which the cubic is not linear.
+    straight to the root, but would leave intervals in which the cubic is not linear.
     """
     return wp.where(tolerance > _SMALLEST_TOLERANCE, wp.min(tolerance, _LARGEST_TOLERANCE), _SMALLEST_TOLERANCE)
 
@@ -167,7 +167,7 @@ def approximate_extremum(k: wp.vec4d) -> wp.float64:
 
 
 @wp.func
-def where_to_look(k: wp.vec4d) -> wp.float64:
+def approximate_contact_time(k: wp.vec4d) -> wp.float64:
     """Returns an uncertified time in (0, 1) at which a cubic is about zero or nearest to it; 0 or 1 if none."""
     if k[0] * k[3] < _ZERO:
         return approximate_root(k)
@@ -182,7 +182,7 @@ def power_of_two(x: wp.float64) -> wp.float64:
 
 @wp.func
 def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.float64):
-    """Returns a time before which there is certainly no contact, from one interval after the other, in order of time.
+    """Returns a time before which there is certainly no contact, by testing one interval after the other.
 
     After an interval that is certainly free comes the other half, or one twice as long. An unsure interval becomes
     shorter: it ends half the tolerance before a root of Y, so that it is usually free and the next one, as long as the
@@ -214,9 +214,9 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
     ahead = bool(False)  # whether a root may be half the tolerance after the end of the interval
     passing = bool(False)  # whether the interval is the one around that root
     halved = bool(False)  # whether the interval is half of an unsure one
-    probing = bool(False)  # whether the shortest interval around the root is tested in place of the interval
+    probing = bool(False)  # whether the shortest interval around the root is tested, not the interval
     probed = certified_sign(y.k[0], y.bound) != 0
-    answer = status
+    current = status
     k = y.k
     for visit in range(MAX_VISITS):
         width = end - start
@@ -224,18 +224,18 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             low = wp.where(probing, wp.max(root - shortest, start), start)
             high = wp.where(probing, wp.min(root + shortest, end), end)
             k = restrict_cubic(y.k, low, high)
-            answer = status_between(motion, y, k, low, high)
+            current = status_between(motion, y, k, low, high)
         half = shortest * wp.floor(_HALF * width / shortest)
         if probing:
-            if answer == UNSURE:
+            if current == UNSURE:
                 return UNSURE, start, end
             probing = False
             probed = True
             end = start + half
             halved = True
-        elif answer == HIT and width <= length:
+        elif current == HIT and width <= length:
             return HIT, start, end
-        elif answer == FREE:
+        elif current == FREE:
             if end == _ONE:
                 return FREE, wp.float64(2.0), end
             start = end
@@ -250,7 +250,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
         elif start == _ZERO and not probed:
             probing = True
         else:
-            time = where_to_look(k)
+            time = approximate_contact_time(k)
             root = start + shortest * wp.floor(width * time / shortest)
             ahead = False
             passing = False

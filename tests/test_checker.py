@@ -14,6 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_bsc import checker
+from warp_bsc.checker.filters import triangles_may_touch
+from warp_bsc.checker.queries import VERTEX_FACE
 
 KINDS = ("vertex_face", "edge_edge")
 COLLIDES = {"vertex_face": checker.vertex_face, "edge_edge": checker.edge_edge}
@@ -268,7 +270,10 @@ def test_filter_agrees_with_exact_arithmetic(kind, name, monkeypatch):
         points = GENERATORS[name](np.random.default_rng(6), 30, kind, dtype)
         monkeypatch.undo()
         filtered = COLLIDES[kind](points)
-        monkeypatch.setattr(checker, "_may_touch", lambda points, pairs: np.ones((len(points), len(pairs)), dtype=bool))
+        monkeypatch.setattr(
+            "warp_bsc.checker.queries.triangles_may_touch",
+            lambda points, pairs: np.ones((len(points), len(pairs)), dtype=bool),
+        )
         assert np.array_equal(filtered, COLLIDES[kind](points))
 
 
@@ -284,7 +289,7 @@ def test_filter_knows_what_underflows_beside_large_coordinates():
 
 def test_filter_spares_exact_arithmetic_most_queries():
     points = GENERATORS["uniform"](np.random.default_rng(7), 2000, "vertex_face", np.float64)
-    assert checker._may_touch(points, checker._VERTEX_FACE).mean() < 0.3
+    assert triangles_may_touch(points, VERTEX_FACE).mean() < 0.3
 
 
 def relatives(kind, points):

@@ -1,6 +1,7 @@
 """The package: what of a checkout can be imported as a part of it."""
 
 import ast
+import functools
 import importlib.util
 import os
 import shutil
@@ -38,33 +39,41 @@ PACKAGES = {
     "_arguments": set(),
     "_atomic_file": set(),
     "_one_thread": set(),
+    "_version": set(),
+    "_private_names": set(),
     "checker": {"_arguments"},
-    "detection": {"kernels", "checker", "_arguments", "_one_thread"},
-    "response": {"detection", "kernels", "_arguments", "_one_thread"},
+    "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
+    "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
     "usd": {"_arguments", "_one_thread"},
-    "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file"},
-    "bench": {"detection", "kernels", "usd", "checker", "response"},
-    "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file"},
+    "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
+    "bench": {"detection", "kernels", "usd", "checker", "response", "_arguments", "_private_names"},
+    "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
     "__main__": {"cli"},
-    "__init__": {"checker", "detection", "replay", "response", "usd"},  # for type checkers alone
+    "__init__": {"_version", "checker", "detection", "replay", "response", "usd"},  # most for type checkers alone
 }
 """Whom a package of ours, or a module beside them, may import; the names that it exports import what they need."""
 
 LIBRARIES = {
-    "newton": {"response", "warp_bsc/bench/newton_examples.py"},  # a benchmark of Newton's examples runs them
+    "newton": {
+        "response",
+        "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
+        "warp_bsc/bench/newton_process.py",  # runs them
+    },
     "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
     "rich": {"cli"},
     "argparse": {"cli"},
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
     "trimesh": {"bench", "usd"},
-    "warp": {"kernels", "detection", "response", "bench", "cli"},
+    "warp": {"kernels", "detection", "response", "bench", "cli", "_private_names"},
 }
 """Who may import a library: packages, or single files."""
 
 
+@functools.cache
 def imports():
     """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
+    found = []
     for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
         for path in sorted(folder.rglob("*.py")):
             relative = path.relative_to(folder)
@@ -79,21 +88,77 @@ def imports():
                     modules = [[*base, alias.name] for alias in node.names]
                 else:
                     continue
-                for module in modules:
-                    yield str(path.relative_to(ROOT)), package, module
+                found += [(str(path.relative_to(ROOT)), package, module) for module in modules]
+    return found
 
 
 def test_packages_import_only_what_the_layout_allows():
     found = {(package, module[1]) for _, package, module in imports() if module[0] == "warp_bsc" and module[1:]}
-    names = {package for package, _ in found} | {imported for _, imported in found if imported != "__version__"}
+    names = {package for package, _ in found} | {imported for _, imported in found}
     assert names == PACKAGES.keys()
     wrong = [
         f"{path}: {'.'.join(module)}"
         for path, package, module in imports()
-        if module[0] == "warp_bsc" and module[1:] not in (["__version__"], [])
+        if module[0] == "warp_bsc" and module[1:]
         if package != module[1] and module[1] not in PACKAGES.get(package, ())
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def circles(importers):
+    """The circles of a graph: sets of two or more nodes that all reach each other, or of one that reaches itself.
+
+    Args:
+        importers: For each node, the nodes that it leads to.
+    """
+    reached = {}
+    for node in importers:
+        reached[node], waiting = set(), [node]
+        while waiting:
+            new = importers.get(waiting.pop(), set()) - reached[node]
+            reached[node] |= new
+            waiting += new
+    return {
+        frozenset(other for other in reached[node] if node in reached.get(other, ()))
+        for node in reached
+        if node in reached[node]
+    }
+
+
+def modules_of_a_package(package):
+    """For each module of a package, the modules of it that it imports, in functions and for type checkers as well."""
+    found = {}
+    for path, imported_by, module in imports():
+        if imported_by == package:
+            own = ["warp_bsc", *Path(path).with_suffix("").parts[path.startswith("warp_bsc") :]]
+            found.setdefault(tuple(part for part in own if part != "__init__"), []).append(module)
+    return {
+        own: {
+            # The longest beginning of a name that is a module: the rest is a name in that module.
+            max((name for name in found if name == tuple(module)[: len(name)]), key=len, default=())
+            for module in modules
+        }
+        - {own, ()}
+        for own, modules in found.items()
+    }
+
+
+def test_circles_are_found():
+    chain = {"a": {"b"}, "b": {"c"}, "c": set()}
+    assert circles(chain) == set()
+    assert circles(chain | {"c": {"a"}, "d": {"a"}}) == {frozenset("abc")}
+    assert circles({"a": {"b"}, "b": {"a"}, "c": {"d"}, "d": {"c", "a"}}) == {frozenset("ab"), frozenset("cd")}
+    assert circles({"a": {"a"}, "b": {"a"}}) == {frozenset("a")}
+
+
+@pytest.mark.parametrize(
+    "package", [name for name in PACKAGES if (ROOT / name).is_dir() or (ROOT / "warp_bsc" / name).is_dir()]
+)
+def test_no_package_has_a_circle_inside(package):
+    modules = modules_of_a_package(package)
+    assert any(modules.values())
+    found = [", ".join(sorted(".".join(module) for module in circle)) for circle in circles(modules)]
+    assert not found, "\n".join(sorted(found))
 
 
 def test_no_chain_of_packages_is_longer_than_seven():

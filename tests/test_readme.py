@@ -28,7 +28,7 @@ def test_python_code_runs_as_printed(tmp_path, capsys):
     np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
     assert names["c"].certified
     assert names["r"].hit.tolist() == [True]
-    assert (names["solver"].report.steps, names["solver"].report.uncertified_steps) == (20, 0)
+    assert (names["solver"].report.totals.steps, names["solver"].report.totals.uncertified_steps) == (20, 0)
     gradient = names["states"][0].particle_qd.grad.numpy()
     assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.0
     assert names["count"].numpy().tolist() == [1]

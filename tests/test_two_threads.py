@@ -64,9 +64,9 @@ def test_a_second_thread_in_a_stage_gets_an_error(model, stage):
     finally:
         solver.solver.go_on.set()
         stepping.join()
-    assert solver.report.steps == 1 and solver.report.certified
+    assert solver.report.totals.steps == 1 and solver.report.certified
     solver.step(start, end, None, None, DT)
-    assert solver.report.steps == 2
+    assert solver.report.totals.steps == 2
 
 
 def test_a_second_thread_in_captured_steps_gets_an_error(model):

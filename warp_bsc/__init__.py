@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from ._version import __version__ as __version__
 
 _KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
 """The device code, which in a checkout stands beside this package, not in it."""
@@ -45,9 +45,12 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .replay.scene_intersections import SceneIntersections
     from .replay.scene_proximities import SceneProximities
     from .response.captured_steps import CapturedSteps
+    from .response.layer.contact_layer import ContactLayer
+    from .response.monitor import CollisionMonitor
     from .response.report import SolverReport
-    from .response.solver_ccd import CollisionMonitor, SolverCCD
-    from .usd.scene import FrameRange, Scene
+    from .response.solver_ccd import SolverCCD
+    from .usd.frames import FrameRange
+    from .usd.scene import Scene
     from .usd.selection import Selection
 
 _MODULES = {
@@ -56,10 +59,11 @@ _MODULES = {
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionMesh": "detection.mesh",
-    "CollisionMonitor": "response.solver_ccd",
+    "CollisionMonitor": "response.monitor",
     "Collisions": "detection.collisions",
+    "ContactLayer": "response.layer.contact_layer",
     "DetectionStats": "detection.collisions",
-    "FrameRange": "usd.scene",
+    "FrameRange": "usd.frames",
     "IntervalResult": "replay.results",
     "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
@@ -86,6 +90,7 @@ __all__ = [
     "CollisionMesh",
     "CollisionMonitor",
     "Collisions",
+    "ContactLayer",
     "DetectionStats",
     "FrameRange",
     "IntervalResult",

@@ -1,20 +1,20 @@
 """Checks the arguments that users pass in: numbers, flags, choices, arrays. Errors begin with the argument's name.
 
-A wrong type is a TypeError, a wrong value a ValueError. NumPy's scalars are as good as Python's; a string is never a
-number, and a bool is none either.
+A wrong type is a TypeError, a wrong value a ValueError. NumPy's scalars count as Python's; neither a string nor a bool
+is a number.
 """
 
 import math
 import reprlib
 from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 __all__ = [
-    "LEAST_DISTANCE",
+    "SMALLEST_DISTANCE",
     "as_numpy",
     "check_finite",
     "check_instance",
@@ -30,22 +30,24 @@ __all__ = [
     "given",
 ]
 
-LEAST_DISTANCE = 2.0**-1021
-"""Least distance or radius that is not 0: half of it is a normal number, which a processor may not take for 0."""
+SMALLEST_DISTANCE = 2.0**-1021
+"""Smallest distance or radius that is not 0: half of it is a normal number, which no processor flushes to 0."""
 
-_LEAST_BITS = int(np.float64(LEAST_DISTANCE).view(np.int64))
+_SMALLEST_BITS = int(np.float64(SMALLEST_DISTANCE).view(np.int64))
 
-_LARGEST_COUNT = 2**31 - 1
+_LARGEST_INTEGER = 2**31 - 1
+
+_Choice = TypeVar("_Choice", bound=str)
 
 
 def given(value: object) -> str:
-    """Returns what was given, as errors show it."""
+    """Returns a value in the form in which errors show it."""
     text = reprlib.repr(value)
     return text if isinstance(value, str | Real | None) else f"{type(value).__name__} {text}"
 
 
-def checked_integer(value: Any, name: str, least: int = 0, most: int = _LARGEST_COUNT) -> int:
-    """Returns an integer in [least, most].
+def checked_integer(value: Any, name: str, minimum: int = 0, maximum: int = _LARGEST_INTEGER) -> int:
+    """Returns an integer in [minimum, maximum].
 
     Raises:
         TypeError: If it is no integer.
@@ -54,16 +56,18 @@ def checked_integer(value: Any, name: str, least: int = 0, most: int = _LARGEST_
     if not isinstance(value, Integral) or isinstance(value, bool):
         raise TypeError(f"{name} must be an integer, not {given(value)}")
     integer = int(value)
-    if not least <= integer <= most:
-        bounds = f"of at least {least}, less than 2^31" if most == _LARGEST_COUNT else f"in [{least}, {most}]"
+    if not minimum <= integer <= maximum:
+        bounds = (
+            f"of at least {minimum}, less than 2^31" if maximum == _LARGEST_INTEGER else f"in [{minimum}, {maximum}]"
+        )
         raise ValueError(f"{name} must be an integer {bounds}, not {given(value)}")
     return integer
 
 
 def checked_number(
-    value: Any, name: str, least: float = -math.inf, most: float = math.inf, *, above: bool = False
+    value: Any, name: str, minimum: float = -math.inf, maximum: float = math.inf, *, above: bool = False
 ) -> float:
-    """Returns a finite number in [least, most], in (least, most] if ``above``.
+    """Returns a finite number in [minimum, maximum], in (minimum, maximum] if ``above``.
 
     Raises:
         TypeError: If it is no number.
@@ -75,12 +79,12 @@ def checked_number(
         number = float(value)
     except OverflowError:
         number = math.inf
-    if not math.isfinite(number) or not least <= number <= most or (above and number == least):
+    if not math.isfinite(number) or not minimum <= number <= maximum or (above and number == minimum):
         bounds = "finite"
-        if math.isfinite(least):
-            bounds += f" and {'more than' if above else 'at least'} {least:g}"
-        if math.isfinite(most):
-            bounds += f" and at most {most:g}"
+        if math.isfinite(minimum):
+            bounds += f" and {'more than' if above else 'at least'} {minimum:g}"
+        if math.isfinite(maximum):
+            bounds += f" and at most {maximum:g}"
         raise ValueError(f"{name} must be {bounds}, not {given(value)}")
     return number
 
@@ -96,7 +100,7 @@ def checked_flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
+def checked_choice(value: Any, name: str, choices: Sequence[_Choice]) -> _Choice:
     """Returns one of some strings.
 
     Raises:
@@ -105,9 +109,10 @@ def checked_choice(value: Any, name: str, choices: Sequence[str]) -> str:
     """
     if not isinstance(value, str):
         raise TypeError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
-    return value
+    for choice in choices:
+        if value == choice:
+            return choice
+    raise ValueError(f"{name} must be one of {', '.join(choices)}, not {given(value)}")
 
 
 def checked_strings(values: Any, name: str) -> tuple[str, ...]:
@@ -196,7 +201,7 @@ def checked_coordinates(array: ArrayLike, shape: tuple[int, ...], name: str) -> 
 def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
     """Returns distances or radii, one or many, in double precision.
 
-    Processors that flush subnormal numbers to zero take such a distance for 0, in comparisons, too: bits are compared.
+    Bits are compared, because processors that flush subnormal numbers to zero also do so in comparisons.
 
     Args:
         distances: One number, or an array of shape (count,).
@@ -206,7 +211,7 @@ def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
     Raises:
         TypeError: If they are no numbers.
         ValueError: If they have another shape, are masked, negative or not finite, or are less than
-            :data:`LEAST_DISTANCE` and not 0.
+            :data:`SMALLEST_DISTANCE` and not 0.
     """
     what = "one number or an array of numbers"
     values = as_numpy(distances, name, what)
@@ -219,7 +224,7 @@ def checked_distances(distances: Any, name: str, count: int) -> np.ndarray:
     is_zero = bits << 1 == 0
     if values.dtype.itemsize > 8:  # of numbers that are longer than doubles, some become 0
         is_zero &= values == 0
-    bad = ~(np.isfinite(converted) & (is_zero | (bits >= _LEAST_BITS)))
+    bad = ~(np.isfinite(converted) & (is_zero | (bits >= _SMALLEST_BITS)))
     if bad.any():
         which = np.flatnonzero(bad)[0]
         where = f"{name}[{which}]" if values.ndim else name

@@ -18,13 +18,13 @@ STDOUT = "-"
 
 
 def unfinished_path(path: str | os.PathLike) -> Path:
-    """Returns where a file is that :meth:`OutputFile.save` has saved and that is not committed, given its place."""
+    """Returns where a file is that :meth:`OutputFile.save` has saved and that is not committed, given its path."""
     return Path(os.path.realpath(path) + ".part")
 
 
 @contextlib.contextmanager
 def naming(what: str | os.PathLike) -> Iterator[None]:
-    """Puts the name of a file before the system's message on what is wrong with it.
+    """Puts the name of a file before the system's message in errors of the context.
 
     Raises:
         OSError: If one is raised in the block.
@@ -38,23 +38,23 @@ def naming(what: str | os.PathLike) -> Iterator[None]:
 
 
 class OutputFile:
-    """A file that is written elsewhere and takes its place when it is complete.
+    """A file that is written elsewhere and moved to its path when it is complete.
 
     A symbolic link stays, and the file that it points to is replaced. A stream, such as ``/dev/null``, a named pipe or
     ``/dev/stdout``, is not replaced: the whole content is written to it at the end.
 
     Attributes:
-        path: The file's place, :data:`STDOUT` for standard output.
+        path: The path of the file, :data:`STDOUT` for standard output.
         name: The same in words.
-        is_stream: Whether the place is a stream, not a regular file.
+        is_stream: Whether the path is that of a stream, not of a regular file.
         folder: The folder of the temporary file.
     """
 
     def __init__(self, path: str | os.PathLike):
-        """Opens a temporary file; one without a name where the system has such, which leaves nothing behind.
+        """Opens a temporary file; without a name where the system allows, so that nothing of it is left after a crash.
 
         Raises:
-            OSError: If the temporary file or the place cannot be written.
+            OSError: If the temporary file or the path cannot be written.
         """
         self.path = Path(path)
         if self.path.is_dir():
@@ -63,8 +63,8 @@ class OutputFile:
             self._stream = _open_stream(path)
         self.is_stream = self._stream is not None
         self.name = "standard output" if str(path) == STDOUT else str(path)
-        self._place = Path(os.path.realpath(path))
-        self.folder = tempfile.gettempdir() if self.is_stream else self._place.parent
+        self._target = Path(os.path.realpath(path))
+        self.folder = tempfile.gettempdir() if self.is_stream else self._target.parent
         if not os.path.isdir(self.folder):
             folder = self.folder if self.path.is_symlink() else self.path.parent
             raise FileNotFoundError(f"{path}: there is no folder {folder}")
@@ -118,7 +118,7 @@ class OutputFile:
             self._temporary, self._is_saved = self._unfinished, True
 
     def commit(self) -> None:
-        """Puts the file in its place, with the permissions of the file that was there.
+        """Moves the file to its path, with the permissions of the file that was there.
 
         Raises:
             OSError: If that fails. A file that was there before is unchanged.
@@ -137,9 +137,9 @@ class OutputFile:
             if not self._is_at(self._temporary):
                 raise FileExistsError(f"another process, which writes the same file, has replaced {self._temporary}")
             with contextlib.suppress(FileNotFoundError):
-                os.chmod(self._temporary, stat.S_IMODE(os.stat(self._place).st_mode))
+                os.chmod(self._temporary, stat.S_IMODE(os.stat(self._target).st_mode))
             self._file.close()
-            os.replace(self._temporary, self._place)
+            os.replace(self._temporary, self._target)
         self.discard()
 
     def discard(self) -> None:
@@ -206,7 +206,7 @@ def _find_descriptor(path) -> int | None:
 def _open_temporary(folder):
     """Opens a temporary file. Returns it and its path, None for a file without a name, which closing removes."""
     if hasattr(os, "O_TMPFILE"):
-        with contextlib.suppress(OSError):  # the file system has no such files, or cannot name them later
+        with contextlib.suppress(OSError):  # the file system has no files without a name, or cannot name them later
             flags = os.O_TMPFILE | os.O_RDWR
             with open(os.open(folder, flags, 0o666), "wb", buffering=0) as trial:
                 _give_name(trial, folder).unlink()

@@ -50,7 +50,10 @@ def losses_and_gradients(layer):
     world.add_shape_box(-1, xform=wp.transform(wp.vec3(), tilt), hx=0.05, hy=0.06, hz=0.05, cfg=config)
     model = build_worlds(world, len(_VELOCITIES))
     inner = newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
-    solver = bsc.SolverCCD(inner, friction=0.3, restitution=0.2, contact_layer=layer)
+    options = {"friction": 0.3, "restitution": 0.2}
+    if layer is not None:
+        inner = bsc.ContactLayer(inner, thickness=layer, **options)
+    solver = bsc.SolverCCD(inner, contact_layer=False, **options)
     states = [model.state() for _ in range(_STEPS + 1)]
     throws = np.tile(_THROW, (len(_VELOCITIES), 1))
     throws[:, 2] += _VELOCITIES

@@ -24,10 +24,15 @@ CENTRE = wp.constant(wp.vec3(0.0, 0.0, HEIGHT))
 
 
 @wp.kernel(enable_backward=False)
-def turn_ball(time: wp.array[float], body_q: wp.array[wp.transform]):
+def turn_ball(
+    # in
+    time: wp.array[float],
+    # out
+    body_q: wp.array[wp.transform],
+):
     """Turns the ball about the upright axis."""
     t = wp.max(time[0] - START_TIME, 0.0)
-    # the speed grows linearly, then stays
+    # the speed grows linearly, then is constant
     angle = SPEED * wp.where(t < RAMP_TIME, 0.5 * t * t / RAMP_TIME, t - 0.5 * RAMP_TIME)
     body_q[0] = wp.transform(CENTRE, wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
 

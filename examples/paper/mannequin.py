@@ -28,7 +28,16 @@ SETTLING, RAMP = wp.constant(0.3), wp.constant(0.5)  # s, rest before the dance,
 
 
 @wp.kernel(enable_backward=False)
-def dance(time: wp.array[float], rate: float, turn: float, sway: float, stride: float, body_q: wp.array[wp.transform]):
+def dance(
+    # in
+    time: wp.array[float],
+    rate: float,
+    turn: float,
+    sway: float,
+    stride: float,
+    # out
+    body_q: wp.array[wp.transform],
+):
     """Writes the poses of trunk and legs.
 
     Args:

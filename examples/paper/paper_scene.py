@@ -1,7 +1,7 @@
 """Base of the five scenes of the paper: options, a solver that moves bodies, checks, and parts to build scenes from.
 
 A scene is a class ``Example`` that derives from :class:`PaperScene`: ``build`` adds its parts, ``motion`` moves its
-bodies, ``measure`` and ``test_scene`` say what it should have become.
+bodies, ``measure`` and ``test_scene`` check its final state.
 """
 
 import math
@@ -26,23 +26,30 @@ __all__ = [
     "main",
 ]
 
-FEWEST_TRIANGLES = 1000
+MIN_TRIANGLES, MAX_TRIANGLES = 1000, 20_000_000
 RECORDED_FPS = 60
 """Frames per second of a recording; a scene that has more is shown in slow motion."""
 
 
 @wp.kernel(enable_backward=False)
-def advance(dt: float, time: wp.array[float]):
-    """Advances the clock; it is on the device because a CUDA graph repeats the same launches."""
+def advance(
+    # in
+    dt: float,
+    # in and out
+    time: wp.array[float],
+):
+    """Advances the clock, which is on the device because a CUDA graph repeats the same launches."""
     time[0] = time[0] + dt
 
 
 @wp.kernel(enable_backward=False)
 def carry(
+    # in
     carried: wp.array[int],
     rest: wp.array[wp.vec3],
     rest_body_q: wp.array[wp.transform],
     body_q: wp.array[wp.transform],
+    # out
     particle_q: wp.array[wp.vec3],
 ):
     """Moves the particles that are fastened to the first body with it."""
@@ -109,8 +116,8 @@ class PaperScene(ExampleBase):
     carried = ()
 
     def __init__(self, viewer, args):
-        if args.triangles < FEWEST_TRIANGLES:
-            raise ValueError(f"--triangles must be at least {FEWEST_TRIANGLES}, not {args.triangles}")
+        if not MIN_TRIANGLES <= args.triangles <= MAX_TRIANGLES:
+            raise ValueError(f"--triangles must be in [{MIN_TRIANGLES}, {MAX_TRIANGLES}], not {args.triangles}")
         self.frame_dt = 1.0 / self.fps
         self.sim_substeps = self.count_substeps(args.triangles)
         super().__init__(viewer, args)
@@ -148,15 +155,15 @@ class PaperScene(ExampleBase):
         return self.state_0.particle_q.numpy().astype(np.float64)
 
     def measure(self):
-        """Returns quantities that show what the scene has become, by name."""
+        """Returns measured quantities of the scene by name."""
         raise NotImplementedError
 
     def test_scene(self, measured):
-        """Checks that the scene has become what its name says, by its measured quantities."""
+        """Checks the measured quantities of the scene."""
         raise NotImplementedError
 
     def test_final(self):
-        """Checks that all steps are certified, nothing intersects, and the scene has become what its name says."""
+        """Checks that all steps are certified, nothing intersects, and the measured quantities are as expected."""
         super().test_final()
         assert np.isfinite(self.positions()).all(), "positions are not finite"
         intersections = self.find_intersections()
@@ -164,7 +171,7 @@ class PaperScene(ExampleBase):
         self.test_scene(self.measure())
 
     def print_report(self):
-        """Prints what the stage did, and what the scene has become."""
+        """Prints the report of the stage and the measured quantities of the scene."""
         print(f"{self.model.tri_count} triangles, {self.frame} frames of {self.sim_substeps} steps")
         super().print_report()
         for name, value in self.measure().items():
@@ -174,7 +181,7 @@ class PaperScene(ExampleBase):
     def create_parser(cls):
         """Returns the options."""
         parser = super().create_parser()
-        parser.add_argument("--triangles", type=int, default=cls.triangles, help="About how many triangles.")
+        parser.add_argument("--triangles", type=int, default=cls.triangles, help="Approximate number of triangles.")
         return parser
 
 

@@ -84,7 +84,7 @@ def main():
     """Records the scenes that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="which scenes (default: all)")
-    parser.add_argument("--triangles", type=int, help="about how many (default: that of each scene)")
+    parser.add_argument("--triangles", type=int, help="approximate number of triangles (default: that of each scene)")
     parser.add_argument("--folder", default=".", help="where to write (default: the current folder)")
     parser.add_argument("--device", help="Warp device, such as cuda:0 (default: Warp's)")
     arguments = parser.parse_args()

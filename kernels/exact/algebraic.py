@@ -15,9 +15,9 @@ sign of P at a root is that of K. Let g = a P - p3 z q, quadratic. Then
 
 because c1 K0 - c0 K1 = a J. The sign of q at the root -K0 / K1 of K, and the side of the turning point -c1 / 2a that
 it is on, tell where that root lies. Division of q(-K0 / K1) by the leading factor a leaves the degree in the
-coefficients that the resultant of P and g has, the least possible apart from a.
+coefficients that the resultant of P and g has, the smallest possible apart from a.
 
-If a = 0, 1 / z in place of z exchanges the two ends of all polynomials, and q has one positive root at most.
+If a = 0, substituting 1 / z for z exchanges the two ends of all polynomials, and q has one positive root at most.
 
 **Order of a point and the roots of a cubic** (or quadratic) f whose roots a1 <= a2 <= a3 are real: with the sign of f
 at infinity positive, f rises to a maximum, falls to a minimum and rises again, one root on each piece. The signs of f'

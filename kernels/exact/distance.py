@@ -8,11 +8,11 @@ a corner q, the next one r, e = r - q and the polygon's normal n, directions g t
 - of the side, if e != 0 and q.e <= 0 <= r.e: g = (e.e) q - (q.e) e;
 - of the plane, if n != 0 and n.(q x r) >= 0 for all sides: g = n or -n, with g.q >= 0.
 
-The foot is at most d away if (g.q)^2 <= d^2 g.g. At such a time the query is a HIT. If for some g all corners have
+The foot is at most d away if (g.q)^2 <= d^2 g.g. The query is then a HIT. If for some g all corners have
 g.x > 0 and (g.x)^2 > d^2 g.g at the start and at the end, they have g.x > d |g| at all times, and the query is FREE.
 This decides pairs that keep their distance, or move apart, or that a plane separates; and hits that last for a while,
-at a multiple of 2^-k. It leaves the others undecided: those that only come within the distance in between, or to no
-single side.
+at a multiple of 2^-k. The others stay UNSURE: pairs that come within the distance only between these times, or that no
+single direction separates.
 
 All axes are divided by the same power of two, and times m / 2^k make corners of B bits into integers of B + k bits,
 d included. In units of a power of two to that, |e| and |i| < 2 sqrt(3), thus for a side |g| <= |q| |e|^2 < 20.8 and
@@ -49,9 +49,9 @@ BITS = {2: 126, 4: 254}
 """Largest B + k for each number of limbs of a coordinate."""
 
 TOO_WIDE = wp.constant(-1)
-"""In place of a status: the exponents of the query are too far apart for the width of the integers."""
+"""Stands for a status where the exponents of the query are too far apart for the width of the integers."""
 
-_BETWEEN = wp.constant(2)  # place of the corners at a time between the start, 0, and the end, 1
+_BETWEEN = wp.constant(2)  # index of the corners at a time between the start, 0, and the end, 1
 
 
 @wp.func
@@ -162,11 +162,11 @@ def _decide_at(polygon: wp.array[Any], corners: int, end: int, squared: Any, squ
                 return HIT
             needed = product(square, squared)
             apart = bool(True)
-            place = int(0)
-            while apart and place < 2 * corners:
-                at_end = wp.where(place < corners, 0, 1)
-                apart = _is_beyond(polygon, place - at_end * corners, at_end, g0, g1, g2, needed)
-                place += 1
+            i = int(0)
+            while apart and i < 2 * corners:
+                at_end = wp.where(i < corners, 0, 1)
+                apart = _is_beyond(polygon, i - at_end * corners, at_end, g0, g1, g2, needed)
+                i += 1
             if apart:
                 return FREE
         line += 1

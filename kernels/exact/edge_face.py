@@ -35,7 +35,7 @@ BITS = {2: 83, 8: 339}
 TOUCHES = wp.constant(3)
 """Status of an edge that meets a face, but does not pass through it."""
 
-# places of the points: p and q of the edge, the corners of the face, and the third corners of its neighbours
+# indices of the points: p and q of the edge, the corners of the face, and the third corners of its neighbours
 _P = wp.constant(0)
 _Q = wp.constant(1)
 _CORNER = wp.constant(2)

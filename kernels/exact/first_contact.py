@@ -48,7 +48,7 @@ NONE = wp.constant(wp.float64(2.0))
 """Time of impact where there is no contact."""
 
 TOO_WIDE = wp.constant(wp.float64(-1.0))
-"""In place of a time of impact: the exponents of the query are too far apart for the width of the integers."""
+"""Stands for a time of impact where the exponents of the query are too far apart for the width of the integers."""
 
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -234,7 +234,7 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
     Args:
         kind: VERTEX_FACE or EDGE_EDGE.
         polygon: The polygon of the query, of at most BITS.
-        timed: Whether the time matters; if not, any time of at most 1 stands for contact.
+        timed: Whether the time is needed; if not, any time of at most 1 stands for contact.
         digits: Binary digits of the time, at most 38.
     """
     corners = wp.where(kind == VERTEX_FACE, 3, 4)
@@ -263,7 +263,7 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
     while axis < 3 and wp.max(is_open) > 0:
         low = wp.vec3i(0, 0, 0)
         high = wp.vec3i(0, 0, 0)
-        # components without roots first: they cost little, and opposite signs decide the query
+        # components without roots first: they take little time, and opposite signs decide the query
         step = int(0)
         while step < 2 * corners:
             if wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
@@ -310,7 +310,7 @@ for _limbs in BITS:
 def decide_in(limbs: int) -> wp.Function:
     """Returns a device function that decides queries in integers of ``limbs`` limbs per coordinate, a key of BITS."""
     number = integer(limbs)
-    most = BITS[limbs]
+    largest = BITS[limbs]
 
     @wp.func
     def decide(
@@ -341,11 +341,11 @@ def decide_in(limbs: int) -> wp.Function:
             b1: Second point at the end.
             c1: Third point at the end.
             d1: Fourth point at the end.
-            timed: Whether the time matters, see :func:`first_contact_exactly`.
+            timed: Whether the time is needed, see :func:`first_contact_exactly`.
             digits: Binary digits of the time, at most 38.
         """
         exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
-        if bits > most:
+        if bits > largest:
             return TOO_WIDE
         polygon = wp.zeros(shape=(24,), dtype=number)
         make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)

@@ -107,7 +107,7 @@ def lowest_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 @wp.func
 def top_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
-    """Returns exponents e such that the difference of two points is below 2^e, for each axis."""
+    """Returns an exponent e for each axis, so that the difference of two points is below 2^e."""
     return wp.vec3i(
         top_bit_of_difference(x[0], y[0]), top_bit_of_difference(x[1], y[1]), top_bit_of_difference(x[2], y[2])
     )
@@ -115,7 +115,7 @@ def top_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 @wp.func
 def widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
-    """Returns exponents e such that the corners of the polygon at one time are below 2^e, for each axis."""
+    """Returns an exponent e for each axis, so that the corners of the polygon at one time are below 2^e."""
     if kind == VERTEX_FACE:
         return wp.max(top_bits(a, b), wp.max(top_bits(a, c), top_bits(a, d)))
     return wp.max(wp.max(top_bits(c, a), top_bits(c, b)), wp.max(top_bits(d, a), top_bits(d, b)))

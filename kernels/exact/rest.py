@@ -1,11 +1,14 @@
 """Exact decision whether the features of a query meet at rest, for points in single precision.
 
-Orientations of such points are sums of exact products in double precision: for three points in a plane, of two
+Orientations of these points are sums of exact products in double precision: for three points in a plane, of two
 coordinates, 48 bits each; for four points in space, of three coordinates, each split into two products of at most 48
 bits. None leaves the range of double precision: they are 0 or between 2^-447 and 2^384. The sum is kept as an
-expansion, doubles that do not overlap, the largest of which has its sign (J. R. Shewchuk, *Adaptive Precision
-Floating-Point Arithmetic and Fast Robust Geometric Predicates*, 1997, doi:10.1007/PL00009321, GROW-EXPANSION). Since
+expansion, doubles that do not overlap; the sign of the largest is that of the sum (Shewchuk's GROW-EXPANSION). Since
 all products are exact, it does not matter whether a compiler fuses multiplications with additions.
+
+References:
+    Jonathan Richard Shewchuk. "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates."
+    Discrete & Computational Geometry 18 (1997). https://doi.org/10.1007/PL00009321.
 """
 
 import warp as wp

@@ -307,7 +307,7 @@ def lowest_bit(x: wp.float64) -> int:
     int field = (int)((d.bits >> 52) & 2047);
     if (field > 53)
         return field == 2047 ? 8192 : field - 1022;
-    // so small that it may have lost what is subnormal, where that is flushed to zero
+    // so small that a subnormal part may have been flushed to zero
     const int x_field = (int)((a.bits >> 52) & 2047), y_field = (int)((b.bits >> 52) & 2047);
     field = x_field > y_field ? x_field : y_field;
     return field - 1021;
@@ -317,7 +317,7 @@ def top_bit_of_difference(x: wp.float64, y: wp.float64) -> int:
     """Returns an e with |x - y| < 2^e for finite numbers, the smallest unless it is tiny; 8192 if they are too large.
 
     It is -4096 if the numbers are the same. Rounding takes a difference below 2^e at most to 2^e itself, which counts
-    as below 2^(e + 1). Where subnormal numbers are flushed, a difference of 2^-969 or more may lose one of its numbers,
+    as below 2^(e + 1). Where subnormal numbers are flushed, one number of a difference of 2^-969 or more may become 0,
     which is less than the lowest bit of the other.
     """
     ...

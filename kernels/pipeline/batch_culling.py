@@ -1,19 +1,19 @@
-"""The culls of many pairs at once, by the vector instructions of a CPU.
+"""The culls of many pairs at once, by SIMD instructions of a CPU.
 
-The box test compares one pair at a time, all coordinates of both ends in one vector. The pairs that it leaves pass the
-other culls in packets of eight: these culls are additions, multiplications and comparisons, the same for every pair.
+The box test compares one pair at a time, all coordinates of both ends in one vector. The other culls test the remaining
+pairs in SIMD packets of eight: they consist of the same additions, multiplications and comparisons for every pair.
 The operations are those of :mod:`warp_bsc.kernels.culling` and :mod:`warp_bsc.kernels.polynomials`, in the same order,
 and the bounds on their errors are the same.
 
 Pairs are not scaled: scaling by powers of two affects overflow and underflow alone. Overflow does not occur, because
-pairs with vectors of 1e70 or more are culled by boxes only. Underflow loses 2^-1074 in each of at most four products of
-a component of the normal, or 2^-1022 where subnormal numbers are flushed, before the product with w. The loss is below
-the UNDERFLOW that bounds add, times the roundoff, 1e-156.
+pairs with vectors of 1e70 or more are culled by boxes only. Underflow changes each of at most four products of a
+component of the normal by 2^-1074, or 2^-1022 where subnormal numbers are flushed, before the product with w. The error
+is below the UNDERFLOW that bounds add, times the roundoff, 1e-156.
 
-A processor that flushes subnormal numbers loses less than delta, the smallest normal number, from each coordinate that
-it reads, and 2 delta from u, v and w. A product of three vectors below m then loses less than 6 delta m^2, and a
-coefficient of Y is a mean of sums of six products. A comparison along a direction has three products for each of its
-components, and loses less than 6 delta times the sum of their sizes. The bounds therefore add 40 delta.
+Flushing subnormal numbers changes each coordinate by less than delta, the smallest normal number, and u, v and w by
+2 delta. A product of three vectors below m then changes by less than 6 delta m^2, and a coefficient of Y is a mean of
+sums of six products. A comparison along a direction has three products for each of its components, and changes by less
+than 6 delta times the sum of their sizes. The bounds therefore add 40 delta.
 
 With a roundoff of zero (method "float") all bounds are zero.
 """
@@ -167,15 +167,15 @@ _SNIPPET = """
         // with a roundoff of zero all bounds are zero
         Vectors size = {{0.0, 0.0, 0.0}};
         Doubles bound = 0.0;
-        double lost = 0.0;
+        double flushed = 0.0;
         int trusted = 255;
         if (roundoff > 0.0) {{
             const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
             const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
             size = plus(plus(u, v), w);
-            lost = {lost};
+            flushed = {flushed};
             const Doubles extent = most(most(size.x, size.y), size.z);
-            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow}) + lost * extent * extent;
+            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow}) + flushed * extent * extent;
             trusted = bits(extent < {largest});
         }}
         auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
@@ -200,7 +200,7 @@ _SNIPPET = """
         }}
         const Vectors along = sizes(direction, direction);
         const Doubles slack
-            = roundoff * ({direction_error} * dot(along, size) + {underflow}) + lost * (along.x + along.y + along.z);
+            = roundoff * ({direction_error} * dot(along, size) + {underflow}) + flushed * (along.x + along.y + along.z);
         culled = (lowest > slack) | (highest < -slack);
         unsure &= ~(bits(culled) & trusted);
         for (int lane = 0; lane < filled; ++lane)
@@ -219,9 +219,9 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
 
     Returns:
-        Device function for the CPU. It takes the positions at both ends, the vertices of the elements, a queue of
-        pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
-        returns a bit for each pair, set where no cull decides the pair. It checks no index.
+        Device function for the CPU. Its arguments are the positions at both ends, the vertices of the elements, a queue
+        of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
+        returns a bit for each pair, set where no cull decides the pair. Indices are not checked.
     """
     single = dtype is wp.vec3
     snippet = _SNIPPET.format(
@@ -230,18 +230,21 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         direction_error=float(DIRECTION_ERROR),
         underflow=repr(float(UNDERFLOW)),
         largest=repr(_LARGEST),
-        lost=repr(40.0 * 2.0 ** (-126 if single else -1022)),
+        flushed=repr(40.0 * 2.0 ** (-126 if single else -1022)),
         batch=int(BATCH),
     )
 
     @wp.func_native(f"    constexpr bool vertex_face = {'true' if vertex_face else 'false'};\n{snippet}")
     def cull_batch(
+        # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         elements: wp.array2d[int],
+        # batch
         pairs: wp.array[wp.vec2i],
         first: int,
         count: int,
+        # rounding
         roundoff: wp.float64,
     ) -> wp.uint64: ...
 

@@ -1,4 +1,4 @@
-"""Axis-aligned boxes of moving elements, in single precision, none of which misses what the positions do."""
+"""Axis-aligned boxes of moving elements, in single precision, without missing an overlap of the exact boxes."""
 
 from typing import Any
 
@@ -12,9 +12,9 @@ _LARGEST_FLOAT = wp.constant(wp.float64(3.4028234663852886e38))
 
 @wp.func
 def rounded(x: Any) -> wp.vec3:
-    """A corner in single precision: to nearest, because rounding and clamping keep the order of coordinates.
+    """Returns a corner in single precision, to nearest, because rounding and clamping keep the order of coordinates.
 
-    Boxes that overlap still do, and what lies apart still does or touches.
+    Boxes that overlap still do; boxes that are apart still are, or touch.
     """
     largest = _LARGEST_FLOAT
     return wp.vec3(
@@ -26,7 +26,7 @@ def rounded(x: Any) -> wp.vec3:
 
 @wp.func
 def lowered(x: Any, padding: wp.float64) -> wp.vec3:
-    """A corner moved down by a padding, in single precision, rounded as by :func:`rounded`.
+    """Returns a corner moved down by a padding, in single precision, rounded as by :func:`rounded`.
 
     Both roundings keep order: boxes of elements overlap that are at most the sum of their paddings apart.
     """
@@ -36,14 +36,14 @@ def lowered(x: Any, padding: wp.float64) -> wp.vec3:
 
 @wp.func
 def raised(x: Any, padding: wp.float64) -> wp.vec3:
-    """A corner moved up by a padding, see :func:`lowered`."""
+    """Returns a corner moved up by a padding, see :func:`lowered`."""
     pad = wp.vec3d(padding, padding, padding)
     return rounded(wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2])) + pad)
 
 
 @wp.func
 def boxes_overlap(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3) -> bool:
-    """Whether two closed boxes overlap."""
+    """Returns whether two closed boxes overlap."""
     return (
         low[0] <= other_high[0]
         and low[1] <= other_high[1]
@@ -58,9 +58,9 @@ def boxes_overlap(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: w
 def boxes_apart(
     low0: Any, high0: Any, low1: Any, high1: Any, other_low0: Any, other_high0: Any, other_low1: Any, other_high1: Any
 ) -> bool:
-    """Whether an axis separates two boxes at the start (0) and at the end (1), on the same side: then it always does.
+    """Returns whether an axis separates two boxes at the start (0) and the end (1), on one side: then it always does.
 
-    Exact at any scale: of a difference only the sign matters. Branches would be mispredicted.
+    Exact at any scale, as only the signs of differences matter. Branches would be mispredicted.
     """
     below = wp.min(other_low0 - high0, other_low1 - high1)
     above = wp.min(low0 - other_high0, low1 - other_high1)

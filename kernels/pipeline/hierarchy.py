@@ -25,7 +25,7 @@ _WIDTH = wp.constant(WIDTH)
 """
 )
 def first_child() -> int:
-    """Returns the first child that a thread tests: the CPU's tests all, a GPU's only its own."""
+    """Returns the first child that a thread tests: 0 on the CPU, where it tests all, else the number of the thread."""
     ...
 
 
@@ -67,8 +67,8 @@ def union_of_warp(found: wp.uint32) -> wp.uint32:
     return x;
 """
 )
-def _least_of_warp(x: wp.vec3) -> wp.vec3:
-    """Returns the least coordinates of the threads of a warp; those of the thread on the CPU."""
+def _min_of_warp(x: wp.vec3) -> wp.vec3:
+    """Returns the smallest coordinates of the threads of a warp; those of the thread on the CPU."""
     ...
 
 
@@ -95,8 +95,8 @@ def _any_of_warp(flag: int) -> int:
 #endif
 """
 )
-def lowest_place(bits: wp.uint32) -> int:
-    """Returns the place of the lowest bit that is set; there must be one."""
+def lowest_set_bit(bits: wp.uint32) -> int:
+    """Returns the number of the lowest bit that is set; there must be one."""
     ...
 
 
@@ -109,7 +109,7 @@ def lowest_place(bits: wp.uint32) -> int:
 #endif
 """
 )
-def count_places(bits: wp.uint32) -> int:
+def count_set_bits(bits: wp.uint32) -> int:
     """Returns the number of bits that are set."""
     ...
 
@@ -121,9 +121,9 @@ class HierarchyLevel:
     Attributes:
         lowers: Lowest coordinates over the time of the motion; higher than ``uppers`` where there is no face.
         uppers: Highest coordinates over the time of the motion.
-        changed: Nonzero where pairs are wanted.
-        first_world: Least world of the faces below; no array if all faces are in one world.
-        last_world: Greatest world of the faces below.
+        changed: Nonzero where a face has pairs that are sought.
+        first_world: Lowest world of the faces below; no array if all faces are in one world.
+        last_world: Highest world of the faces below.
     """
 
     lowers: wp.array[wp.vec3]
@@ -136,17 +136,17 @@ class HierarchyLevel:
 @wp.func
 def fit_parent(child: int, low: wp.vec3, high: wp.vec3, changed: int, parents: HierarchyLevel):
     """Writes the box of the parent of a child, from the boxes of all 32 children, one a thread."""
-    least = _least_of_warp(low)
-    greatest = -_least_of_warp(-high)
+    lower = _min_of_warp(low)
+    upper = -_min_of_warp(-high)
     any_changed = _any_of_warp(changed)
     parent = child / _WIDTH
     if child % _WIDTH == 0:
-        parents.lowers[parent] = least
-        parents.uppers[parent] = greatest
+        parents.lowers[parent] = lower
+        parents.uppers[parent] = upper
         parents.changed[parent] = any_changed
     elif child_step() == 1:
-        parents.lowers[parent] = wp.min(parents.lowers[parent], least)
-        parents.uppers[parent] = wp.max(parents.uppers[parent], greatest)
+        parents.lowers[parent] = wp.min(parents.lowers[parent], lower)
+        parents.uppers[parent] = wp.max(parents.uppers[parent], upper)
         parents.changed[parent] = parents.changed[parent] | any_changed
 
 
@@ -189,9 +189,9 @@ def changed_children(level: HierarchyLevel, first: int):
 
 
 @wp.func
-def from_place(place: int):
-    """Returns the bits from a place on, in [0, 31]."""
-    return ~((wp.uint32(1) << wp.uint32(place)) - wp.uint32(1))
+def bits_from(first: int):
+    """Returns the bits from one on, in [0, 31]."""
+    return ~((wp.uint32(1) << wp.uint32(first)) - wp.uint32(1))
 
 
 @wp.func
@@ -207,19 +207,19 @@ def overlapping_faces(faces: HierarchyLevel, place: int, first: int, candidates:
     """
     low = faces.lowers[place]
     high = faces.uppers[place]
-    wanted = candidates
+    sought = candidates
     if faces.changed[place] == 0:
-        wanted = wanted & changed
+        sought = sought & changed
     if first <= place:
         own = wp.uint32(1) << wp.uint32(place - first)
-        wanted = wanted & ~(own | (own - wp.uint32(1)))
+        sought = sought & ~(own | (own - wp.uint32(1)))
     found = wp.uint32(0)
     left = candidates
     while left != wp.uint32(0):
         bit = left & (~left + wp.uint32(1))
         left = left ^ bit
-        other = first + lowest_place(bit)
+        other = first + lowest_set_bit(bit)
         if boxes_overlap(low, high, faces.lowers[other], faces.uppers[other]):
-            if (wanted & bit) != wp.uint32(0) and same_world(faces, place, faces, other):
+            if (sought & bit) != wp.uint32(0) and same_world(faces, place, faces, other):
                 found = found | bit
     return found

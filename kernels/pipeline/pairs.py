@@ -1,7 +1,12 @@
-"""From pairs of faces to pairs of elements: representative triangles (Curtis et al. 2008); and on to vertices.
+"""From pairs of faces to pairs of elements by representative triangles, and to vertices.
 
 Every vertex and every edge belongs to one face that has it, its representative. Two elements with overlapping boxes
 have representatives with overlapping boxes, so that one traversal over faces finds all pairs, each of them once.
+
+References:
+    Sean Curtis, Rasmus Tamstorf, and Dinesh Manocha. "Fast Collision Detection for Deformable Models Using
+    Representative-Triangles." Symposium on Interactive 3D Graphics and Games (2008).
+    https://doi.org/10.1145/1342250.1342260.
 """
 
 import warp as wp
@@ -11,19 +16,19 @@ from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 @wp.func
 def owns_vertex(owned: int, corner: int) -> bool:
-    """Whether a face is the representative of the vertex at a corner."""
+    """Returns whether a face is the representative of the vertex at a corner."""
     return (owned >> corner) & 1 == 1
 
 
 @wp.func
 def owns_edge(owned: int, side: int) -> bool:
-    """Whether a face is the representative of the edge from corner ``side`` to the next."""
+    """Returns whether a face is the representative of the edge from corner ``side`` to the next."""
     return (owned >> (3 + side)) & 1 == 1
 
 
 @wp.func
 def vertices_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.vec4i:
-    """The vertices of (vertex, face) or (edge, edge), in the order of a query's points; elements: faces or edges."""
+    """Returns the vertices of (vertex, face) or (edge, edge) in the order of a query's points, from faces or edges."""
     first = pair[0]
     second = pair[1]
     if kind == VERTEX_FACE:
@@ -33,7 +38,7 @@ def vertices_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp
 
 @wp.func
 def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.vec4i:
-    """The vertices of a pair of any kind, as queries with a minimum distance take them: p a b a, or p q q q.
+    """Returns the vertices of a pair of any kind, in the order of queries with a minimum distance: p a b a, or p q q q.
 
     Elements are faces, or edges for (edge, edge) and (vertex, edge); (vertex, vertex) has none.
     """
@@ -46,7 +51,7 @@ def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.v
 
 @wp.func
 def firsts_of(kind: int) -> int:
-    """Returns how many of the four places of a pair the first element has."""
+    """Returns how many of the four vertices of a pair belong to the first element."""
     return wp.where(kind == EDGE_EDGE, 2, 1)
 
 

@@ -1,6 +1,6 @@
 """Queues between the stages of a pipeline: an array of entries, and a count on the device that any thread may raise.
 
-A count goes on where a queue is full, so that it shows how many entries did not fit: nothing is dropped silently.
+Counts go on where a queue is full, so that they tell how many entries did not fit: nothing is dropped silently.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ import warp as wp
 """
 )
 def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
-    """Raises the count of a queue by one, and returns what it was."""
+    """Raises the count of a queue by one, and returns its old value: the index of the new entry."""
     ...
 
 
@@ -45,8 +45,8 @@ def take_slot(counts: wp.array[wp.int64], queue: int) -> wp.int64:
 #endif
 """
 )
-def take_place(count: wp.array[int]) -> int:
-    """Raises a count that a conditional of a CUDA graph may read by one, and returns what it was."""
+def take_slot_int(count: wp.array[int]) -> int:
+    """Raises a count of 32 bits, which a conditional of a CUDA graph can read, by one, and returns its old value."""
     ...
 
 
@@ -76,14 +76,14 @@ def take_place(count: wp.array[int]) -> int:
 """
 )
 def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
-    """Raises the count of a queue by an amount below 64, and returns what it was: the first of the slots taken."""
+    """Raises the count of a queue by an amount below 64, and returns its old value: the index of the first entry."""
     ...
 
 
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    // one atomic for all threads of a warp that are here, whose result nothing waits for
+    // one atomic for all threads of a warp that are here; its result is not used
     const unsigned mask = __activemask();
     int total = 0;
     for (int bit = 0; bit < 6; ++bit)
@@ -116,5 +116,5 @@ def append(pair: wp.vec2i, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64]
 
 @wp.func
 def is_filled(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int) -> bool:
-    """Whether entry i of a queue has been written."""
+    """Returns whether entry i of a queue has been written."""
     return i < queue.shape[0] and wp.int64(i) < counts[count]

@@ -1,4 +1,4 @@
-"""A wide BVH of a CPU: packets of eight boxes, compared with SIMD instructions.
+"""A wide BVH for the CPU: packets of eight boxes, compared with SIMD instructions.
 
 Elements sorted along a space-filling curve are cut into packets of eight. Eight packets have a node, eight nodes have
 one of the next level, up to one root: a tree whose links are arithmetic. The same coordinate of all eight lies side by
@@ -10,7 +10,7 @@ side, so that one box is compared with eight at once.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
 - ``node_worlds``, int32, 16 a node: the first and the last world of the children.
 
-Where there are fewer than eight, the boxes of the others are empty, which overlap nothing.
+Missing elements and children have empty boxes, which overlap none.
 """
 
 import functools
@@ -167,22 +167,28 @@ import warp as wp
 )
 def pair_packet(
     packet: int,
+    # tree of the packet
     boxes: wp.array[wp.float32],
     elements: wp.array[wp.int32],
     corners: int,
+    # tree that is traversed
     other_boxes: wp.array[wp.float32],
     other_elements: wp.array[wp.int32],
     other_corners: int,
     other_nodes: wp.array[wp.float32],
     other_node_worlds: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
+    # options
     symmetric: int,
     ordered: int,
     keep_separated: int,
     at_end: int,
+    # in and out
     counts: wp.array[wp.int64],
+    # indices of counts
     candidate_count: int,
     queued_count: int,
+    # out
     pairs: wp.array[wp.vec2i],
 ):
     """Enqueues the pairs of a packet's elements with those of a tree that share no corner and that no axis separates.
@@ -278,11 +284,11 @@ def fit_packet_of(dtype: type) -> wp.Function:
         dtype: Type of a position, vec3 or vec3d.
 
     Returns:
-        Device function for the CPU. It takes the packet, the number of its elements, the positions at both ends, the
-        number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach beyond
-        each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which elements
-        have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an element with
-        a position that is not finite is empty. No index is checked.
+        Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
+        ends, the number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach
+        beyond each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which
+        elements have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an
+        element with a position that is not finite is empty. Indices are not checked.
     """
     snippet = _FIT_SNIPPET.format(scalar="float" if dtype is wp.vec3 else "double")
 
@@ -290,12 +296,15 @@ def fit_packet_of(dtype: type) -> wp.Function:
     def fit_packet(
         packet: int,
         count: int,
+        # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         corners: int,
         changed: wp.array[int],
         padding: wp.array[wp.float64],
+        # in and out
         elements: wp.array[int],
+        # out
         boxes: wp.array[wp.float32],
         nodes: wp.array[wp.float32],
     ): ...

@@ -87,7 +87,7 @@ def test_tables_files_and_figure(capsys, monkeypatch, tmp_path):
     times, figure = tmp_path / "times.json", tmp_path / "times.png"
     lines = bench(capsys, "cloth:1000", "crash:1000", "--json", times, "--figure", figure).splitlines()
     assert max(map(len, lines)) <= 100
-    for start in ("Scene ", "ns a query, CPU, 1 core", "Slowest query, ns", "Wrong answers", "ms a frame"):
+    for start in ("Scene ", "ns a query, CPU, 1 core", "Slowest query, ns", "Wrong results", "ms a frame"):
         assert any(line.startswith(start) for line in lines), start
     assert [scene["name"] for scene in json.loads(times.read_text())["scenes"]] == ["cloth:1000", "crash:1000"]
     assert figure.read_bytes().startswith(b"\x89PNG")

@@ -66,7 +66,7 @@ def test_other_answers_are_noticed(monkeypatch, device, mode, kernels):
     right, wrong = (list(bench_queries._kernels(kind)) for kind in PairKind)
     right[kernels] = wrong[kernels]
     monkeypatch.setattr(bench_queries, "_kernels", lambda kind: right)
-    with pytest.raises(RuntimeError, match=f"answered differently by mode {mode}"):
+    with pytest.raises(RuntimeError, match=f"decided differently by mode {mode}"):
         benchmark_queries(PairKind.VERTEX_FACE, count=1000, device=device, repeat=1)
 
 

@@ -10,7 +10,7 @@ import newton.utils
 import pytest
 import warp as wp
 
-from warp_bsc.bench import newton_examples
+from warp_bsc.bench import newton_examples, newton_process
 from warp_bsc.bench.newton_examples import WARM_UP, NewtonExample, describe_needs, find_examples, measure_example
 
 # A triangle stands above a pinned sheet and moves down by 1 cm a frame, its tip from 5.5 cm: after the sixth frame two
@@ -105,14 +105,14 @@ def in_this_process(monkeypatch, tmp_path):
         (newton.examples, "download_external_git_folder"),
         (newton.utils, "download_asset"),
         (sys, "argv"),
-        *((newton.solvers, name) for name in newton_examples._SOLVERS),
+        *((newton.solvers, name) for name in newton_process.SOLVERS),
     ):
         monkeypatch.setattr(module, name, getattr(module, name))
 
     def replies(request, errors):
         given = []
         with wp.ScopedDevice(request["device"]):
-            newton_examples._serve(request, given.append)
+            newton_process.serve(request, given.append)
         yield from given
 
     monkeypatch.setattr(newton_examples, "_replies", replies)
@@ -153,7 +153,11 @@ def test_finds_examples_by_name_with_their_options():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"mode": "both"}, "both"), ({"frames": WARM_UP}, "frames must be more than"), ({"check_every": 0}, "every 0")],
+    [
+        ({"mode": "both"}, "both"),
+        ({"frames": WARM_UP}, "frames must be more than"),
+        ({"check_every": 0}, "check_every must be at least 1, not 0"),
+    ],
 )
 def test_wrong_options(options, message):
     example = NewtonExample("gone", "gone")

@@ -109,7 +109,7 @@ def test_replay_table_fits_a_terminal(capsys, monkeypatch, falling_scene):
         "Collisions in 1 of 4 intervals: 3 vertex-face and 0 edge-edge pairs.",
         "3 of /World/Floor with /World/Falling",
         "The first at time 3.25: /World/Falling, vertex 1, with /World/Floor, face 0.",
-        "Certified for vertices that move straight between the times checked: every answer.",
+        "Certified for vertices that move straight between the times checked: every pair tested.",
     ):
         assert part in output
 
@@ -327,7 +327,7 @@ def test_scene_that_is_not_usd(capsys, tmp_path):
 def test_conservative_says_what_it_could_not_certify(capsys, falling_scene):
     output = run(capsys, "replay", falling_scene, "--method", "conservative")
     assert "no collision is missing. Pairs tested that floating point could not certify: " in output
-    assert "every answer" not in output
+    assert "every pair tested" not in output
     assert "collisions may be missing" in run(capsys, "replay", falling_scene, "--method", "float")
 
 

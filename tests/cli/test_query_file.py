@@ -94,7 +94,8 @@ def test_kind_by_path(tmp_path, name, kind):
 def test_kind_given(tmp_path):
     path = write(tmp_path, *[ROW] * 8, name="data.csv")
     assert read_query_file(path, kind="edge-edge").kind == "edge-edge"
-    assert "--kind" in error_of(path)
+    with pytest.raises(ValueError, match=f"^kind: {path} defines neither"):
+        read_query_file(path)
 
 
 @pytest.mark.parametrize(
@@ -121,8 +122,8 @@ def test_kind_given(tmp_path):
         ([ROW] * 7 + [f"{2**53 + 1},1,3,4,1,2"], ":8: x is not exactly a double"),
         ([ROW] * 7 + [f"1,{2**1080},3,4,1,2"], ":8: x is not exactly a double"),
         ([ROW] * 7 + [f"{2**1080},1,3,4,1,2"], ":8: x is larger than any double: 129"),
-        ([ROW + ",1"] * 12 + [ROW + ",0"] * 4, ":13: the true answer must be 0 or 1, and the same"),
-        ([ROW + ",2"] * 8, ":1: the true answer must be 0 or 1"),
+        ([ROW + ",1"] * 12 + [ROW + ",0"] * 4, ":13: the true result must be 0 or 1, and the same"),
+        ([ROW + ",2"] * 8, ":1: the true result must be 0 or 1"),
     ],
 )
 def test_broken_file(tmp_path, lines, message):
@@ -140,7 +141,7 @@ def test_file_that_is_not_text(tmp_path):
 @pytest.mark.parametrize(
     ("truth", "message"),
     [
-        ("[true]", "1 true answers for the 2 queries"),
+        ("[true]", "1 true results for the 2 queries"),
         ("[0, 1]", "not a list of true and false"),
         (f"[{'9' * 5000}, true]", "not a list of true and false"),
         ("[tru", "not JSON"),
@@ -162,7 +163,7 @@ def test_true_answers_in_both_places(tmp_path):
     truth_path.write_text("[true, false]")
     assert read_query_file(path).truth.tolist() == [True, False]
     truth_path.write_text("[true, true]")
-    assert error_of(path) == f":9: the true answer is 0, but 1 in {truth_path}"
+    assert error_of(path) == f":9: the true result is 0, but 1 in {truth_path}"
 
 
 def test_find_files_of_folder(tmp_path):

@@ -8,10 +8,12 @@ from hypothesis import strategies as st
 from sheets import crumpled, grid
 
 import warp_bsc as bsc
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy, traversal_kernel
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd, hilbert_transpose
+from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.face_hierarchy import traversal_kernel
 from warp_bsc.detection.settings import Count
-from warp_bsc.kernels.pipeline.hierarchy import count_places
+from warp_bsc.detection.wide_tree import hilbert_transpose
+from warp_bsc.kernels.pipeline.hierarchy import count_set_bits
 
 
 def find_pairs(broad_phase, mesh, x0, x1):
@@ -182,7 +184,7 @@ class _Visits:
 
 @wp.func
 def _count_visit(place: int, first: int, found: wp.uint32, visits: _Visits):
-    wp.atomic_add(visits.faces, place, count_places(found))
+    wp.atomic_add(visits.faces, place, count_set_bits(found))
 
 
 def test_a_traversal_with_another_visit():

@@ -206,7 +206,7 @@ def test_bad_meshes_are_refused():
         ([[0, 1, 2**32]], r"faces\[0\]"),
         (np.zeros((0, 4), int), r"shape \(n, 3\)"),
         (np.zeros((3, 0), int), r"shape \(n, 3\)"),
-        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 faces"),
+        (np.broadcast_to(0, (2**28, 3)), r"less than 2\^28 rows"),
     ]:
         with pytest.raises(ValueError, match=message):
             bsc.CollisionMesh(faces, 4)
@@ -497,7 +497,7 @@ def captured():
     start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
     detector.detect(start, end)
     with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.detect(start, end)
+        c = detector.capture(start, end)
     return detector, c, start, end, lambda: wp.capture_launch(capture.graph)
 
 
@@ -530,7 +530,7 @@ def test_a_graph_says_that_a_queue_was_too_small(captured):
     detector, _, start, end, _ = captured
     detector._pipeline.edge_edge._allocate_contacts(1)
     with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.detect(start, end)
+        c = detector.capture(start, end)
     wp.capture_launch(capture.graph)
     assert c.read().overflowed and not c.read().certified
     (overflow,) = c.read().overflows
@@ -540,7 +540,7 @@ def test_a_graph_says_that_a_queue_was_too_small(captured):
     with pytest.raises(RuntimeError, match="capture again"):
         c.read()
     with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.detect(start, end)
+        c = detector.capture(start, end)
     wp.capture_launch(capture.graph)
     assert c.read().certified and not c.read().overflowed
 
@@ -561,7 +561,7 @@ def test_capturing_first_is_refused():
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
     start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
     with pytest.raises(RuntimeError, match="detect once"), wp.ScopedCapture(device="cuda:0"):
-        detector.detect(start, end)
+        detector.capture(start, end)
 
 
 @pytest.mark.gpu

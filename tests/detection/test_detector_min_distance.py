@@ -229,7 +229,7 @@ def test_detection_in_a_graph(device):
     x0, x1 = wp.array(start, dtype=wp.vec3), wp.array(start, dtype=wp.vec3)
     detector.detect(x0, wp.array(end, dtype=wp.vec3))
     with wp.ScopedCapture(device) as capture:
-        captured = detector.detect(x0, x1)
+        captured = detector.capture(x0, x1)
     x1.assign(end)
     wp.capture_launch(capture.graph)
     replayed, expected = captured.read(), detector.detect(start, end)

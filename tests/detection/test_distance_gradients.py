@@ -80,7 +80,7 @@ def test_gradients_in_a_graph_are_those_without(device):
         tape = wp.Tape()
         if captures:
             with wp.ScopedCapture(device) as capture, tape:
-                collisions = detector.detect(*positions)
+                collisions = detector.capture(*positions)
             wp.capture_launch(capture.graph)
         else:
             with tape:

@@ -5,7 +5,8 @@ from math import comb
 import numpy as np
 import warp as wp
 
-from warp_bsc import checker
+from warp_bsc.checker.polynomials import differentiate, trim
+from warp_bsc.checker.roots import doubles_around, inner_part, isolated_roots, sign_at_root
 from warp_bsc.kernels.exact import algebraic
 from warp_bsc.kernels.exact.wide_integers import integer
 
@@ -66,7 +67,7 @@ def in_time(coefficients):
     for i, c in enumerate(coefficients):
         for j in range(n - i + 1):
             power_form[i + j] += int(c) * comb(n - i, j) * (-1) ** j
-    return checker._trimmed(power_form)
+    return trim(power_form)
 
 
 def inner_roots(coefficients):
@@ -74,15 +75,15 @@ def inner_roots(coefficients):
     f = in_time(coefficients)
     if not f:
         return f, []
-    f = checker._inner_part(f)
-    return f, list(checker._isolated_roots(f))
+    f = inner_part(f)
+    return f, list(isolated_roots(f))
 
 
 def multiplicity(f, interval):
     """Of the root of f in an interval."""
     derivative, times = f, 0
-    while checker._sign_at_root(derivative, f, *interval) == 0:
-        derivative = checker._trimmed(checker._derivative(derivative))
+    while sign_at_root(derivative, f, *interval) == 0:
+        derivative = trim(differentiate(derivative))
         times += 1
     return times
 
@@ -127,13 +128,13 @@ def test_roots_are_counted_and_signs_are_those_at_the_roots():
         assert cubic_roots[i] == len(f_intervals), (f[i], q[i])
         assert quadratic_roots[i] == len(q_intervals), (f[i], q[i])
         if q_intervals:
-            expected = [checker._sign_at_root(in_time(f[i]), q_inner, *interval) for interval in q_intervals]
+            expected = [sign_at_root(in_time(f[i]), q_inner, *interval) for interval in q_intervals]
             assert signs[i].tolist() == [expected[0], expected[-1]], (f[i], q[i])
         if f_intervals:
-            expected = [checker._sign_at_root(in_time(q[i]), f_inner, *interval) for interval in f_intervals]
+            expected = [sign_at_root(in_time(q[i]), f_inner, *interval) for interval in f_intervals]
             assert cubic_signs[i].tolist()[3 - len(expected) :] == expected, (f[i], q[i])
             for time, interval in zip(times[i][3 - len(expected) :], f_intervals, strict=True):
-                low, high = checker._doubles_around(f_inner, *interval)
+                low, high = doubles_around(f_inner, *interval)
                 assert time <= high and low < time + 2.0**-DIGITS, (f[i], time)
         seen.add((len(f_intervals), len(q_intervals), len(set(f_intervals)) == len(f_intervals)))
     assert len(seen) >= 17, "the polynomials are of too few kinds"

@@ -15,6 +15,8 @@ import warp as wp
 from generators import mostly_hits, uniform
 
 from warp_bsc import checker
+from warp_bsc.checker.polynomials import differentiate, trim
+from warp_bsc.checker.roots import isolated_roots, sign_at_root
 from warp_bsc.kernels import HIT, UNSURE, roots, signs
 from warp_bsc.kernels.classification import classify, classify_with
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
@@ -117,7 +119,7 @@ def integer_polynomial(coefficients):
         power_form.append(comb(n, i) * differences[0])
         differences = [b - a for a, b in itertools.pairwise(differences)]
     denominator = np.lcm.reduce([c.denominator for c in power_form], dtype=object)
-    return checker._trimmed([int(c * denominator) for c in power_form])
+    return trim([int(c * denominator) for c in power_form])
 
 
 def assert_true(answers, i, k, q, line):
@@ -126,19 +128,19 @@ def assert_true(answers, i, k, q, line):
     if shape == roots.UNKNOWN or shape == roots.TWO_EXTREMA:
         return
     f = integer_polynomial(k)
-    slope = checker._trimmed(checker._derivative(f))
+    slope = trim(differentiate(f))
     assert slope[0] != 0
     assert sum(slope) != 0
-    assert len(list(checker._isolated_roots(slope))) == shape
+    assert len(list(isolated_roots(slope))) == shape
     if count == roots.UNKNOWN:
         return
     assert f[0] != 0
     assert sum(f) != 0
-    intervals = list(checker._isolated_roots(f))
+    intervals = list(isolated_roots(f))
     assert len(intervals) == count
     for polynomial, certain in ((q, answers.q_signs[i]), (line, answers.line_signs[i])):
         for interval, sign in zip((intervals[0], intervals[-1]) if count else (), certain, strict=False):
-            assert sign == 0 or sign == checker._sign_at_root(integer_polynomial(polynomial), f, *interval)
+            assert sign == 0 or sign == sign_at_root(integer_polynomial(polynomial), f, *interval)
 
 
 # --- Polynomials that aim at trouble ---

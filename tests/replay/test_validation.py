@@ -69,8 +69,8 @@ def test_right_answers(crossing):
     found = validate(detector, collisions, x0, x1, most=None, seed=0)
     assert found.disagreements == () and found.false_hits == 0
     assert found.hits == len(collisions.vertex_face) + len(collisions.edge_edge)
-    assert found.hits + found.others == found.answers  # the grid and the detector find the same candidates
-    assert 0 < found.certified <= found.answers
+    assert found.hits + found.others == found.decided  # the grid and the detector find the same candidates
+    assert 0 < found.certified <= found.decided
 
 
 @pytest.mark.parametrize("fewest", [1, 7, 1 << 30])

@@ -24,7 +24,7 @@ from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, 
 import warp_bsc as bsc
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
-from warp_bsc.replay import checking, workers
+from warp_bsc.replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
 FRAMES, SIDE = 24, 5
@@ -108,8 +108,8 @@ def say_where(found, wanted):
     return [name for name in wanted if found[name] != wanted[name]]
 
 
-OPTIONS = "--ignore-initial", "--min-distance", "0.02", "--validate", "1"
-"""``--ignore-initial`` needs the first time in every worker, ``--min-distance`` the end of a chunk."""
+OPTIONS = "--ignore-initial", "--clearance", "0.02", "--validate", "1"
+"""``--ignore-initial`` needs the first time in every worker, ``--clearance`` the end of a chunk."""
 
 LEFT_OUT = 4
 """The exit status of a scene of which a part is left out."""
@@ -254,12 +254,12 @@ class Inline:
 
 def test_a_chunk_that_takes_long_is_cut(troubled, monkeypatch):
     """So that results do not wait long for others, until a kill loses them; what reading reveals is not lost either."""
-    monkeypatch.setattr(workers, "_local", (0, 1))
-    monkeypatch.setattr(workers, "_opened", None)
+    monkeypatch.setattr(worker, "_local", (0, 1))
+    monkeypatch.setattr(worker, "_opened", None)
     checks = checking.Checks(bsc.Selection(), "exact", "cpu", True, None, 0)
     found, calls = [], []
     for seconds in (1000.0, 0.0):
-        monkeypatch.setattr(workers, "_CHUNK_SECONDS", seconds)
+        monkeypatch.setattr(worker, "_CHUNK_SECONDS", seconds)
         scene, inline = bsc.Scene(troubled), Inline()
         results = list(workers.check_in_workers(scene, checks, inline))
         sums = [result.summary for result in results]
@@ -326,7 +326,7 @@ def test_what_cannot_be_resumed(tmp_path, monkeypatch, capsys, waves):
     folder = tmp_path / "stopped"
     scene = str(tmp_path / "scene.usdc")
     shutil.copy(waves, scene)
-    stop(monkeypatch, scene, folder, 5, "--min-distance", "0.1")
+    stop(monkeypatch, scene, folder, 5, "--clearance", "0.1")
 
     def refused(*options):
         before = contents(folder)
@@ -334,16 +334,16 @@ def test_what_cannot_be_resumed(tmp_path, monkeypatch, capsys, waves):
         assert contents(folder) == before
         return capsys.readouterr().err.splitlines()[-1]
 
-    place = f"warp-bsc: error: {folder / 'hits.json'}: its replay was another one, and cannot go on: "
-    assert refused() == place + "min_distance was 0.1, and is None"
-    same = ("--min-distance", "0.1")
+    place = f"warp-bsc: error: {folder / 'hits.json'}: written with other options or files; cannot resume: "
+    assert refused() == place + "clearance was 0.1, and is None"
+    same = ("--clearance", "0.1")
     assert refused(*same, "--method", "float") == place + "method was exact, and is float"
     assert refused(*same, "--no-self") == place + "self_collisions was True, and is False"
     assert refused(*same, "--frames", "0:9").startswith(place + "frames was None, and is {'start': 0.0")
     os.utime(scene, ns=(1, 1))
     assert refused(*same) == place + "the scene's files have changed"
     (folder / "hits.json").write_text('{"intervals": []}')
-    assert "not a JSON file of this version's replay" in refused()
+    assert "not a resumable replay of this version" in refused()
     assert main(["replay", scene, "--resume"]) == 2
     assert "--resume needs --json FILE" in capsys.readouterr().err
 
@@ -381,15 +381,22 @@ def test_a_pickled_scene_keeps_its_welds(tmp_path, monkeypatch, troubled):
     ],
 )
 def test_each_local_worker_has_a_gpu(name, number, gpus, device):
-    assert workers.device_of_worker(name, number, gpus) == device
+    assert worker.device_of_worker(name, number, gpus) == device
 
 
 def test_no_cluster(capsys, monkeypatch, waves):
-    assert main(["replay", waves, "--scheduler", "tcp://127.0.0.1:1", "--workers", "2"]) == 2
-    assert "either processes on this machine, or those of a cluster" in capsys.readouterr().err
+    for wrong in ("head:8786", "tcp://", "0", "2.5"):
+        assert main(["replay", waves, "--workers", wrong]) == 2
+        said = (
+            f"argument --workers: must be an integer of at least 1, or an address such as tcp://head:8786, not {wrong};"
+        )
+        assert said in capsys.readouterr().err
+    for wrong in ("head", "8", "tcp://"):
+        with pytest.raises(ValueError, match=r'^workers must be an integer or an address such as "tcp://head:8786"'):
+            bsc.replay(bsc.Scene(waves), workers=wrong)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["replay", waves, "--scheduler", "tcp://127.0.0.1:1"]) == 2
-    said = "warp-bsc: error: --scheduler: a cluster needs Dask: pip install 'warp-bsc[cluster]'\n"
+    assert main(["replay", waves, "--workers", "tcp://127.0.0.1:1"]) == 2
+    said = "warp-bsc: error: --workers: a cluster needs Dask: pip install 'warp-bsc[cluster]'\n"
     assert capsys.readouterr().err == said
 
 
@@ -422,11 +429,11 @@ def cluster(tmp_path):
 @pytest.mark.slow
 def test_a_cluster_writes_the_same_files(tmp_path, monkeypatch, cluster, troubled, alone, waves, capsys):
     address, processes = cluster
-    assert not say_where(run(troubled, tmp_path / "2", "--scheduler", address, *OPTIONS, status=LEFT_OUT), alone)
+    assert not say_where(run(troubled, tmp_path / "2", "--workers", address, *OPTIONS, status=LEFT_OUT), alone)
 
     expected = [result.summary.mesh_pairs for result in bsc.replay(bsc.Scene(waves), device="cpu")]
     found = []
-    for result in bsc.replay(bsc.Scene(waves), device="cpu", scheduler=address):
+    for result in bsc.replay(bsc.Scene(waves), device="cpu", workers=address):
         found.append((result.summary.index, result.summary.mesh_pairs))
         if len(found) == 4:
             processes[1].kill()
@@ -443,8 +450,8 @@ def test_a_cluster_writes_the_same_files(tmp_path, monkeypatch, cluster, trouble
 
     with monkeypatch.context() as patch:
         patch.setattr(replay_command, "replay", lost)
-        assert main(["replay", waves, "--scheduler", address, "--subdivide", "100"]) == 2
-    said = f"warp-bsc: error: {address}: the scheduler of the Dask cluster answers no more\n"
+        assert main(["replay", waves, "--workers", address, "--subdivide", "100"]) == 2
+    said = f"warp-bsc: error: --workers: {address}: lost the scheduler of the Dask cluster\n"
     assert without_progress(capsys.readouterr().err) == said
-    assert main(["replay", waves, "--scheduler", address]) == 2
-    assert f"{address}: no scheduler of a Dask cluster answers" in capsys.readouterr().err
+    assert main(["replay", waves, "--workers", address]) == 2
+    assert f"--workers: {address}: cannot reach the scheduler of a Dask cluster" in capsys.readouterr().err

@@ -25,13 +25,13 @@ from warp_bsc.response.state.structs import DIVIDED, PROJECTED
 
 
 def check_rest(rollout, dt, steps):
-    """Asserts that cloth which comes to rest is projected in each step, and never cut or left standing."""
+    """Asserts that cloth which comes to rest is projected in each step, and never cut or frozen."""
     touched = 0
     for _ in range(steps):
         rollout.step(dt)
         touched += rollout.solver.report.hits > 0
     report = rollout.solver.report
-    assert (report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0)
+    assert (report.totals.truncated_steps, report.totals.frozen_steps, report.totals.uncertified_steps) == (0, 0, 0)
     assert rollout.collisions == 0 and touched > 0.1 * steps
 
 
@@ -110,7 +110,7 @@ def test_a_wanted_position_that_is_not_finite(value, what, device):
     moved = rollout.positions[-81:, 2] != model.particle_q.numpy()[-81:, 2]
     assert moved.sum() == 80
     assert rollout.collisions == 0 and hits > 50
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
     rollout.solver.solver.change = None
     rollout.step()
     assert rollout.solver.report.not_finite == 0 and rollout.solver.report.certified
@@ -138,7 +138,7 @@ def test_a_start_position_that_is_not_finite(value, device):
         rollout.solver.step(start, end, None, None, DT)
         rollout.states = end, start
         report = rollout.solver.report
-        assert not report.certified and not report.undetected and report.uncertified_steps == step + 1
+        assert not report.certified and not report.undetected and report.totals.uncertified_steps == step + 1
         assert not np.isfinite(rollout.positions[broken]).any()
         assert np.isfinite(rollout.positions[others]).all() and np.isfinite(rollout.velocities[others]).all()
         for x1, collides in ((wanted, True), (rollout.positions, False)):
@@ -148,7 +148,7 @@ def test_a_start_position_that_is_not_finite(value, device):
                 avoided += number
             else:
                 found += number
-    assert (found, report.frozen_steps) == (0, 0) and avoided > 100
+    assert (found, report.totals.frozen_steps) == (0, 0) and avoided > 100
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def test_any_positions_that_are_not_finite(shot, share, seed):
     values = random.choice(np.float32([np.nan, np.inf, -np.inf]), (len(lost), 3))
     shot.solver.solver.change = lambda state: write_rows(state.particle_q, lost, values)
     shot.states = shot.model.state(), shot.model.state()
-    shot.collisions, standing = 0, shot.solver.report.frozen_steps
+    shot.collisions, standing = 0, shot.solver.report.totals.frozen_steps
     for _ in range(3):
         start = shot.positions
         shot.step()
@@ -176,7 +176,7 @@ def test_any_positions_that_are_not_finite(shot, share, seed):
         assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
         still = (shot.positions[lost] == start[lost]).all(axis=1)
         assert still.all() or shot.solver.report.hits  # another may push it
-    assert shot.collisions == 0 and shot.solver.report.frozen_steps == standing
+    assert shot.collisions == 0 and shot.solver.report.totals.frozen_steps == standing
 
 
 @pytest.mark.parametrize("iterations", [0, 40])
@@ -191,8 +191,9 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
     add_patch(builder, 3, 0.04, (1.0, 0.0, 0.0), velocity=(0.3, 0.2, 0.1))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
-    rollout.solver._work.status.max_iterations = iterations
+    rollout = Rollout(
+        model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap)), max_iterations=iterations)
+    )
     certified, uncertified = [], 0
     for next_gap in gaps:
         gap = next_gap
@@ -202,7 +203,7 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
         report = rollout.solver.report
         certified.append(report.certified)
         uncertified += not report.certified
-        assert report.uncertified_steps == uncertified and not report.undetected
+        assert report.totals.uncertified_steps == uncertified and not report.undetected
         assert report.certified == (report.remaining == 0)
         assert rollout.collisions - collisions <= report.remaining
         assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
@@ -258,10 +259,8 @@ def test_worlds_do_not_notice_each_other(trouble, device):
         model = bullet(20.0, device=device, worlds=3)
         middle = np.arange(model.particle_count // 3, 2 * model.particle_count // 3)
         patch = middle[-81:]
-        rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
-        response = rollout.solver._work
-        if trouble != "jammed":
-            response.max_iterations = 2  # as many as the other worlds need
+        most = {} if trouble == "jammed" else {"max_iterations": 2}  # as many as the other worlds need
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model), **most))
         state = rollout.states[0]
         if calm:
             write_rows(state.particle_qd, patch, 0.0)
@@ -282,7 +281,7 @@ def test_worlds_do_not_notice_each_other(trouble, device):
             rollout.states = end, start
             bits.append(np.delete(np.concatenate([rollout.positions, rollout.velocities], axis=1), middle, axis=0))
             hits += rollout.solver.report.hits
-            outcome = response.vertices.outcome.numpy()
+            outcome = rollout.solver._work.vertices.outcome.numpy()
             assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
             troubled |= {
                 "crossing": rollout.solver.report.crossings > 0 and rollout.solver.report.excluded > 0,
@@ -312,7 +311,11 @@ def test_the_rollers_of_newton(device, monkeypatch):
     start = example.state_0.particle_q.numpy().copy()
     example.step()
     report = stages[0].report
-    assert (report.steps, report.uncertified_steps, report.frozen_steps) == (example.sim_substeps, 0, 0)
+    assert (report.totals.steps, report.totals.uncertified_steps, report.totals.frozen_steps) == (
+        example.sim_substeps,
+        0,
+        0,
+    )
     end = example.state_0.particle_q.numpy()
     moved = np.linalg.norm(end - start, axis=1)
     print(

@@ -94,10 +94,9 @@ class Step:
         self.friction, self.restitution = (
             wp.array([value], dtype=float, device=device, requires_grad=True) for value in (friction, restitution)
         )
-        options = {"friction": self.friction, "restitution": self.restitution, "bodies": True}
-        self.solver = bsc.SolverCCD(Still(model), **options)
-        self.solver._work.status.max_iterations = projections
-        self.solver._work.progress.max_truncations = truncations
+        options = {"friction": self.friction, "restitution": self.restitution, "bodies": "separated"}
+        self.solver = bsc.SolverCCD(Still(model), contact_layer=False, max_iterations=projections, **options)
+        self.solver._work.status.max_truncations = truncations
         self.states = start, end = model.state(), model.state()
         self.arrays = {
             "start_q": start.particle_q,
@@ -196,7 +195,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(case, device):
     end = scene.end(scene.values)
     report, moved = scene.solver.report, {name: end[name] - scene.values[name] for name in end}
     assert report.hits > 0 and report.certified
-    assert (report.truncated > 0) == ("truncation" in case) and (report.frozen_steps > 0) == (case == "frozen")
+    assert (report.truncated > 0) == ("truncation" in case) and (report.totals.frozen_steps > 0) == (case == "frozen")
     assert (np.abs(moved["particle_q"]).max() > 1e-3) == (shape != "on the ground")
     assert (np.abs(moved["body_q"]).max() > 1e-3) == (shape in ("wedge", "on the ground"))
     random = np.random.default_rng(0)
@@ -225,14 +224,14 @@ def test_an_incomplete_record_gives_nan(device):
     scene.end(scene.values)
     with wp.Tape():
         scene.solver.step(*scene.states, None, None, DT)
-    response = scene.solver._work
-    recorded = RecordedStep(scene.solver._motion, response.resolution, scene.solver._recorder, DT)
+    work = scene.solver._work
+    recorded = RecordedStep(scene.solver._motion, work.resolution, scene.solver._recorder, DT)
     arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
     for complete in (1, 0):
         for array in scene.arrays.values():
             array.grad.fill_(1.0)
         recorded.complete.fill_(complete)
-        StepAdjoint(recorded, response).backward(*(array.grad for array in arrays))
+        StepAdjoint(recorded, work).backward(*(array.grad for array in arrays))
         for name, array in scene.arrays.items():
             assert np.isfinite(array.grad.numpy()).all() == (complete == 1), name
 
@@ -355,7 +354,7 @@ def test_gradient_of_a_rollout_is_that_of_central_differences(device):
         scene.forward()
     tape.backward(scene.value)
     report, contacts = scene.solver.report, scene.contacts
-    assert sum(contacts) >= 20 and (report.uncertified_steps, report.truncated_steps) == (0, 0)
+    assert sum(contacts) >= 20 and (report.totals.uncertified_steps, report.totals.truncated_steps) == (0, 0)
     first = {name: array.numpy().astype(float) for name, array in scene.inputs.items()}
     gradients = {name: array.grad.numpy().astype(float) for name, array in scene.inputs.items()}
     mass = first["body_mass"][scene.plate]

@@ -57,6 +57,13 @@ def semi_implicit(model):
     return newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False)
 
 
+def layered(inner, thickness=LAYER, *, min_distance=None, **options):
+    """A stage behind a contact layer around a solver; without the layer if its thickness is None."""
+    if thickness is not None:
+        inner = bsc.ContactLayer(inner, thickness=thickness, min_distance=min_distance, **options)
+    return bsc.SolverCCD(inner, min_distance=min_distance, contact_layer=False, **options)
+
+
 class Throws:
     """Patches thrown on a sphere, a box or a pinned sheet that are fixed, one in each world."""
 
@@ -79,7 +86,7 @@ class Throws:
         builder.replicate(world, worlds)
         self.model = builder.finalize(device=device, requires_grad=requires_grad)
         inner = semi_implicit(self.model)
-        self.solver = bsc.SolverCCD(inner, friction=0.3, restitution=0.2, contact_layer=LAYER)
+        self.solver = layered(inner, friction=0.3, restitution=0.2)
         self.states = [self.model.state() for _ in range(STEPS + 1)]
         vectors = {"shape": worlds, "dtype": wp.vec3, "device": device, "requires_grad": requires_grad}
         self.velocity, self.centre = wp.zeros(**vectors), wp.zeros(**vectors)
@@ -125,7 +132,7 @@ def central_differences(device, target, velocity):
     velocities = (velocity + offsets).astype(np.float32).astype(float)
     scene = Throws(device, target, velocities.size // 3, requires_grad=False)
     centres = scene.centres(velocities.reshape(-1, 3)).reshape(velocities.shape)
-    assert scene.solver.report.uncertified_steps == 0
+    assert scene.solver.report.totals.uncertified_steps == 0
     steps = np.stack([velocities[:, k, 0, k] - velocities[:, k, 1, k] for k in range(3)], axis=1)
     return ((centres[:, :, 0] - centres[:, :, 1]) / steps[..., None]).swapaxes(1, 2)
 
@@ -145,7 +152,7 @@ def test_central_differences_agree_with_each_other_and_with_the_tape(target, vel
     differences = central_differences(device, target, velocity)
     scene = Throws(device, target, 1, requires_grad=True)
     derivatives = np.concatenate([differences, scene.gradients(velocity)[None]])
-    assert scene.solver.report.lost_gradients == 0
+    assert scene.solver.report.gradients.lost_steps == 0
     sizes = np.abs(derivatives).min(axis=0)
     spread = derivatives.max(axis=0) - derivatives.min(axis=0)
     assert (spread <= 0.03 * sizes)[sizes >= 0.01 * sizes.max()].all()
@@ -181,7 +188,7 @@ def test_a_bounce_returns_the_restitution_whenever_it_begins(floor, tolerance, r
         add_floor(world, floor)
         builder.add_world(world)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(semi_implicit(model), friction=0.0, restitution=restitution, contact_layer=LAYER)
+    solver = layered(semi_implicit(model), friction=0.0, restitution=restitution)
     rollout = Rollout(model, solver)
     for _ in range(16):
         rollout.step(DT)
@@ -200,7 +207,7 @@ def colliding_patches(**options):
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_pushes_conserve_momentum(friction, device):
     model = colliding_patches(**FREE).finalize(device=device)
-    solver = bsc.SolverCCD(semi_implicit(model), friction=friction, restitution=0.5, contact_layer=LAYER)
+    solver = layered(semi_implicit(model), friction=friction, restitution=0.5)
     rollout = Rollout(model, solver)
     mass = model.particle_mass.numpy().astype(float)[:, None]
 
@@ -222,7 +229,7 @@ def test_many_worlds_are_each_bit_for_bit_as_alone(device):
     ends = []
     for builder in (world, many):
         model = builder.finalize(device=device)
-        solver = bsc.SolverCCD(semi_implicit(model), friction=0.3, restitution=0.5, contact_layer=LAYER)
+        solver = layered(semi_implicit(model), friction=0.3, restitution=0.5)
         rollout = Rollout(model, solver)
         start = rollout.states[0].particle_qd.numpy().copy()
         for _ in range(15):
@@ -238,12 +245,11 @@ def test_cloth_comes_to_rest_on_the_layer(layer, min_distance, device):
     add_square(builder, 4, 0.03, (0.0, 0.0, 0.02), (1.0, 0.3, 0.0), 0.1, **SOFT)
     add_floor(builder, "mesh", friction=0.5)
     model = builder.finalize(device=device)
-    distances = {"contact_layer": layer, "min_distance": min_distance}
-    solver = bsc.SolverCCD(semi_implicit(model), friction=0.5, restitution=0.0, **distances)
+    solver = layered(semi_implicit(model), layer, min_distance=min_distance, friction=0.5, restitution=0.0)
     rollout = Rollout(model, solver)
     for _ in range(200):
         rollout.step(DT)
-    assert solver.report.uncertified_steps == 0
+    assert solver.report.totals.uncertified_steps == 0
     q, qd = (x.numpy() for x in (rollout.states[0].particle_q, rollout.states[0].particle_qd))
     assert np.abs(qd).max() < 0.01
     np.testing.assert_allclose(q[:, 2], layer + (min_distance or 0.0), atol=0.02 * layer)
@@ -256,7 +262,7 @@ def test_particles_outside_of_the_layer_keep_every_bit(device):
         add_square(builder, 3, 0.03, (0.0, 0.0, 0.1), **SOFT)
         builder.add_ground_plane()
         model = builder.finalize(device=device)
-        rollout = Rollout(model, bsc.SolverCCD(semi_implicit(model), contact_layer=layer))
+        rollout = Rollout(model, layered(semi_implicit(model), layer))
         for _ in range(5):
             rollout.step(DT)
         ends.append([x.numpy() for x in (rollout.states[0].particle_q, rollout.states[0].particle_qd)])
@@ -285,7 +291,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(restitution, device):
     model = builder.finalize(device=device, requires_grad=True)
     numbers = {"dtype": float, "device": device, "requires_grad": True}
     friction, bounce = wp.array([0.3], **numbers), wp.array([restitution], **numbers)
-    solver = bsc.SolverCCD(Still(model), friction=friction, restitution=bounce, contact_layer=0.2)
+    solver = layered(Still(model), 0.2, friction=friction, restitution=bounce)
     states, dt = (model.state(), model.state()), 0.01
     arrays = [states[0].particle_q, states[1].particle_q, states[1].particle_qd]
     arrays += [model.particle_inv_mass, friction, bounce, model.shape_material_mu]
@@ -334,16 +340,16 @@ def test_a_layer_without_room_for_its_pairs_pushes_nothing(device):
     ends = []
     for layer in (None, LAYER):
         model = colliding_patches(**SOFT).finalize(device=device)
-        solver = bsc.SolverCCD(semi_implicit(model), contact_layer=layer)
+        solver = layered(semi_implicit(model), layer)
         if layer is not None:
-            solver._layer._detector.capacities.zero_()
-            solver._layer._detector.grow = lambda: False
+            solver.solver._detector.capacities.zero_()
+            solver.solver._detector.grow = lambda: False
         rollout = Rollout(model, solver)
         for _ in range(12):
             rollout.step(DT)
-        assert solver.report.uncertified_steps == 0
+        assert solver.report.totals.uncertified_steps == 0
         ends.append(rollout.states[0].particle_q.numpy())
-    assert 1 <= solver.report.layerless_steps <= 12
+    assert 1 <= solver.solver.skipped_steps <= 12
     np.testing.assert_array_equal(*ends)
 
 
@@ -369,7 +375,7 @@ def test_gradients_in_a_graph_are_those_without(device):
                 tape = differentiate()
             tape.zero()
             wp.capture_launch(capture.graph)
-        assert scene.solver.report.lost_gradients + scene.solver.report.layerless_steps == 0
+        assert scene.solver.report.gradients.lost_steps + scene.solver.solver.skipped_steps == 0
         gradients.append(scene.velocity.grad.numpy())
     np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-5)
 
@@ -380,13 +386,34 @@ def test_wrong_use(device):
     builder.add_shape_box(builder.add_body(mass=1.0), hx=0.02, hy=0.02, hz=0.02)
     model = builder.finalize(device=device, requires_grad=True)
     for layer in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(ValueError, match="contact_layer"):
-            bsc.SolverCCD(semi_implicit(model), contact_layer=layer)
-    with pytest.raises(ValueError, match="contact_layer"):
-        bsc.SolverCCD(semi_implicit(model), contact_layer=LAYER, respond=False)
-    solver = bsc.SolverCCD(semi_implicit(model), contact_layer=LAYER)
-    with wp.Tape(), pytest.raises(NotImplementedError, match="contact_layer"):
+        with pytest.raises(ValueError, match="thickness"):
+            bsc.ContactLayer(semi_implicit(model), thickness=layer)
+    solver = layered(semi_implicit(model))
+    with wp.Tape(), pytest.raises(NotImplementedError, match="a contact layer carries no gradients to poses"):
         solver.step(model.state(), model.state(), None, None, DT)
+    state = model.state()
+    with wp.Tape(), pytest.raises(ValueError, match="state_out must not be state_in"):
+        solver.step(state, state, None, None, DT)
     plain = builder.finalize(device=device)
-    with pytest.raises(NotImplementedError, match="contact_layer"):
-        bsc.SolverCCD(semi_implicit(plain), contact_layer=LAYER, coupling=2)
+    with pytest.raises(NotImplementedError, match="substeps"):
+        bsc.SolverCCD(bsc.ContactLayer(semi_implicit(plain)), substeps=2)
+
+
+def test_the_stage_puts_a_layer_in_where_the_model_asks_for_gradients(device):
+    """Of a quarter of an edge; not without gradients, nor where pairs keep a distance or shapes move with bodies."""
+
+    def layer_of(requires_grad=True, body=False, **options):
+        builder = newton.ModelBuilder()
+        add_square(builder, 3, 0.04, (0.0, 0.0, 0.1), **SOFT)
+        if body:
+            builder.add_shape_box(builder.add_body(mass=1.0), hx=0.02, hy=0.02, hz=0.02)
+        solver = bsc.SolverCCD(semi_implicit(builder.finalize(device=device, requires_grad=requires_grad)), **options)
+        return solver.solver if isinstance(solver.solver, bsc.ContactLayer) else None
+
+    layer = layer_of(friction=0.3)
+    assert layer.thickness == pytest.approx(0.25 * 0.04, rel=0.01) and layer.friction.numpy() == np.float32(0.3)
+    assert isinstance(layer.solver, newton.solvers.SolverSemiImplicit)
+    assert layer_of(contact_layer=False) is None
+    assert layer_of(requires_grad=False) is None
+    assert layer_of(min_distance=0.001) is None
+    assert layer_of(body=True) is None

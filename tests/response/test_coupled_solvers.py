@@ -67,7 +67,7 @@ def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, ite
     rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
     poses, state = fall(model, SolverCoupledProxy(model, entries(model, rigid, make), config), steps)
     report = stages[0].report
-    assert (report.steps, report.uncertified_steps, report.crossings) == (iterations * steps, 0, 0)
+    assert (report.totals.steps, report.totals.uncertified_steps, report.crossings) == (iterations * steps, 0, 0)
     lags = mode == "lagged" and iterations == 1
     np.testing.assert_allclose(poses[:, :3], expected[:, :3], atol=5e-3 if lags else 2e-3)
     assert poses[-1, 2] > 0.055 - steps * DT + 0.02
@@ -97,7 +97,7 @@ def test_a_body_hangs_on_cloth_over_a_sphere(device):
     rigid = newton.solvers.SolverSemiImplicit
     _, state = fall(model, SolverCoupledADMM(model, entries(model, rigid, make), config), 64)
     report = stages[0].report
-    assert report.steps == 128 and report.uncertified_steps == 0 and report.crossings == 0
+    assert report.totals.steps == 128 and report.totals.uncertified_steps == 0 and report.crossings == 0
     q, pose = state.particle_q.numpy(), state.body_q.numpy()[0]
     assert np.linalg.norm(q - np.array(at), axis=1).min() > 0.098  # the sphere's surface is an inscribed mesh
     free_fall = -0.02 - 0.5 * 9.81 * (64 * DT) ** 2
@@ -190,7 +190,7 @@ def test_a_captured_graph_steps_as_the_solver_does(device):
         for _ in range(6):
             wp.capture_launch(capture.graph) if captured else step_twice()
         report = stages[0].report
-        assert (report.steps, report.uncertified_steps, report.crossings) == (12, 0, 0)
+        assert (report.totals.steps, report.totals.uncertified_steps, report.crossings) == (12, 0, 0)
         ends.append(np.concatenate([states[0].body_q.numpy().ravel(), states[0].particle_q.numpy().ravel()]))
     assert ends[0][2] < 0.04
     np.testing.assert_array_equal(*ends)
@@ -222,7 +222,7 @@ def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations,
         lower, upper = (start.particle_q.numpy()[part, 2].mean() for part in parts)
         gaps.append(upper - lower)
     assert gaps[2] < -0.01 and min(gaps[3:]) > 0.01
-    assert all(stage.report.uncertified_steps == 0 and stage.report.crossings == 0 for stage in stages)
+    assert all(stage.report.totals.uncertified_steps == 0 and stage.report.crossings == 0 for stage in stages)
 
 
 @pytest.mark.parametrize("resets", [False, True])

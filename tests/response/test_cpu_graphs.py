@@ -117,7 +117,7 @@ def test_a_detection_reads_the_positions_of_the_replay(dtype):
     vector = wp.vec3 if dtype is np.float32 else wp.vec3d
     x0, x1 = (wp.array(x.astype(dtype), dtype=vector, device=CPU) for x in (START, START))
     with wp.ScopedCapture(CPU) as capture:
-        collisions = detector.detect(x0, x1)
+        collisions = detector.capture(x0, x1)
     with pytest.raises(RuntimeError, match="not been launched"):
         collisions.read()
     for end, expected in ((START, []), (END, [[3, 0], [4, 0], [5, 0]]), (START, [])):
@@ -135,7 +135,7 @@ def test_queues_grow_in_a_replay():
     x0.assign(np.arange(60)[:, None] * np.float32([10.0, 1.0, 0.1]))
     x1.assign(x0)
     with wp.ScopedCapture(CPU) as capture:
-        collisions = detector.detect(x0, x1)
+        collisions = detector.capture(x0, x1)
     start = rng.uniform(-1.0, 1.0, (60, 3)).astype(np.float32)
     end = -start
     x0.assign(start)
@@ -149,6 +149,13 @@ def test_queues_grow_in_a_replay():
     assert collisions.certified and not collisions.overflowed
 
 
+def test_a_capture_outside_a_graph_is_refused():
+    detector = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, device=CPU))
+    x = wp.array(START, dtype=wp.vec3, device=CPU)
+    with pytest.raises(RuntimeError, match=r"captures no graph: call capture\(x0, x1\) within wp.ScopedCapture"):
+        detector.capture(x, x)
+
+
 def test_what_returns_arrays_of_the_host_is_refused():
     detector = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, device=CPU))
     points = np.zeros((3, 8, 3))
@@ -157,8 +164,9 @@ def test_what_returns_arrays_of_the_host_is_refused():
         (lambda: detector.find_intersections(x), RuntimeError),
         (lambda: bsc.query_vertex_face(points, device=CPU), RuntimeError),
         (lambda: bsc.query_edge_edge(points, device=CPU), RuntimeError),
-        (lambda: detector.detect(x, x), ValueError),
-        (lambda: detector.detect(START, END), ValueError),
+        (lambda: detector.detect(x, x), RuntimeError),
+        (lambda: detector.capture(x, x), ValueError),
+        (lambda: detector.capture(START, END), ValueError),
     ):
         with pytest.raises(error, match="graph"), wp.ScopedCapture(CPU):
             call()
@@ -187,8 +195,8 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
                 wp.capture_launch(capture.graph)
             else:
                 step()
-            reports.append([solver.report.hits, solver.report.iterations, solver.report.truncated_steps])
-        assert (solver.report.steps, solver.report.uncertified_steps) == (8, 0)
+            reports.append([solver.report.hits, solver.report.iterations, solver.report.totals.truncated_steps])
+        assert (solver.report.totals.steps, solver.report.totals.uncertified_steps) == (8, 0)
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy(), reports])
     assert np.max(reports, axis=0)[1] > 1
     for actual, expected in zip(*ends, strict=True):
@@ -233,7 +241,7 @@ def test_a_replay_without_room_is_taken_back():
             solver.step(start, end, control, None, DT)
             start.assign(end)
             if CPU.is_capturing:
-                totals = solver.report._totals
+                totals = solver.report.device_totals
                 outputs = [replays, start.particle_q, totals.undetected_steps, totals.lost_gradients]
                 wp.launch(_run_out_of_room, 1, outputs=outputs, device=CPU)
 
@@ -242,13 +250,8 @@ def test_a_replay_without_room_is_taken_back():
             steps()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
         retaken.append((steps.retaken, int(replays.numpy()[0])))
-        report = solver.report
-        assert (report.steps, report.undetected_steps, report.lost_gradients, report.uncertified_steps) == (
-            7,
-            0,
-            0,
-            0,
-        )
+        totals, lost = solver.report.totals, solver.report.gradients.lost_steps
+        assert (totals.steps, totals.undetected_steps, totals.uncertified_steps, lost) == (7, 0, 0, 0)
     assert retaken == [(2, 6), (0, 0)]  # the first run is outside the graph
     for actual, expected in zip(*ends, strict=True):
         np.testing.assert_array_equal(actual, expected)
@@ -260,7 +263,7 @@ def test_gradients_in_a_graph_are_those_without():
         model = bullet(60.0, device=CPU)
         model.requires_grad = True
         model.particle_ke = model.particle_kd = model.particle_kf = 0.0
-        solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False))
+        solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False), contact_layer=False)
         states, control = [model.state(requires_grad=True) for _ in range(9)], model.control()
 
         def rollout(solver=solver, states=states, control=control):
@@ -280,7 +283,7 @@ def test_gradients_in_a_graph_are_those_without():
             wp.capture_launch(capture.graph)
         else:
             rollout()
-        assert solver.report.truncated_steps + solver.report.hits > 0
+        assert solver.report.totals.truncated_steps + solver.report.hits > 0
         gradients.append([states[0].particle_q.grad.numpy(), states[0].particle_qd.grad.numpy()])
     assert all(np.isfinite(gradient).all() and np.abs(gradient).max() > 0.0 for gradient in gradients[1])
     for actual, expected in zip(*gradients, strict=True):

@@ -53,8 +53,9 @@ def test_crossing_sheets(pull, steps, device):
         assert counts[-1] > 0 and excluded > 0
     else:
         assert set(counts) == {counts[0]}
-    assert (rollout.collisions, report.truncated_steps, report.frozen_steps, report.uncertified_steps) == (0, 0, 0, 0)
-    assert (report.total_excluded, report.total_remaining) == (excluded, 0)
+    totals = report.totals
+    assert (rollout.collisions, totals.truncated_steps, totals.frozen_steps, totals.uncertified_steps) == (0, 0, 0, 0)
+    assert (report.totals.excluded, report.totals.remaining) == (excluded, 0)
     assert (f"contacts: 0 remained, {excluded} excluded" in str(report)) == (excluded > 0)
 
 
@@ -90,7 +91,7 @@ def test_the_count_is_that_of_exact_detection(device):
         assert rollout.solver.report.certified and rollout.collisions == 0
         counts.append(expected)
     assert [count > 0 for count in counts] == [bool(int(digit)) for digit in "001110010"]
-    assert rollout.solver.report.frozen_steps == rollout.solver.report.truncated_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == rollout.solver.report.totals.truncated_steps == 0
 
 
 def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):
@@ -206,7 +207,7 @@ def test_cloth_on_a_roller_without_common_vertices(device):
         assert rollout.solver.report.certified
         assert rollout.positions[cloth:].tobytes() == turned.tobytes()
     assert rollout.collisions == 0 and touched > 0
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
     assert rollout.positions[:cloth, 0].mean() > 1e-3  # at the start it is 0
 
 

@@ -18,9 +18,7 @@ from warp_bsc.response.state.structs import DIVIDED, DividingPlanes, allocate_di
 
 def staged(model, iterations, inner="vbd"):
     """A rollout with at most this many iterations of projection."""
-    solver = bsc.SolverCCD(SOLVERS[inner](model))
-    solver._work.status.max_iterations = iterations
-    return Rollout(model, solver)
+    return Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), max_iterations=iterations))
 
 
 def record_wanted(rollout):
@@ -52,7 +50,7 @@ def test_a_bullet(speed, iterations, device):
         paths, wanted_paths = (np.linalg.norm(x.astype(float) - start, axis=1) for x in (rollout.positions, *wanted))
         assert iterations > 0 or (paths <= wanted_paths + 1e-6).all()
     assert rollout.collisions == 0 and hits > 50
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
 
 
 @pytest.mark.parametrize("iterations", [0, 1])
@@ -77,7 +75,7 @@ def test_a_tilted_bullet(iterations, device):
         hits += rollout.solver.report.hits
         assert rollout.solver.report.certified
     assert rollout.collisions == 0 and hits > 50
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
 
 
 @pytest.mark.parametrize("iterations", [0, 1])
@@ -88,8 +86,7 @@ def test_linear_momentum_is_kept(iterations, device):
     add_patch(builder, 6, 0.05, (0.09, 0.07, 0.05), velocity=(0.0, -0.5, -2.0))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
-    rollout.solver._work.status.max_iterations = iterations
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model), max_iterations=iterations))
     before, velocities, divided = rollout.momenta()[0], rollout.velocities, 0
     for _ in range(6):
         rollout.step()
@@ -107,8 +104,9 @@ def test_plates_that_close_on_cloth(iterations, device):
     add_plates(builder, 0.03)
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap))))
-    rollout.solver._work.status.max_iterations = iterations
+    rollout = Rollout(
+        model, bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap)), max_iterations=iterations)
+    )
     hits = 0
     for step in range(8):
         gap = max(0.004, 0.026 - 0.004 * step)
@@ -117,7 +115,7 @@ def test_plates_that_close_on_cloth(iterations, device):
         assert rollout.solver.report.certified
         assert np.abs(rollout.positions[:, 2]).max() < 0.5 * gap
     assert rollout.collisions == 0 and hits > 50
-    assert rollout.solver.report.frozen_steps == rollout.solver.report.truncated_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == rollout.solver.report.totals.truncated_steps == 0
 
 
 def test_a_pile_takes_few_rounds(device):
@@ -133,7 +131,7 @@ def test_a_pile_takes_few_rounds(device):
         rollout.step(1.0 / 600.0)
         rounds.append(rollout.solver.report.iterations)
     report = rollout.solver.report
-    assert report.uncertified_steps == report.truncated_steps == 0
+    assert report.totals.uncertified_steps == report.totals.truncated_steps == 0
     assert rollout.collisions == 0 and report.hits > 50
     assert max(rounds) <= 4 and np.median(rounds[3:]) <= 2, rounds
 

@@ -1,4 +1,4 @@
-"""Contacts passed on to coupled steps: the inner solver gets those that the stage does not resolve, and no others."""
+"""Contacts passed on to steps in substeps: the inner solver gets those that the stage does not resolve, and no others."""
 
 import newton
 import numpy as np
@@ -31,7 +31,7 @@ def finalized(builder, device):
 
 
 def roll(model, passes, steps, *, inner="vbd", in_graph=False, **options):
-    """Returns a rollout of coupled steps, with contacts found before each and passed on, or without."""
+    """Returns a rollout of steps in substeps, with contacts found before each and passed on, or without."""
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), **options))
     pipeline = newton.CollisionPipeline(model)
     contacts = pipeline.contacts() if passes else None
@@ -59,14 +59,14 @@ def roll(model, passes, steps, *, inner="vbd", in_graph=False, **options):
     return rollout
 
 
-@pytest.mark.parametrize("inner, coupling", [("vbd", "auto"), ("vbd", 8), ("xpbd", 4)])
-def test_a_step_is_the_same_with_contacts_passed_on(inner, coupling, device):
+@pytest.mark.parametrize("inner, substeps", [("vbd", "auto"), ("vbd", 8), ("xpbd", 4)])
+def test_a_step_is_the_same_with_contacts_passed_on(inner, substeps, device):
     builder = newton.ModelBuilder()
     add_drape(builder)
     model = finalized(builder, device)
-    plain, passed = (roll(model, passes, 24, inner=inner, coupling=coupling) for passes in (False, True))
-    assert passed.solver.report.coupled_steps > 4 and passed.solver.report.uncertified_steps == 0
-    assert passed.solver.report.coupled_steps == plain.solver.report.coupled_steps
+    plain, passed = (roll(model, passes, 24, inner=inner, substeps=substeps) for passes in (False, True))
+    assert passed.solver.report.totals.substepped_steps > 4 and passed.solver.report.totals.uncertified_steps == 0
+    assert passed.solver.report.totals.substepped_steps == plain.solver.report.totals.substepped_steps
     assert passed.positions.tobytes() == plain.positions.tobytes()
     assert passed.velocities.tobytes() == plain.velocities.tobytes()
 
@@ -77,8 +77,8 @@ def test_contacts_in_a_graph_are_those_of_each_replay(device):
     builder = newton.ModelBuilder()
     add_drape(builder)
     model = finalized(builder, device)
-    plain, captured = (roll(model, True, 16, in_graph=graph, coupling="auto") for graph in (False, True))
-    assert captured.solver.report.coupled_steps > 4
+    plain, captured = (roll(model, True, 16, in_graph=graph, substeps="auto") for graph in (False, True))
+    assert captured.solver.report.totals.substepped_steps > 4
     assert captured.positions.tobytes() == plain.positions.tobytes()
 
 
@@ -92,8 +92,8 @@ def test_worlds_with_contacts_are_like_one_alone(device):
         builder = newton.ModelBuilder()
         builder.add_world(world)
         alone.append(builder)
-    rollouts = [roll(finalized(builder, device), True, 8, coupling="auto") for builder in (worlds, *alone)]
-    assert rollouts[0].solver.report.coupled_steps > 2
+    rollouts = [roll(finalized(builder, device), True, 8, substeps="auto") for builder in (worlds, *alone)]
+    assert rollouts[0].solver.report.totals.substepped_steps > 2
     expected = np.concatenate([rollout.positions for rollout in rollouts[1:]])
     assert rollouts[0].positions.tobytes() == expected.tobytes()
 
@@ -186,7 +186,7 @@ def test_forces_are_in_the_rows_of_the_contacts_passed_on(device):
     single = builder.add_particle(wp.vec3(0.1, 0.1, 0.102), wp.vec3(), 0.01, radius=0.005)
     add_patch(builder, 3, 0.04, (0.0, -0.1, 0.103))
     model = finalized(builder, device)
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), coupling="auto")
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), substeps="auto")
     pipeline = newton.CollisionPipeline(model)
     contacts = pipeline.contacts()
     pipeline.collide(model.state(), contacts)
@@ -208,8 +208,8 @@ def test_a_single_particle_rests_on_its_contact(device):
     builder.add_shape_box(-1, hx=0.2, hy=0.2, hz=0.1)
     add_patch(builder, 3, 0.04, (0.0, 0.0, 0.106))
     single = builder.add_particle(wp.vec3(0.1, 0.1, 0.106), wp.vec3(), 0.01, radius=0.005)
-    rollout = roll(finalized(builder, device), True, 20, coupling=2)
-    assert rollout.solver.report.coupled_steps > 4
+    rollout = roll(finalized(builder, device), True, 20, substeps=2)
+    assert rollout.solver.report.totals.substepped_steps > 4
     assert abs(rollout.positions[single, 2] - 0.105) < 5e-4
     assert rollout.positions[:16, 2].min() > 0.1 and rollout.positions[:16, 2].max() < 0.102
 

@@ -251,7 +251,7 @@ def test_the_report_names_what_solids_have_swallowed(device):
         certified.append(report.certified)
         inside.append(set(report.inside.particles.tolist()))
     everything = set(range(model.particle_count))
-    assert certified == [True, False, True, True] and report.uncertified_steps == 1
+    assert certified == [True, False, True, True] and report.totals.uncertified_steps == 1
     assert inside == [set(), everything, everything, everything] and report.crossings == 0
-    assert report.total_remaining > 0 and f"{report.total_remaining} remained" in str(report)
+    assert report.totals.remaining > 0 and f"{report.totals.remaining} remained" in str(report)
     assert set(report.inside.shapes.tolist()) == {0, 1} and (report.inside.soft_bodies == -1).all()

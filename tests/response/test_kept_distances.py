@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DT, SOLVERS, Changed, DistanceRollout, Rollout, add_patch, add_plates, place_plates
-from test_queueless import stage
+from test_search import stage
 
 import warp_bsc as bsc
 
@@ -51,21 +51,23 @@ def bullet(speed, device):
 def test_a_bullet(speed, iterations, device):
     """It stops at the distance, by projection, and by planes alone."""
     model, distance = bullet(speed, device), 0.012
-    rollout = DistanceRollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), min_distance=distance), distance)
-    rollout.solver._work.status.max_iterations = iterations
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), min_distance=distance, max_iterations=iterations)
+    rollout = DistanceRollout(model, solver, distance)
     hits = 0
     for _ in range(8 if speed < 50.0 else 4):
         rollout.step()
         hits += rollout.solver.report.hits
         assert rollout.solver.report.certified
     assert hits > 20 and rollout.near == rollout.approaches == rollout.collisions == 0
-    assert rollout.solver.report.frozen_steps == 0
+    assert rollout.solver.report.totals.frozen_steps == 0
 
 
 def test_ropes_and_points(device):
     """They keep the sum of their radii from each other and from cloth, by springs and particles without faces."""
     model = strands(device)
-    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=2), radius=model.particle_radius, friction=0.3)
+    solver = bsc.SolverCCD(
+        newton.solvers.SolverXPBD(model, iterations=2), particle_radius=model.particle_radius, friction=0.3
+    )
     assert len(solver.mesh.free_edges) == 18 and len(solver.mesh.points) == 3
     rollout = DistanceRollout(model, solver, radius=model.particle_radius.numpy())
     hits = 0
@@ -80,7 +82,9 @@ def test_without_queues(device, monkeypatch):
     """Where queues of a graph are too small, the search without them keeps the distances of all kinds of pairs."""
     model = strands(device)
     radius = model.particle_radius.numpy()
-    rollout = DistanceRollout(model, stage(model, monkeypatch, tiny=True, inner="xpbd", radius=radius), radius=radius)
+    rollout = DistanceRollout(
+        model, stage(model, monkeypatch, tiny=True, inner="xpbd", particle_radius=radius), radius=radius
+    )
     hits = 0
     for _ in range(8):
         rollout.step()
@@ -94,7 +98,9 @@ def test_worlds(device):
     ends = []
     for worlds in (1, 2):
         model = strands(device, worlds)
-        rollout = Rollout(model, bsc.SolverCCD(Changed(model), radius=0.004))  # XPBD knows no worlds of particles
+        rollout = Rollout(
+            model, bsc.SolverCCD(Changed(model), particle_radius=0.004)
+        )  # XPBD knows no worlds of particles
         for _ in range(6):
             rollout.step()
             assert rollout.solver.report.certified
@@ -143,7 +149,7 @@ def test_infinite_planes(device):
     assert heights[0].max() < 0.02
 
 
-@pytest.mark.parametrize("options", [{}, {"coupling": 3}])
+@pytest.mark.parametrize("options", [{}, {"substeps": 3}])
 def test_plates_bodies_and_coupled_steps(options, device):
     """Kinematic plates that close on cloth, and a box that falls onto a sheet, keep the distance as shapes."""
     distance = 0.006
@@ -168,9 +174,7 @@ def test_plates_bodies_and_coupled_steps(options, device):
             state_out.body_qd.assign(twists)
             place_plates(state_out, gap)
 
-    rollout = DistanceRollout(
-        model, bsc.SolverCCD(Falling(model), min_distance=distance, bodies=None, **options), distance
-    )
+    rollout = DistanceRollout(model, bsc.SolverCCD(Falling(model), min_distance=distance, **options), distance)
     hits = 0
     for step in range(6):
         gap = max(0.022, 0.04 - 0.004 * step)
@@ -186,7 +190,7 @@ def test_what_touches_at_the_start_is_set_aside(device):
     add_rope(builder, [[-0.05, 0.0, 0.0], [0.05, 0.0, 0.0]], velocity=(0.0, 0.0, 0.1))
     add_rope(builder, [[0.0, -0.05, 0.0], [0.0, 0.05, 0.0]])
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(Changed(model), radius=0.004))
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model), particle_radius=0.004))
     rollout.step()
     assert rollout.solver.report.certified and rollout.solver.report.excluded == 1
 
@@ -208,7 +212,7 @@ def test_a_monitor_counts_approaches(device):
     model = bullet(60.0, device)
     hits = []
     for distance in (None, 0.012):
-        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), respond=False, min_distance=distance))
+        rollout = Rollout(model, bsc.CollisionMonitor(SOLVERS["vbd"](model), min_distance=distance))
         rollout.step()
         hits.append(rollout.solver.report.hits)
         assert rollout.solver.report.certified == (hits[-1] == 0)
@@ -233,8 +237,8 @@ def test_springs_that_take_part(device):
     ("options", "message"),
     [
         ({"min_distance": -1.0}, "min_distance must be finite and at least 0"),
-        ({"radius": np.ones(3)}, r"radius must be one number or have shape \(59,\)"),
-        ({"radius": np.nan}, "radius must be finite and at least 0"),
+        ({"particle_radius": np.ones(3)}, r"particle_radius must be one number or have shape \(59,\)"),
+        ({"particle_radius": np.nan}, "particle_radius must be finite and at least 0"),
     ],
 )
 def test_bad_distances_are_refused(options, message, device):
@@ -249,7 +253,10 @@ def test_a_step_that_is_differentiated_is_refused(device):
     model = builder.finalize(device=device, requires_grad=True)
     solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), min_distance=0.01)
     states = model.state(), model.state()
-    with pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and radius"), wp.Tape():
+    with (
+        pytest.raises(NotImplementedError, match="carry no gradients: omit min_distance and particle_radius"),
+        wp.Tape(),
+    ):
         solver.step(*states, model.control(), None, DT)
     solver.step(*states, model.control(), None, DT)
 
@@ -265,7 +272,7 @@ def test_bodies_alone(device):
         body = builder.add_body(xform=wp.transform(wp.vec3(0.01 * i, 0.02 * i, 0.06 + 0.1 * i), turn))
         builder.add_shape_box(body, hx=0.04, hy=0.05, hz=0.03)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=distance, bodies=True)
+    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=distance, bodies="separated")
     states, mesh = (model.state(), model.state()), solver.mesh
     x = wp.empty(mesh.vertex_count, dtype=wp.vec3, device=device)
     finder, rounds = bsc.CollisionDetector(mesh), 0

@@ -94,25 +94,9 @@ def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(scen
     assert hits > 100
     assert (excluded > 0) == (crossings > 0) == (scene is blade)  # the other is through within one step
     assert 0 < uncertified < 8 and equal > 0
-    assert (report.steps, report.uncertified_steps) == (8, uncertified)
-    assert (report.truncated_steps, report.frozen_steps, report.not_finite_steps, report.undetected_steps) == (
-        0,
-        0,
-        0,
-        0,
-    )
-
-
-def test_the_monitor_is_the_stage_without_a_response(device):
-    model = bullet(60.0, device=device)
-    reports = []
-    for make in (bsc.CollisionMonitor, lambda solver: bsc.SolverCCD(solver, respond=False)):
-        rollout = Rollout(model, make(SOLVERS["vbd"](model)))
-        for _ in range(3):
-            rollout.step()
-        reports.append((str(rollout.solver.report), rollout.solver.report.hits, rollout.positions.tobytes()))
-        assert isinstance(rollout.solver, bsc.SolverCCD) and not rollout.solver.respond
-    assert reports[0] == reports[1]
+    assert (report.totals.steps, report.totals.uncertified_steps) == (8, uncertified)
+    totals = report.totals
+    assert totals.truncated_steps == totals.frozen_steps == totals.not_finite_steps == totals.undetected_steps == 0
 
 
 def test_the_monitor_reports_the_same_from_a_graph(device):
@@ -141,18 +125,18 @@ def test_the_monitor_reports_the_same_from_a_graph(device):
             else:
                 step()
             report = solver.report
-            counts = report.hits, report.remaining, report.excluded, report.crossings, report.uncertified_steps
+            counts = report.hits, report.remaining, report.excluded, report.crossings, report.totals.uncertified_steps
             rows[-1].append((*counts, report.uncertified_vertices.tolist(), states[0].particle_q.numpy().tobytes()))
-        assert report.steps == 6
+        assert report.totals.steps == 6
     assert rows[0] == rows[1]
     assert sum(row[0] for row in rows[0]) > 100
 
 
-@pytest.mark.parametrize("option", ["separation", "friction", "restitution"])
-def test_numbers_of_the_response_are_refused_without_one(option, device):
+@pytest.mark.parametrize("option", ["separation", "friction", "restitution", "substeps", "bodies", "contact_layer"])
+def test_arguments_of_a_response_are_refused(option, device):
     model = bullet(10.0, device=device)
-    with pytest.raises(ValueError, match=option):
-        bsc.SolverCCD(SOLVERS["xpbd"](model), respond=False, **{option: 0.5})
+    with pytest.raises(TypeError, match=option):
+        bsc.CollisionMonitor(SOLVERS["xpbd"](model), **{option: 0.5})
 
 
 def test_the_monitor_needs_no_friction(device):
@@ -166,7 +150,7 @@ def test_the_monitor_needs_no_friction(device):
     assert (report.hits, report.excluded) == (model.particle_count, 0)  # all vertices enter the plane
     rollout.step()
     assert (report.hits, report.excluded) == (0, model.particle_count)  # and are left to the solver from then on
-    assert report.certified and report.uncertified_steps == 1
+    assert report.certified and report.totals.uncertified_steps == 1
 
 
 def test_gradients_of_the_inner_solver_pass_the_monitor_unchanged(device):
@@ -208,7 +192,9 @@ def test_a_particle_without_a_wanted_position_stands_and_is_counted(device):
         np.testing.assert_array_equal(rollout.positions[last], before[last])
         assert (rollout.positions[last - 1] != before[last - 1]).any()
     report = rollout.solver.report
-    assert (report.not_finite, report.not_finite_steps, report.frozen_steps, report.uncertified_steps) == (1, 2, 0, 0)
+    totals = report.totals
+    assert (report.not_finite, totals.not_finite_steps, totals.frozen_steps) == (1, 2, 0)
+    assert totals.uncertified_steps == 0
     assert report.certified and len(report.uncertified_vertices) == 0
     assert str(report).endswith("0 not certified, 2 steps with positions that are not finite")
 
@@ -220,7 +206,8 @@ def test_the_monitor_does_not_certify_positions_that_are_not_finite(device):
     start, end = model.state(), model.state()
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
-    assert (report.not_finite, report.not_finite_steps, report.hits, report.uncertified_steps) == (1, 1, 0, 1)
+    totals = report.totals
+    assert (report.not_finite, totals.not_finite_steps, report.hits, totals.uncertified_steps) == (1, 1, 0, 1)
     assert np.isnan(end.particle_q.numpy()[last]).all()
     np.testing.assert_array_equal(report.uncertified_vertices, particles_of_elements_with(model, last))
 
@@ -248,7 +235,7 @@ def test_a_body_without_a_position_leaves_a_step_uncertified(make, device):
     start, end = model.state(), model.state()
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
-    assert not report.certified and report.uncertified_steps == 1
+    assert not report.certified and report.totals.uncertified_steps == 1
     assert report.not_finite == 0 and len(report.uncertified_vertices) == 0
 
 
@@ -294,7 +281,7 @@ def test_crossings_at_the_start_are_counted_from_the_first_step(make, device):
     assert expected > 0
     for steps in (1, 2):
         rollout.step()
-        assert (report.crossings, report.steps) == (expected, steps)
+        assert (report.crossings, report.totals.steps) == (expected, steps)
         assert (report.hits, report.excluded) == (0, 0)  # nothing moves
         assert report.certified and len(report.uncertified_vertices) == 0
     assert str(report).endswith(f"0 not certified, {expected} crossings at the start")

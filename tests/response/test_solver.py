@@ -29,7 +29,7 @@ def test_nothing_passes_through(inner, speed, device):
     assert stopped.collisions == 0
     assert len(stopped.detector.find_intersections(stopped.positions)) == 0
     report = stopped.solver.report
-    assert (report.steps, report.uncertified_steps) == (steps, 0)
+    assert (report.totals.steps, report.totals.uncertified_steps) == (steps, 0)
 
 
 def test_style3d_is_an_inner_solver_too(device):
@@ -62,7 +62,7 @@ def test_style3d_is_an_inner_solver_too(device):
             rollout.step(contacts=contacts)
         collisions.append(rollout.collisions)
     assert collisions[0] > 0 and collisions[1] == 0
-    assert rollout.solver.report.uncertified_steps == rollout.solver.report.truncated_steps == 0
+    assert rollout.solver.report.totals.uncertified_steps == rollout.solver.report.totals.truncated_steps == 0
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
@@ -90,7 +90,7 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
 
     All contacts are projected, as where a world also has contacts of fast elements.
     """
-    monkeypatch.setattr("warp_bsc.response.response.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
+    monkeypatch.setattr("warp_bsc.response.schedule.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
     for layer in range(6):
@@ -107,7 +107,7 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
         return rollout.solver.report.iterations
 
     with_proximities = rounds()
-    monkeypatch.setattr("warp_bsc.response.response.Response._collect_near_pairs", lambda self: None)
+    monkeypatch.setattr("warp_bsc.response.step.add_proximities", lambda work: None)
     assert 0 < with_proximities <= 3 < rounds()
 
 
@@ -153,7 +153,7 @@ def test_momenta_of_free_bodies_are_conserved(friction, sideways, device):
         rollout.step()
         met += rollout.solver.report.hits
     assert met > 100
-    assert rollout.solver.report.truncated_steps == 0
+    assert rollout.solver.report.totals.truncated_steps == 0
     new_linear, new_angular = rollout.momenta()
     assert np.linalg.norm(new_linear - linear) < 1e-5 * np.linalg.norm(linear)
     assert np.linalg.norm(new_angular - angular) < 1e-5 * np.linalg.norm(angular)
@@ -180,7 +180,7 @@ def test_friction_on_a_ramp(friction, device):
     slid = (rollout.positions.mean(axis=0) - start) @ down
     expected = 0.5 * 9.81 * max(0.0, np.sin(angle) - friction * np.cos(angle)) * time**2
     assert abs(slid - expected) < 0.05 * expected + 1e-3
-    assert rollout.solver.report.uncertified_steps == 0
+    assert rollout.solver.report.totals.uncertified_steps == 0
 
 
 def test_kinematic_and_inactive_particles_are_never_moved(device):
@@ -309,7 +309,7 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
             rollout = Rollout(model, stage)
             for _ in range(8):
                 rollout.step()
-            assert stage.report.steps == 8
+            assert stage.report.totals.steps == 8
             ends.append(rollout.states[0].particle_qd.numpy().copy())
     np.testing.assert_array_equal(ends[0], ends[1])
     np.testing.assert_array_equal(ends[2], ends[3])
@@ -355,7 +355,7 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
         assert captured.solver.report.certified
         assert plain.positions.tobytes() == captured.positions.tobytes()
         assert plain.velocities.tobytes() == captured.velocities.tobytes()
-    assert captured.solver.report.uncertified_steps == 0
+    assert captured.solver.report.totals.uncertified_steps == 0
 
 
 def leave_capacity_for_one_contact(detector):
@@ -408,7 +408,12 @@ def test_captured_steps_retake_nothing_that_a_graph_completes(device):
         steps()
         assert len(rollout.detector.find_intersections(rollout.positions)) == 0
     report = rollout.solver.report
-    assert (steps.retaken, report.steps, report.undetected_steps, report.uncertified_steps) == (0, 12, 0, 0)
+    assert (steps.retaken, report.totals.steps, report.totals.undetected_steps, report.totals.uncertified_steps) == (
+        0,
+        12,
+        0,
+        0,
+    )
 
 
 @pytest.mark.parametrize("support", ["plane", "box"])
@@ -434,4 +439,4 @@ def test_cloth_on_something_rigid_is_at_rest(support, device):
     assert np.mean(speeds[96:]) < 5e-4  # m/s
     assert start.particle_q.numpy()[:, 2].min() > 0.0
     report = solver.report
-    assert (report.steps, report.uncertified_steps, report.truncated_steps) == (144, 0, 0)
+    assert (report.totals.steps, report.totals.uncertified_steps, report.totals.truncated_steps) == (144, 0, 0)

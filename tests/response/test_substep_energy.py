@@ -21,10 +21,10 @@ import warp_bsc as bsc
 )
 def test_substeps_gain_no_energy(settings, device):
     scene = Scene(settings, device)
-    rise, with_elastic, report = scene.run(coupling=settings.coupling, duration=0.2)
-    assert report.coupled_steps > 4
+    rise, with_elastic, report = scene.run(substeps=settings.substeps, duration=0.2)
+    assert report.totals.substepped_steps > 4
     assert rise <= RISE
-    if settings.coupling == "auto":
+    if settings.substeps == "auto":
         assert with_elastic <= RISE
 
 
@@ -38,7 +38,7 @@ def test_a_drape_with_contacts_passed_on_gains_no_energy(device):
     builder.color()
     model = builder.finalize(device=device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu, model.particle_mu = 1e4, 1e-2, 0.5, 0.5
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), coupling="auto")
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), substeps="auto")
     pipeline = newton.CollisionPipeline(model)
     start, end, control, contacts = model.state(), model.state(), model.control(), pipeline.contacts()
     mass = model.particle_mass.numpy().astype(float)
@@ -55,4 +55,4 @@ def test_a_drape_with_contacts_passed_on_gains_no_energy(device):
         start, end = end, start
         energies.append(energy(start))
     assert max(energies) <= (1.0 + RISE) * energies[0]
-    assert solver.report.coupled_steps > 10
+    assert solver.report.totals.substepped_steps > 10

@@ -210,6 +210,15 @@ def calls() -> dict[str, Call]:
     found["CollisionDetector.detect"] = Call(
         detector.detect, {"x0": X, "x1": X}, {"x0": COORDINATES, "x1": COORDINATES}
     )
+
+    def capture(x0, x1):
+        with wp.ScopedCapture("cpu"):
+            detector.capture(x0, x1)
+
+    on_device = wp.array(X, dtype=wp.vec3d, device="cpu")
+    found["CollisionDetector.capture"] = Call(
+        capture, {"x0": on_device, "x1": on_device}, {"x0": COORDINATES, "x1": COORDINATES}, raises=detector.capture
+    )
     found["CollisionDetector.find_intersections"] = Call(detector.find_intersections, {"x": X}, {"x": COORDINATES})
     found["CollisionDetector.find_proximities"] = Call(
         detector.find_proximities,
@@ -329,11 +338,10 @@ def calls_of_scenes() -> dict[str, Call]:
                 "device": without(DEVICES, "unknown", "empty"),  # of the machine that checks
                 "intersections": FLAGS,
                 "ignore_initial": FLAGS,
-                "min_distance": without(POSITIVE, "None"),
-                "validate_most": without(NOT_COUNT, "None"),
+                "clearance": without(POSITIVE, "None"),
+                "validate": {**NOT_COUNT, "word": "some", "empty": ""},
                 "earlier": {"None": None, "number": 3},
-                "workers": {**NOT_COUNT, "zero": 0},
-                "scheduler": {"number": 3, "list": ["tcp://head"]},
+                "workers": {**NOT_COUNT, "zero": 0, "word": "head", "no host": "tcp://", "list": ["tcp://head"]},
             },
         ),
     }
@@ -351,6 +359,10 @@ def calls_of_solvers() -> dict[str, Call]:
         "doubles": wp.zeros(1, dtype=wp.float64, device="cpu"),
         "shape": wp.zeros(count + 1, dtype=wp.float32, device="cpu"),
     }
+    radii = without(MANY_DISTANCES, "None") | {
+        "one bad": [1.0] * (count - 1) + [-1.0],
+        "masked": masked(np.ones(count)),
+    }
     found = {
         "SolverCCD": Call(
             bsc.SolverCCD,
@@ -360,19 +372,34 @@ def calls_of_solvers() -> dict[str, Call]:
                 "separation": without(POSITIVE, "None"),
                 "friction": coefficient | {"huge": 1e39},
                 "restitution": coefficient | {"above 1": 1.5},
-                "coupling": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
-                "bodies": without(FLAGS, "None"),
+                "substeps": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
+                "bodies": {"unknown": "moved", "flag": True, "None": None},
+                "max_iterations": NOT_COUNT | {"too many": 41},
                 "min_distance": without(DISTANCES, "None"),
-                "radius": without(MANY_DISTANCES, "None")
-                | {"one bad": [1.0] * (count - 1) + [-1.0], "masked": masked(np.ones(count))},
-                "contact_layer": without(POSITIVE, "None"),
+                "particle_radius": radii,
+                "contact_layer": FLAGS,
                 "lift_speed_limit": FLAGS,
-                "respond": FLAGS,
             },
             raises=bsc.SolverCCD.__init__,
         ),
         "CollisionMonitor": Call(
-            bsc.CollisionMonitor, {"solver": inner}, {"solver": solvers}, raises=bsc.CollisionMonitor.__init__
+            bsc.CollisionMonitor,
+            {"solver": inner},
+            {"solver": solvers, "min_distance": without(DISTANCES, "None"), "particle_radius": radii},
+            raises=bsc.CollisionMonitor.__init__,
+        ),
+        "ContactLayer": Call(
+            bsc.ContactLayer,
+            {"solver": inner},
+            {
+                "solver": solvers,
+                "thickness": without(POSITIVE, "None"),
+                "friction": coefficient | {"huge": 1e39},
+                "restitution": coefficient | {"above 1": 1.5},
+                "min_distance": without(DISTANCES, "None"),
+                "particle_radius": radii,
+            },
+            raises=bsc.ContactLayer.__init__,
         ),
         "CapturedSteps": Call(
             bsc.CapturedSteps,
@@ -386,7 +413,11 @@ def calls_of_solvers() -> dict[str, Call]:
         ),
     }
     states = {"state_in": start, "state_out": end, "control": None, "contacts": None, "dt": 0.01}
-    for name, cls in (("SolverCCD", stage), ("CollisionMonitor", bsc.CollisionMonitor(inner))):
+    for name, cls in (
+        ("SolverCCD", stage),
+        ("CollisionMonitor", bsc.CollisionMonitor(inner)),
+        ("ContactLayer", bsc.ContactLayer(inner)),
+    ):
         found[f"{name}.step"] = Call(
             cls.step,
             states,
@@ -412,7 +443,7 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|CollisionMonitor)\.(coupling_\w+|notify_model_changed|observables|reset|set_collision_frequency|"
+    r"(SolverCCD|CollisionMonitor|ContactLayer)\.(coupling_\w+|notify_model_changed|observables|reset|set_collision_frequency|"
     r"update_contacts|validate_observables)$"
 )
 """Methods that delegate to the inner solver, which checks their arguments."""
@@ -520,10 +551,12 @@ def rows() -> list[Row]:
 NUMERIC = ["", "x", "nan", "inf", "-1", "0", "0.5", "1e400", "1e-320", "True", "10" * 20]
 NUMBERS_OF: dict[Any, list[str]] = {positive: NUMERIC, natural: [text for text in NUMERIC if text != "0"]}
 VALUES: dict[str, list[str]] = {
+    "--clearance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--min-distance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--fail-on": ["", "x", "collisions,x"],
     "--frames": ["", "x", "1", "3:1", "1:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
     "--validate": [*NUMERIC, "ALL"],
+    "--workers": [*NUMERIC, "head:8786", "tcp://", "://head:8786"],
     "--modes": ["", "x", "plain,x"],
 }
 
@@ -571,7 +604,6 @@ TEXTS = {
     "--csv",
     "--baseline",
     "--allow-missing",
-    "--scheduler",
     "--device",
 }
 """Options whose text is looked up where it is used: patterns, files, devices and addresses."""

@@ -218,7 +218,7 @@ def simulate(seed: int, judged: dict[str, Judged], most: int, device) -> bool:
     settings = Settings.draw(seed)
     simulation, counts = Simulation(settings, device), judged[settings.kind]
     with contextlib.redirect_stdout(io.StringIO()):  # Style3D prints how long it prepared
-        solver = simulation.make_solver(coupling=settings.coupling if seed % 3 else None)
+        solver = simulation.make_solver(substeps=settings.substeps if seed % 3 else None)
     rollout, pipeline = Rollout(simulation.model, solver), newton.CollisionPipeline(simulation.model)
     contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
     wrong = 0

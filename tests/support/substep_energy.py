@@ -1,4 +1,4 @@
-"""Energy of random scenes in coupled steps, whatever contacts the program passes on.
+"""Energy of random scenes in substeps, whatever contacts the program passes on.
 
 ``python tests/support/substep_energy.py --count 200`` prints a line for each scene whose kinetic and potential energy
 rises above that at the start by more than 1%, with its seed. It exits with status 1 if that of the inner solver alone
@@ -34,7 +34,7 @@ class Settings:
         kind: One of ``KINDS``.
         inner: The inner solver: ``"vbd"``, ``"xpbd"`` or ``"style3d"``, the last one for drapes and piles.
         contacts: Whether the program passes Newton's contacts on.
-        coupling: Number of substeps, or ``"auto"``.
+        substeps: Number of substeps, or ``"auto"``.
         rate: Steps a second.
     """
 
@@ -42,7 +42,7 @@ class Settings:
     kind: str
     inner: str
     contacts: bool
-    coupling: int | str
+    substeps: int | str
     rate: int
 
     @classmethod
@@ -51,19 +51,19 @@ class Settings:
         rng = np.random.default_rng(seed)
         kind = KINDS[rng.integers(len(KINDS))]
         inners = ["vbd", "vbd", "xpbd", "style3d"] if kind in ("drape", "pile") else ["vbd", "xpbd"]
-        coupling = NUMBERS[rng.integers(len(NUMBERS))]
+        substeps = NUMBERS[rng.integers(len(NUMBERS))]
         return cls(
             seed,
             kind,
             inners[rng.integers(len(inners))],
             bool(rng.integers(2)),
-            coupling if rng.integers(2) else "auto",
+            substeps if rng.integers(2) else "auto",
             int(rng.choice([60, 120])),
         )
 
     def __str__(self):
         contacts = "contacts passed on" if self.contacts else "no contacts passed on"
-        return f"{self.kind}, {self.inner}, {contacts}, coupling={self.coupling!r}, 1/{self.rate} s"
+        return f"{self.kind}, {self.inner}, {contacts}, substeps={self.substeps!r}, 1/{self.rate} s"
 
 
 class Scene:
@@ -176,7 +176,7 @@ class Scene:
         height = 0.01 + self._radius if on_top else low + size + 2.0 * self._radius
         self._add_cloth((-0.3, -0.3, height), 0.6, int(rng.integers(4, 7)))
 
-    def make_solver(self, *, stage=True, coupling=None):
+    def make_solver(self, *, stage=True, substeps=None):
         """Returns the inner solver, behind the stage if asked."""
         settings, model = self._settings, self.model
         match settings.inner:
@@ -191,8 +191,8 @@ class Scene:
         if not stage:
             return solver
         # without Newton's contacts, nobody but the stage keeps bodies on the ground
-        bodies = True if model.body_count and not settings.contacts else None
-        return bsc.SolverCCD(solver, coupling=coupling, bodies=bodies)
+        bodies = "separated" if model.body_count and not settings.contacts else "pushed"
+        return bsc.SolverCCD(solver, substeps=substeps, bodies=bodies)
 
     def elastic_energy(self, x):
         """Returns the energy of stretched triangles (St. Venant-Kirchhoff, as in VBD) or springs [J]."""
@@ -233,18 +233,18 @@ class Scene:
                 total += 0.5 * spin @ model.body_inertia.numpy()[body] @ spin
         return float(total), float(elastic)
 
-    def run(self, *, stage=True, coupling=None, duration=0.4):
+    def run(self, *, stage=True, substeps=None, duration=0.4):
         """Returns how far the energy rises, as a share of that at the start, without and with elastic energy.
 
         With that, the stage's report.
 
         Args:
             stage: Whether the stage is behind the inner solver.
-            coupling: As for ``SolverCCD``.
+            substeps: As for ``SolverCCD``.
             duration: How long [s].
         """
         model, settings = self.model, self._settings
-        solver = self.make_solver(stage=stage, coupling=coupling)
+        solver = self.make_solver(stage=stage, substeps=substeps)
         pipeline = newton.CollisionPipeline(model)
         # Style3D needs contacts, if only none
         contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
@@ -274,9 +274,9 @@ def main():
     for seed in range(arguments.seed, arguments.seed + arguments.count):
         settings = Settings.draw(seed)
         scene = Scene(settings, arguments.device)
-        rise, with_elastic, report = scene.run(coupling=settings.coupling)
-        coupled += report.coupled_steps
-        uncertified += report.uncertified_steps > 0
+        rise, with_elastic, report = scene.run(substeps=settings.substeps)
+        coupled += report.totals.substepped_steps
+        uncertified += report.totals.uncertified_steps > 0
         if with_elastic <= RISE:
             continue
         whole, whole_with_elastic, _ = scene.run()
@@ -292,7 +292,7 @@ def main():
                 flush=True,
             )
     print(
-        f"{arguments.count} scenes, {coupled} coupled steps, {uncertified} scenes with uncertified steps. Kinetic and "
+        f"{arguments.count} scenes, {coupled} steps in substeps, {uncertified} scenes with uncertified steps. Kinetic and "
         f"potential energy rise by more than {RISE:.0%} in {rising}, in {worse} of which that of the inner solver "
         f"does not; with elastic energy in {strained}, in {more_strained} of which more than in whole steps"
     )

@@ -7,7 +7,8 @@ from pxr import Gf, UsdGeom, UsdSkel
 from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.usd import scene as scene_module
-from warp_bsc.usd.scene import FrameRange, Scene
+from warp_bsc.usd.frames import FrameRange
+from warp_bsc.usd.scene import Scene
 
 NAN, INF = math.nan, math.inf
 LAST = 4

@@ -1,4 +1,4 @@
-"""Measures the detector on a scene: the time of a detection, and what it finds."""
+"""Measures the detector on a scene: the time of a detection, and its counts."""
 
 import statistics
 import time
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.collisions import CapturedCollisions, Collisions, DetectionStats, StageCounts
+from .._arguments import checked_integer
+from ..detection.collisions import DetectionStats, StageCounts
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..detection.settings import Method
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from .scenes import BenchmarkScene
 from .timing import replay_graph
@@ -78,7 +80,7 @@ class DetectorBenchmark:
 def benchmark_detector(
     scene: BenchmarkScene,
     *,
-    method: str = "conservative",
+    method: Method = "conservative",
     device: wp.DeviceLike = None,
     repeat: int = 5,
     compare: bool = False,
@@ -95,8 +97,11 @@ def benchmark_detector(
         compare: Whether to measure the IPC Toolkit as well.
 
     Raises:
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``repeat`` is less than 1, or the method is unknown.
         RuntimeError: If a CUDA graph found other pairs than the detection outside it.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     counts_memory = device.is_cuda and wp.is_mempool_enabled(device)
     dtype = wp.vec3 if scene.x0.dtype == np.float32 else wp.vec3d
@@ -107,7 +112,6 @@ def benchmark_detector(
     collisions = detector.detect(x0, x1)
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None
 
-    assert isinstance(collisions, Collisions)  # nothing is captured here
     stats = collisions.stats
     detect, read, stages = [], [], []
     for _ in range(repeat):
@@ -116,7 +120,6 @@ def benchmark_detector(
         collisions = detector.detect(x0, x1)
         wp.synchronize_device(device)
         detect.append(1e3 * (time.perf_counter() - start))
-        assert isinstance(collisions, Collisions)
         stats = collisions.stats  # reads everything else with it
         read.append(1e3 * (time.perf_counter() - start))
         stages.append(stats.milliseconds)
@@ -138,11 +141,11 @@ def benchmark_detector(
 
 
 def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, stats: DetectionStats) -> float:
-    """Median time of a replay of the detection as a CUDA graph [ms]."""
+    """Returns the median time of a replay of the detection as a CUDA graph [ms]."""
     device = detector.mesh.device
     with wp.ScopedCapture(device) as capture:
-        captured = detector.detect(x0, x1)
-    assert capture.graph and isinstance(captured, CapturedCollisions)
+        captured = detector.capture(x0, x1)
+    assert capture.graph is not None
     milliseconds = replay_graph(capture.graph, device, replays=_GRAPH_REPLAYS)
     found = captured.read().stats
     if (found.vertex_face, found.edge_edge) != (stats.vertex_face, stats.edge_edge):

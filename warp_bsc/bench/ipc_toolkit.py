@@ -1,6 +1,6 @@
-"""Measures the IPC Toolkit: its answers to single queries, and its candidates and collision-free step size.
+"""Measures the IPC Toolkit: its results of single queries, and its candidates and collision-free step size.
 
-Its queries are called one by one from Python, and such a call takes longer than many a query. The time of a call is
+Its queries are called one by one from Python, where a call can take longer than the query. The time of a call is
 measured on a query of features so far apart that it ends at once, and subtracted. The subtracted time contains that of
 a query that ends at once: this favors the IPC Toolkit. Queries are timed on one core, without a search for the slowest.
 """
@@ -22,8 +22,8 @@ __all__ = [
     "CCD_CLASSES",
     "IpcQueryTiming",
     "IpcToolkitBenchmark",
-    "answer_queries",
     "benchmark_ipc_toolkit",
+    "decide_queries",
     "is_installed",
     "time_queries",
     "version",
@@ -37,13 +37,13 @@ _FAR = 1e3
 
 @dataclass(frozen=True)
 class IpcQueryTiming:
-    """The answers of one method of the IPC Toolkit to queries, compared with the truth, and their time.
+    """The results of one method of the IPC Toolkit, compared with the truth, and their time.
 
     Attributes:
         queries: Number of queries that were timed, a random part of the scene's.
         nanoseconds: Mean time of a query, without the call from Python [ns].
-        call_nanoseconds: Mean time of such a call, which was subtracted [ns].
-        checked: Number of answers that were compared with the truth.
+        call_nanoseconds: Mean time of a call from Python, which was subtracted [ns].
+        checked: Number of queries that were compared with the truth.
         false_positives: Number of them that are wrongly collisions.
         false_negatives: Number of them that are wrongly free.
     """
@@ -87,17 +87,17 @@ class IpcToolkitBenchmark:
 
 
 def is_installed() -> bool:
-    """Whether the IPC Toolkit is installed."""
+    """Returns whether the IPC Toolkit is installed."""
     return importlib.util.find_spec("ipctk") is not None
 
 
 def version() -> str | None:
-    """Version of the IPC Toolkit, None if it is not installed."""
+    """Returns the version of the IPC Toolkit, None if it is not installed."""
     return importlib.metadata.version("ipctk") if is_installed() else None
 
 
-def answer_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
-    """Whether each query collides by a method of the IPC Toolkit, bool, shape [n].
+def decide_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:
+    """Returns whether each query collides by a method of the IPC Toolkit, bool, shape [n].
 
     Args:
         method: One of :data:`CCD_CLASSES`.
@@ -131,7 +131,7 @@ def time_queries(method: str, kind: PairKind, points: np.ndarray, *, repeat: int
 
 
 def _ccd(method: str, kind: PairKind) -> Callable:
-    """The function that answers one query of this kind."""
+    """Returns the function of the IPC Toolkit for one query of this kind."""
     import ipctk  # noqa: PLC0415 (optional)
 
     ccd = getattr(ipctk, CCD_CLASSES[method])()
@@ -151,7 +151,7 @@ def _mean_nanoseconds(ccd: Callable, queries: list[tuple], repeat: int) -> float
 def benchmark_ipc_toolkit(scene: BenchmarkScene, edges: np.ndarray, *, repeat: int = 5) -> IpcToolkitBenchmark:
     """Measures the IPC Toolkit's candidates and collision-free step size.
 
-    It may use as many threads as the process may use cores. Both its hierarchy and its grid are measured, because the
+    It may use a thread for each core of the process. Both its hierarchy and its grid are measured, because the
     order of their candidates affects the step size as well, and the one that is faster in all is returned. A first run
     of each, in which it allocates its memory, is not timed.
 

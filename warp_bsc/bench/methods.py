@@ -1,10 +1,10 @@
 """The methods that the paper's benchmarks compare.
 
-All methods read the same arrays, positions by the vertices of a pair's elements, as a detector does, and answer the
-same question: do the two features meet? They differ as follows:
+All methods read the same arrays, positions by the vertices of a pair's elements, as a detector does, and decide whether
+the two features meet. They differ as follows:
 
 - ``float``, ``conservative``, ``exact``: the detector's own narrow phase,
-  :class:`~warp_bsc.detection.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the answers of the
+  :class:`~warp_bsc.detection.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the results of the
   contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector leaves to
   the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has compared
   them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
@@ -78,7 +78,7 @@ def _clock() -> wp.int64: ...
 
 @functools.cache
 def _kernels(kind: PairKind, dtype: type):
-    """The kernels for one kind of query and one type of position, each in a module of its own.
+    """Returns the kernels for one kind of query and one type of position, each in a module of its own.
 
     Returns:
         Kernels that solve cubics, cull on a GPU, cull on a CPU, classify by the reduced inside tests, and trace.
@@ -201,7 +201,7 @@ def _kernels(kind: PairKind, dtype: type):
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         decided = _AXIS_BOXES
         if solves_cubic:
-            # any stage: what counts is that the status is computed
+            # any stage: only the time counts, and the status must be computed
             decided = wp.int32(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
         elif not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -244,7 +244,7 @@ class Queries:
 
     @classmethod
     def of_points(cls, kind: PairKind, points: np.ndarray) -> "Queries":
-        """Queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
+        """Returns queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
         n = len(points)
         x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
         vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
@@ -253,11 +253,11 @@ class Queries:
         return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
 
     def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
-        """Points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
+        """Returns the points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
         return query_points(self.elements, self.pairs[which], self.x0, self.x1)
 
     def __len__(self) -> int:
-        """The number of queries."""
+        """Returns the number of queries."""
         return len(self.pairs)
 
 
@@ -313,7 +313,7 @@ class MethodRun:
         retry_until_fits(self.launch, self._narrow_phase, device)
 
     def launch(self) -> None:
-        """Answers all queries; on a GPU without synchronizing with the device."""
+        """Decides all queries; on a GPU without synchronizing with the device."""
         queries = self.queries
         arrays, device = queries.arrays, queries.device
         if self.method in NARROW_PHASE_METHODS:
@@ -338,7 +338,7 @@ class MethodRun:
         )
 
     def read_status(self) -> np.ndarray:
-        """The status of each query after a launch: FREE, HIT or UNSURE, int8, shape [n]. Not for repeated queries."""
+        """Returns the status of each query after a launch: FREE, HIT or UNSURE, int8, shape [n]; not if repeated."""
         if self.method not in NARROW_PHASE_METHODS:
             return self._status.numpy().copy()
         status = np.full(self.queries.count, FREE, dtype=np.int8)
@@ -353,12 +353,12 @@ class MethodRun:
         return status
 
     def find_hits(self) -> np.ndarray:
-        """Whether each query collides by the method, bool, shape [n]: it does unless it is shown to be free."""
+        """Returns whether each query collides by the method, bool, shape [n]: whether it is not decided to be free."""
         return self.read_status() != FREE
 
 
 def measure_nanoseconds(run: MethodRun, *, repeat: int) -> float:
-    """Median time of a query [ns] in launches of all queries: replays of a CUDA graph, calls on the CPU.
+    """Returns the median time of a query [ns] in launches of all queries: replays of a CUDA graph, calls on the CPU.
 
     A first launch, which loads the kernels, is not timed.
 

@@ -1,8 +1,7 @@
 """Measures Newton's own examples, unchanged, plain and with the collision stage behind their solver.
 
-Each run is a process of its own, ``python -m warp_bsc.bench.newton_examples``: the stage is put in place of solver
-classes of :mod:`newton.solvers`, and neither that nor a crash reaches another run. The process runs the example as
-``python -m newton.examples`` does, with a frame loop that measures in place of ``newton.examples.run``.
+Each run is a process of its own, see :mod:`.newton_process`, so that neither a crash nor the solver classes that it
+replaces reach another run.
 """
 
 import ast
@@ -11,21 +10,17 @@ import difflib
 import importlib
 import importlib.util
 import json
-import os
-import runpy
 import shlex
 import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 __all__ = [
     "CPU_FRAMES",
@@ -37,6 +32,7 @@ __all__ = [
     "ExampleRun",
     "NewtonExample",
     "StageTotals",
+    "describe_download",
     "describe_needs",
     "find_examples",
     "measure_example",
@@ -59,9 +55,6 @@ FRAMES = 300
 
 CPU_FRAMES = 10
 """Largest default number of frames on the CPU."""
-
-_SOLVERS = ("SolverVBD", "SolverXPBD", "SolverStyle3D", "SolverSemiImplicit")
-"""The solvers of Newton that move cloth and soft bodies."""
 
 _BUILDERS = ("add_cloth", "add_soft", "add_triangle", "add_tetrahedr")
 """How the names of the functions begin that add cloth and soft bodies to a model."""
@@ -122,8 +115,8 @@ class StageTotals:
 class ExampleMeasurement:
     """Times of an example's frames, and its crossings.
 
-    A crossing is an edge that meets a face of which it shares no vertex, found in exact arithmetic; at least one of the
-    two belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not seen.
+    A crossing is an edge that meets a face without a common vertex, found in exact arithmetic; at least one of the two
+    belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not counted.
 
     Attributes:
         device: The Warp device.
@@ -192,14 +185,6 @@ class ExampleRun:
     problem: str | None = None
 
 
-class _NotApplicable(Exception):
-    """The example cannot be measured in this mode; the message says why."""
-
-
-class _NeedsDownload(Exception):
-    """The example needs an asset that may not be downloaded; the message names it."""
-
-
 def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
     """Returns examples of Newton by name; without one, those with cloth or soft bodies in :data:`FOLDERS`.
 
@@ -233,7 +218,7 @@ def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
 
 
 def _read_example(name: str, module: str, options: tuple[str, ...] = ()) -> NewtonExample:
-    """Reads an example's source for what it needs."""
+    """Reads an example's source for its packages and downloads."""
     specification = importlib.util.find_spec(module)
     assert specification is not None and specification.origin is not None
     tree = ast.parse(Path(specification.origin).read_text(encoding="utf-8"))
@@ -278,12 +263,12 @@ def measure_example(
         device: Name of the Warp device.
         frames: Number of frames, more than :data:`WARM_UP`; default: the number that the example sets, otherwise
             :data:`FRAMES`; on the CPU at most :data:`CPU_FRAMES`.
-        check_every: Crossings are counted at the end of every so many frames, and of the last.
+        check_every: Number of frames after which crossings are counted again; those of the last frame are as well.
         download: Whether the example may download assets.
         progress: Called with the number of frames done and the number of all.
 
     Returns:
-        The measurement, or the reason why there is none; an error of the example, or a crash, is such a reason.
+        The measurement, or the reason why there is none, such as an error of the example or a crash.
 
     Raises:
         ValueError: If the mode or a number is out of range.
@@ -291,9 +276,9 @@ def measure_example(
     if mode not in MODES:
         raise ValueError(f"mode must be one of {', '.join(MODES)}, not {mode!r}")
     if frames is not None and frames <= WARM_UP:
-        raise ValueError(f"the number of frames must be more than {WARM_UP}, whose times are left out, not {frames}")
+        raise ValueError(f"frames must be more than {WARM_UP}, as the times of these are left out, not {frames}")
     if check_every < 1:
-        raise ValueError(f"crossings must be counted every frame or every few frames, not every {check_every}")
+        raise ValueError(f"check_every must be at least 1, not {check_every}")
     needs = describe_needs(example, download=download)
     if needs:
         return ExampleRun(example.title, mode, problem=needs[0])
@@ -324,7 +309,7 @@ def measure_example(
 
 
 def describe_needs(example: NewtonExample, *, download: bool = False) -> list[str]:
-    """Returns what an example needs and has not, a line each, as far as its source says.
+    """Returns the packages and downloads that an example lacks by its source, a line each.
 
     Args:
         example: The example.
@@ -332,20 +317,21 @@ def describe_needs(example: NewtonExample, *, download: bool = False) -> list[st
     """
     needs = [f"needs the package {package}" for package in example.missing]
     if example.downloads and not download:
-        needs.append(_describe_download(", ".join(filter(None, example.downloads))))
+        needs.append(describe_download(", ".join(filter(None, example.downloads))))
     return needs
 
 
-def _describe_download(asset: str) -> str:
+def describe_download(asset: str) -> str:
+    """Returns the line about an asset that may not be downloaded."""
     return f"needs a download: {asset or 'an asset'}"
 
 
 def _replies(request: dict[str, Any], errors) -> Iterator[dict[str, Any]]:
     """Starts a process that serves a request, and yields its replies; the last is its exit status, or its result.
 
-    The process ends with the iteration, whatever ends it.
+    The process ends with the iteration, also where an error ends that.
     """
-    command = [sys.executable, "-m", __name__, json.dumps(request)]
+    command = [sys.executable, "-m", f"{__package__}.newton_process", json.dumps(request)]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True)
     assert process.stdout is not None
     complete = False
@@ -365,270 +351,16 @@ def _replies(request: dict[str, Any], errors) -> Iterator[dict[str, Any]]:
 
 
 def _last_line(errors) -> str:
-    """The last line of a file that is not blank, "" if there is none."""
+    """Returns the last line of a file that is not blank, "" if there is none."""
     errors.seek(0)
     lines = errors.read().decode(errors="replace").split("\n")
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
 
 def _describe_end(status: int, line: str) -> str:
-    """How a process ended that gave no result."""
+    """Returns how a process ended that gave no result."""
     if status < 0:
         with contextlib.suppress(ValueError):  # a signal without a name
             return f"failed: the process was ended by {signal.Signals(-status).name}"
         return f"failed: the process was ended by signal {-status}"
     return f"failed: the process ended with status {status}" + (f": {line}" if line else "")
-
-
-def _describe_error(error: BaseException) -> str:
-    """The type of an error and the first line of its message."""
-    line = _first_line(error)
-    return line if line == type(error).__name__ else f"{type(error).__name__}: {line}"
-
-
-def _first_line(error: BaseException) -> str:
-    """The first line of an error's message, its type if there is none."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-
-
-def _serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> None:
-    """Serves a request of :func:`measure_example` in this process, which is good for no other one afterwards."""
-    try:
-        measured = _measure_here(request, lambda frame, frames: reply({"frame": frame, "frames": frames}))
-    except _NotApplicable as reason:
-        reply({"problem": f"not applicable: {reason}"})
-    except _NeedsDownload as reason:
-        reply({"problem": _describe_download(str(reason))})
-    except Exception as error:
-        missing = error if isinstance(error, ModuleNotFoundError) else error.__cause__
-        if isinstance(missing, ModuleNotFoundError):  # Newton raises an error of its own from that for a backend
-            reply({"problem": f"needs the package {missing.name}"})
-        else:
-            reply({"problem": f"failed: {_describe_error(error)}"})
-    else:
-        reply({"measured": asdict(measured)})
-
-
-def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None]) -> ExampleMeasurement:
-    """Runs an example as the main module, with the frame loop that measures."""
-    import newton.examples  # noqa: PLC0415 (slow)
-    import newton.utils  # noqa: PLC0415 (slow)
-
-    measurements: list[ExampleMeasurement] = []
-    stages: list[Any] = []
-
-    def run(example, arguments):
-        own = arguments.num_frames != newton.examples.create_parser().get_default("num_frames")
-        frames = request["frames"]
-        if frames is None:
-            frames = arguments.num_frames if own else FRAMES
-            frames = min(frames, CPU_FRAMES) if wp.get_device().is_cpu else frames
-        if request["mode"] == "stage" and not stages:
-            raise _NotApplicable(f"no solver with particles is one of {', '.join(_SOLVERS)}")
-        measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
-
-    newton.examples.run = run
-    if not request["download"]:
-        newton.utils.download_asset = newton.examples.download_external_git_folder = _refuse_download
-    if request["mode"] == "stage":
-        _stage_solvers(stages)
-    options = ["--viewer", "null", "--quiet", "--device", request["device"], *request["options"]]
-    if request["frames"] is not None:
-        options += ["--num-frames", str(request["frames"])]
-    sys.argv = [request["module"], *options]
-    runpy.run_module(request["module"], run_name="__main__")
-    if not measurements:
-        raise _NotApplicable("it does not call newton.examples.run")
-    return measurements[0]
-
-
-def _refuse_download(*arguments, **options):
-    """Stands in for the functions of Newton that download."""
-    raise _NeedsDownload(next((str(argument) for argument in (*arguments, *options.values())), ""))
-
-
-class _StagedType(type):
-    """The type of solver classes whose instances come with the collision stage behind them.
-
-    They are subclasses of Newton's, so that examples may read their attributes and derive from them.
-    """
-
-    stages: list[Any]
-
-    def __call__(cls, *arguments, **options):
-        """Makes a solver and returns the stage behind it, or the solver if it has no particles."""
-        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
-
-        solver = super().__call__(*arguments, **options)
-        if not solver.model.particle_count:
-            return solver
-        stage = SolverCCD(solver)
-        cls.stages.append(stage)
-        return stage
-
-    def __instancecheck__(cls, instance):
-        """Whether an instance, or the solver before a stage, is of the class."""
-        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
-
-        return super().__instancecheck__(instance.solver if isinstance(instance, SolverCCD) else instance)
-
-
-def _stage_solvers(stages: list[Any]) -> None:
-    """Replaces the solvers in :mod:`newton.solvers` by staged ones, which list their stages.
-
-    This must come before the example is imported: it may import the classes by name.
-    """
-    import newton.solvers  # noqa: PLC0415 (slow)
-
-    for name in _SOLVERS:
-        solver = getattr(newton.solvers, name)
-        names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages}
-        setattr(newton.solvers, name, _StagedType(name, (solver,), names))
-
-
-def _measure_frames(
-    example: Any, frames: int, check_every: int, stages: list[Any], progress: Callable[[int, int], None]
-) -> ExampleMeasurement:
-    """Runs the frames of an example as ``newton.examples.run`` does, and its tests.
-
-    Args:
-        example: The example, constructed.
-        frames: Number of frames.
-        check_every: Crossings are counted at the end of every so many frames, and of the last.
-        stages: The stages behind its solvers.
-        progress: Called with the number of frames done and the number of all.
-    """
-    crossings = _Crossings(example)
-    model = example.model
-    post_step = _Test(example, "test_post_step")
-    seconds = []
-    at_start = crossings.count()
-    most, first_crossed, first_not_finite = 0, None, None
-    for frame in range(frames):
-        progress(frame, frames)
-        wp.synchronize_device(model.device)
-        start = time.perf_counter()
-        example.step()
-        wp.synchronize_device(model.device)
-        seconds.append(time.perf_counter() - start)
-        post_step.run()
-        example.render()
-        if first_not_finite is None and (frame % check_every == check_every - 1 or frame == frames - 1):
-            if crossings.are_finite():
-                count = crossings.count()
-                most = max(most, count)
-                if count > at_start and first_crossed is None:
-                    first_crossed = frame
-            else:
-                first_not_finite = frame
-    progress(frames, frames)
-    final = _Test(example, "test_final")
-    final.run()
-    totals = [
-        {total.name: getattr(stage.report, total.name) for total in fields(StageTotals)}  # each reads the device
-        for stage in stages
-    ]
-    return ExampleMeasurement(
-        device=str(model.device),
-        particles=model.particle_count,
-        triangles=model.tri_count,
-        tetrahedra=model.tet_count,
-        shapes=model.shape_count,
-        frames=frames,
-        frame_milliseconds=[1e3 * took for took in seconds[WARM_UP:]],
-        crossings_at_start=at_start,
-        most_crossings=most,
-        first_frame_with_crossings=first_crossed,
-        first_frame_not_finite=first_not_finite,
-        stage=StageTotals(**{name: sum(total[name] for total in totals) for name in totals[0]}) if totals else None,
-        test_final=final.result,
-        test_post_step=post_step.result,
-    )
-
-
-class _Test:
-    """A test of an example, by name.
-
-    Attributes:
-        result: "ok", the first line of the message if it failed, None if the example has no such test or it did not
-            run.
-    """
-
-    def __init__(self, example: Any, name: str):
-        self._test = getattr(example, name, None)
-        self.result: str | None = None
-
-    def run(self) -> None:
-        """Runs the test, unless it failed before."""
-        if self._test is None or self.result not in (None, "ok"):
-            return
-        try:
-            self._test()
-            self.result = "ok"
-        except (AssertionError, ValueError) as error:
-            self.result = _first_line(error)
-        except Exception as error:
-            self.result = _describe_error(error)
-
-
-class _Crossings:
-    """Counts the crossings of an example's cloth and soft bodies in its present state.
-
-    Raises:
-        _NotApplicable: If the example has no cloth and no soft bodies, or its state is not where Newton's examples have
-            theirs.
-    """
-
-    def __init__(self, example: Any):
-        from ..detection.detector import CollisionDetector  # noqa: PLC0415 (response, below, imports Newton)
-        from ..response.state.mesh import ModelMesh  # noqa: PLC0415 (imports Newton)
-
-        model = getattr(example, "model", None)
-        self._example = example
-        self._name = next((name for name in ("state_0", "state") if hasattr(example, name)), "")
-        if model is None or not self._name:
-            raise _NotApplicable("it has no attributes model and state_0")
-        if not model.tri_count + model.tet_count:
-            raise _NotApplicable("it has neither cloth nor soft bodies")
-        self._mesh = ModelMesh(model)
-        self._detector = CollisionDetector(self._mesh, method="exact")
-        self._x = wp.zeros(self._mesh.vertex_count, dtype=wp.vec3, device=model.device)
-        particles = model.particle_count
-        self._edge_is_soft, self._face_is_soft = (
-            elements.min(axis=1) < particles for elements in (self._mesh.edges, self._mesh.faces)
-        )
-
-    def count(self) -> int:
-        """Number of crossings that an edge or a face of cloth or of a soft body takes part in."""
-        self._read_positions()
-        edges, faces = self._detector.find_intersections(self._x).T
-        return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())
-
-    def are_finite(self) -> bool:
-        """Whether the positions of all vertices of faces are finite."""
-        self._read_positions()
-        return bool(np.isfinite(self._x.numpy()[self._mesh.vertices]).all())
-
-    def _read_positions(self) -> None:
-        """Reads the positions of the state, which the example may have replaced by another."""
-        state = getattr(self._example, self._name)
-        self._mesh.positions(state.particle_q, state.body_q, self._x)
-
-
-def _main() -> None:
-    """Serves the request in the argument, and writes replies as lines of JSON to standard output.
-
-    All other output, also that of native code, goes to standard error.
-    """
-    replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-
-    def reply(values: dict[str, Any]) -> None:
-        replies.write(json.dumps(values) + "\n")
-        replies.flush()
-
-    _serve(json.loads(sys.argv[1]), reply)
-
-
-if __name__ == "__main__":
-    _main()

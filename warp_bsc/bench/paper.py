@@ -1,7 +1,7 @@
 """The paper's benchmarks: time and errors of each method on the candidate pairs of five scenes.
 
 Queries are the candidate pairs of the broad phase in some of a scene's intervals: pairs that share no vertex and whose
-swept boxes overlap. Where there are too many, a random part of them is measured. All methods get the same arrays.
+swept boxes overlap. If there are too many, a random part of them is measured. All methods read the same arrays.
 
 The exact checker checks every query that any method calls a collision, which includes all that are UNSURE and all that
 the methods disagree about, and a random sample of the others.
@@ -21,7 +21,7 @@ from ..detection.pipeline import DetectionPipeline
 from ..detection.settings import PairKind
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
-from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, answer_queries, time_queries
+from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .scenes import BenchmarkScene
 from .timing import count_threads
@@ -40,12 +40,15 @@ __all__ = [
 
 SEED = 0
 _TURNS = 8  # of timing all methods
-_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # in a launch at least: fewer are repeated, so that its start does not count
+_CPU_QUERIES, _GPU_QUERIES = (
+    2**18,
+    2**22,
+)  # smallest launches: fewer queries are repeated
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """The amount of measurements.
 
     Attributes:
         intervals: Number of intervals of a scene, evenly spaced.
@@ -65,18 +68,18 @@ class Effort:
 
     @classmethod
     def full(cls) -> "Effort":
-        """The effort of the whole benchmark."""
+        """Returns the effort of the whole benchmark."""
         return cls(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
 
     @classmethod
     def quick(cls) -> "Effort":
-        """The effort of a first look."""
+        """Returns the effort of a first look."""
         return cls(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversaries=5000, repeat=3)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where methods are timed.
+    """A device, and the number of its cores, on which methods are timed.
 
     Attributes:
         device: Warp device.
@@ -106,7 +109,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Errors:
-    """The answers of a method, compared with the truth.
+    """The results of a method, compared with the truth.
 
     Attributes:
         hits: Number of queries that it calls collisions; all of them were checked.
@@ -135,11 +138,11 @@ class SceneBenchmark:
         checked: Number of queries compared with the truth: all that any method calls a collision, ``sample`` others.
         sample: Number of checked queries that no method calls a collision.
         errors: Errors by method.
-        disagreeing: Number of answers of a method that differ between devices; none should.
+        disagreeing: Number of results of a method that differ between devices, which should be 0.
         stages: Number of queries that each of :data:`STAGES` decides.
         timings: Times by place.
         stage_milliseconds: Mean time of a detection with method "exact" by stage, on the last place's device [ms].
-        frame_milliseconds: Mean time of such a detection [ms].
+        frame_milliseconds: Mean time of a detection with method "exact" [ms].
         ipc_toolkit: Measurements of the IPC Toolkit by method; empty if it was not measured.
     """
 
@@ -163,7 +166,7 @@ class SceneBenchmark:
 
 
 def find_places(devices: list[wp.Device]) -> list[Place]:
-    """The places of some devices: one core of the CPU, all cores that may be used, and GPUs."""
+    """Returns the places of some devices: one core of the CPU, all cores that may be used, and GPUs."""
     places = []
     for device in devices:
         if device.is_cuda:
@@ -203,9 +206,9 @@ def benchmark_scene(
     if not candidates:
         raise ValueError(f"{name}: no candidate pairs: no swept boxes overlap in the intervals measured")
 
-    answers, unsure, disagreeing = _find_answers(queries, places, progress)
+    found_hits, unsure, disagreeing = _find_hits(queries, places, progress)
     progress("the truth")
-    errors, collisions, checked, sample, truth = _compare(queries, answers, effort)
+    errors, collisions, checked, sample, truth = _compare(queries, found_hits, effort)
     stages = np.zeros(len(STAGES), dtype=int)
     for found in queries.values():
         stages += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(STAGES))
@@ -245,9 +248,9 @@ def benchmark_scene(
 
 
 def _gather(
-    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, most: int
+    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, max_queries: int
 ) -> tuple[dict[PairKind, Queries], int]:
-    """The candidate pairs of some intervals by kind, or a random part of them; and their number."""
+    """Returns the candidate pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
     x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
     elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
@@ -256,7 +259,7 @@ def _gather(
         found = _find_candidates(scene, device)
         number = sum(len(kind_pairs) for _, kind_pairs in found.values())
         candidates += number
-        share = min(1.0, most / len(intervals) / max(number, 1))
+        share = min(1.0, max_queries / len(intervals) / max(number, 1))
         for kind, (kind_elements, kind_pairs) in found.items():
             before = [
                 vertices if kind == PairKind.VERTEX_FACE else sum(map(len, elements[kind])),
@@ -274,7 +277,7 @@ def _gather(
 
 
 def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
-    """Vertices of the elements, and the candidate pairs, by kind."""
+    """Returns the vertices of the elements, and the candidate pairs, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     pipeline = DetectionPipeline(mesh)
     x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
@@ -289,32 +292,32 @@ def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind,
     return found
 
 
-def _find_answers(
+def _find_hits(
     queries: dict[PairKind, Queries], places: list[Place], progress: Callable[[str], None]
 ) -> tuple[dict[tuple[PairKind, str], np.ndarray], int, int]:
-    """Finds which queries collide by kind and method; and the numbers of UNSURE and of device-dependent answers."""
-    answers, unsure, disagreeing = {}, 0, 0
+    """Returns which queries collide by kind and method, and the numbers of UNSURE and of device-dependent results."""
+    found_hits, unsure, disagreeing = {}, 0, 0
     for place in {str(place.device): place for place in places}.values():
-        progress(f"answers, {place.device}")
+        progress(f"results, {place.device}")
         for kind, found in queries.items():
             on_device = QuerySet(found, place.device)
             for method in METHODS:
                 run = MethodRun(method, on_device)
                 run.launch()
                 hits = run.find_hits()
-                if (kind, method) in answers:
-                    disagreeing += int((answers[kind, method] != hits).sum())
+                if (kind, method) in found_hits:
+                    disagreeing += int((found_hits[kind, method] != hits).sum())
                 else:
-                    answers[kind, method] = hits
+                    found_hits[kind, method] = hits
                     if method == "conservative":
                         unsure += int((run.read_status() == UNSURE).sum())
-    return answers, unsure, disagreeing
+    return found_hits, unsure, disagreeing
 
 
 def _compare(
-    queries: dict[PairKind, Queries], answers: dict[tuple[PairKind, str], np.ndarray], effort: Effort
+    queries: dict[PairKind, Queries], found_hits: dict[tuple[PairKind, str], np.ndarray], effort: Effort
 ) -> tuple[dict[str, Errors], int, int, int, dict[PairKind, tuple[np.ndarray, np.ndarray]]]:
-    """Compares the answers with the truth.
+    """Compares the results with the truth.
 
     Returns:
         Errors by method; numbers of collisions, of checked queries and of those in the random sample; and by kind the
@@ -326,7 +329,7 @@ def _compare(
     collisions = checked = sample = 0
     truths = {}
     for kind, found in queries.items():
-        by_method = {method: answers[kind, method] for method in METHODS}
+        by_method = {method: found_hits[kind, method] for method in METHODS}
         suspicious = np.any(list(by_method.values()), axis=0)
         others = np.flatnonzero(~suspicious)
         some = random.permutation(others)[: int(np.ceil(effort.sample * len(found) / total))]
@@ -344,7 +347,7 @@ def _compare(
 
 
 def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
-    """Mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
+    """Returns the mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
     if place.cores == 1:
         with cores(1):
             return _time_methods_here(queries, place, effort, worst=True)
@@ -384,7 +387,7 @@ def _time_methods_here(queries: dict[PairKind, Queries], place: Place, effort: E
         repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
         on_device = QuerySet(found, place.device, repeated=repeated)
         runs = {method: MethodRun(method, on_device) for method in METHODS}
-        # in turns, the fastest of which counts: other work on the machine can only slow a turn down
+        # in turns; the fastest counts, as other work on the machine can only slow a turn down
         repeat = -(-effort.repeat // _TURNS)
         took = [
             {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
@@ -411,6 +414,6 @@ def _time_ipc_toolkit(
         call += called * share
         indices, truth = truths[kind]
         part = random.permutation(len(indices))[: int(np.ceil(effort.ipc_queries * share))]
-        hit, truth = answer_queries(method, kind, found.points(indices[part])), truth[part]
+        hit, truth = decide_queries(method, kind, found.points(indices[part])), truth[part]
         wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
     return IpcQueryTiming(number, nanoseconds, call, *map(int, wrong))

@@ -1,4 +1,4 @@
-"""Measures how many elementary queries a second are answered; queries and answers stay on the device."""
+"""Measures how many elementary queries a second are decided; queries and results stay on the device."""
 
 import functools
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .._arguments import checked_integer
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.settings import TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
-"""The modes that are measured, with the bytes of a query and its answer.
+"""The modes that are measured, with the bytes of a query and its result.
 
 - ``status``: finds the status, one thread a query.
 - ``impact``: finds the time of impact, coordinates and normal as well.
@@ -43,7 +44,7 @@ MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 SEED = 0
 """Seed of the random numbers."""
 
-_MOST_QUERIES = 2**26
+_MAX_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
 _MISSES = {PairKind.VERTEX_FACE: 1.32, PairKind.EDGE_EDGE: 2.33}
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
@@ -55,13 +56,13 @@ _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fus
 
 @dataclass(frozen=True)
 class QueryBenchmark:
-    """Answers to the queries of one kind, and the times to find them.
+    """Results of the queries of one kind, and the times to find them.
 
     Attributes:
         kind: Kind of pair.
-        status: The answers, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
+        status: Status of each query, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
         survivors: Number of queries that no cull decides.
-        milliseconds: Median time to answer all queries, by mode [ms].
+        milliseconds: Median time to decide all queries, by mode [ms].
     """
 
     kind: PairKind
@@ -96,13 +97,21 @@ class QueryBenchmark:
 
     @property
     def bytes_per_second(self) -> dict[str, float]:
-        """Bytes of queries read and of answers written, by mode [1/s]."""
+        """Bytes of queries read and of results written, by mode [1/s]."""
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
 
 @wp.kernel(**_KERNEL)
-def _generate_queries(first: int, seed: int, miss: float, first_points: int, points: wp.array2d[wp.vec3]):
-    """Two features of unit size that fly at each other from a random distance, and deform a little on the way."""
+def _generate_queries(
+    first: int,
+    # in
+    seed: int,
+    miss: float,
+    first_points: int,
+    # out
+    points: wp.array2d[wp.vec3],
+):
+    """Writes two features of unit size that fly at each other from a random distance and deform a little."""
     i = first + wp.tid()
     random = wp.rand_init(seed, i)
     apart = 2.0 * wp.sample_unit_cube(random)
@@ -119,12 +128,18 @@ def _generate_queries(first: int, seed: int, miss: float, first_points: int, poi
 
 @wp.func
 def _rounded(x: wp.vec3) -> wp.vec3:
-    """The nearest multiples of 2^-8."""
+    """Returns the nearest multiples of 2^-8."""
     return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
 
 
 @wp.kernel(**_KERNEL)
-def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
+def _make_touch(
+    first: int,
+    # in
+    other: int,
+    # in and out
+    points: wp.array2d[wp.vec3],
+):
     """Moves the first point of each query onto the edge from point ``other`` to the next, at half time.
 
     After rounding, all numbers are small multiples of 2^-11, so that this is exact.
@@ -141,7 +156,7 @@ def _make_touch(first: int, other: int, points: wp.array2d[wp.vec3]):
 
 @functools.cache
 def _kernels(kind: PairKind):
-    """The kernels for one kind of query, each in a module of its own."""
+    """Returns the kernels for one kind of query, each in a module of its own."""
     vertex_face = kind == PairKind.VERTEX_FACE
     number = int(kind)
     ccd = ccd_vertex_face if vertex_face else ccd_edge_edge
@@ -154,7 +169,13 @@ def _kernels(kind: PairKind):
         return p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7]
 
     @wp.kernel(**_KERNEL)
-    def find_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+    def find_status(
+        first: int,
+        # in
+        points: wp.array2d[wp.vec3],
+        # out
+        status: wp.array[wp.int8],
+    ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         status[i] = wp.int8(ccd(a0, b0, c0, d0, a1, b1, c1, d1))
@@ -162,8 +183,10 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def find_impact(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
         tolerance: wp.float64,
+        # out
         status: wp.array[wp.int8],
         toi: wp.array[wp.float64],
         coordinates: wp.array[wp.vec3d],
@@ -180,15 +203,18 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def cull(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
+        # out
         status: wp.array[wp.int8],
         survivors: wp.array[int],
+        # in and out
         counts: wp.array[wp.int64],
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         status[i] = wp.int8(FREE)
-        # the points are known to be finite
+        # all points are finite
         if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             return
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
@@ -202,10 +228,12 @@ def _kernels(kind: PairKind):
     @wp.kernel(**_KERNEL)
     def classify_survivors(
         first: int,
+        # in
         points: wp.array2d[wp.vec3],
         tolerance: wp.float64,
         survivors: wp.array[int],
         counts: wp.array[wp.int64],
+        # out
         status: wp.array[wp.int8],
     ):
         slot = first + wp.tid()
@@ -215,11 +243,11 @@ def _kernels(kind: PairKind):
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
         y = coplanarity(motion)
-        answer = classify(motion, y)
-        if answer == UNSURE:
-            result = impact(motion, y, answer, tolerance)
-            answer = result.status
-        status[i] = wp.int8(answer)
+        certified = classify(motion, y)
+        if certified == UNSURE:
+            result = impact(motion, y, certified, tolerance)
+            certified = result.status
+        status[i] = wp.int8(certified)
 
     decide = decide_in(1)
 
@@ -228,7 +256,13 @@ def _kernels(kind: PairKind):
         return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
 
     @wp.kernel(**_KERNEL)
-    def find_exact_status(first: int, points: wp.array2d[wp.vec3], status: wp.array[wp.int8]):
+    def find_exact_status(
+        first: int,
+        # in
+        points: wp.array2d[wp.vec3],
+        # out
+        status: wp.array[wp.int8],
+    ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         time = decide(
@@ -251,12 +285,12 @@ def _kernels(kind: PairKind):
 
 def check_query_count(count: int) -> None:
     """Raises ValueError if there are too few or too many queries."""
-    if not 1 <= count <= _MOST_QUERIES:
-        raise ValueError(f"count must be in [1, {_MOST_QUERIES}], not {count}")
+    if not 1 <= count <= _MAX_QUERIES:
+        raise ValueError(f"count must be in [1, {_MAX_QUERIES}], not {count}")
 
 
 def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Random queries, the same on every device; a larger number begins with the queries of a smaller one.
+    """Returns random queries, the same on every device; a larger number begins with the queries of a smaller one.
 
     Args:
         kind: Kind of pair.
@@ -275,7 +309,7 @@ def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None
 
 
 def generate_touching_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Random queries whose first point touches an edge at half time: floating point can certify almost none.
+    """Returns random queries whose first point touches an edge at half time: floating point can certify almost none.
 
     Arguments and result: as of :func:`generate_queries`, whose queries they are made from.
     """
@@ -299,9 +333,11 @@ def benchmark_queries(
         repeat: Number of repetitions; their medians count.
 
     Raises:
-        ValueError: If there are too few or too many queries.
-        RuntimeError: If two modes find different answers, or exact arithmetic misses features that touch.
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``count`` or ``repeat`` is out of range.
+        RuntimeError: If two modes find different results, or exact arithmetic misses features that touch.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     if count is None:
         count = 2**24 if device.is_cuda else 2**18
@@ -309,7 +345,7 @@ def benchmark_queries(
     find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
     touching = generate_touching_queries(kind, count, device=device)
-    # no answer is -1
+    # no status is -1
     status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
     toi = wp.empty(count, dtype=wp.float64, device=device)
     coordinates, normal = (wp.empty(count, dtype=wp.vec3d, device=device) for _ in range(2))
@@ -336,17 +372,17 @@ def benchmark_queries(
 
     runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
     milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
-    answers = {mode: array.numpy() for mode, array in status.items()}
-    missed = int((answers["exact"] != HIT).sum())
+    results = {mode: array.numpy() for mode, array in status.items()}
+    missed = int((results["exact"] != HIT).sum())
     if missed:
         raise RuntimeError(f"{missed} of {count} touching {kind.display_name} queries were found to be free")
     for mode in runs.keys() - {"exact"}:
-        different = int((answers[mode] != answers["status"]).sum())
+        different = int((results[mode] != results["status"]).sum())
         if different:
             raise RuntimeError(
-                f"{different} of {count} {kind.display_name} queries were answered differently by mode {mode}"
+                f"{different} of {count} {kind.display_name} queries were decided differently by mode {mode}"
             )
-    return QueryBenchmark(kind, answers["status"].copy(), int(counts.numpy()[0]), milliseconds)
+    return QueryBenchmark(kind, results["status"].copy(), int(counts.numpy()[0]), milliseconds)
 
 
 def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
@@ -355,7 +391,12 @@ def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     Args:
         device: Warp device; default: Warp's default.
         repeat: Number of repetitions; their median counts.
+
+    Raises:
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``repeat`` is less than 1.
     """
+    repeat = checked_integer(repeat, "repeat", 1)
     device = wp.get_device(device)
     source = wp.full(_COPIED_BYTES, 1, dtype=wp.uint8, device=device)
     target = wp.empty_like(source)

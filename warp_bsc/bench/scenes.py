@@ -24,7 +24,7 @@ __all__ = [
 PAPER_SCENES = ("twisting", "funnel", "dancer", "flamenco", "crashing")
 """Names of the scenes of the paper's benchmarks (Sec. 5.2)."""
 
-_FEWEST_TRIANGLES, _MOST_TRIANGLES = 1000, 20_000_000
+_MIN_TRIANGLES, _MAX_TRIANGLES = 1000, 20_000_000
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class BenchmarkScene:
 
 
 def default_scenes() -> list[str]:
-    """The scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
+    """Returns the scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
     scene = Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
     return [*([str(scene)] if scene.exists() else []), "cloth:5000", "cloth:50000"]
 
@@ -59,15 +59,16 @@ def load_scene(name: str, *, interval: int = 0) -> BenchmarkScene:
         interval: Number of the interval between time samples of a USD file, from 0.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If a file is broken, the two meshes do not fit together, or there is no such generator or interval.
+        FileNotFoundError: If a file does not exist.
+        ValueError: If a file is broken, the two meshes do not fit together, or a generator or an interval does not
+            exist.
     """
     generated = re.fullmatch(r"(\w+):([^/\\]*)", name)
     if generated:
         return BenchmarkScene(name, *_find_generator(name, *generated.groups()))
     if "," in name:
         return _load_pair(name)
-    scene = Scene(name, sample_turns=False)  # what was recorded
+    scene = Scene(name, sample_turns=False)  # samples as they were recorded
     if not 0 <= interval < len(scene):
         raise ValueError(f"{name}: there is no interval {interval}, they go from 0 to {len(scene) - 1}")
     motion = scene.interval(interval)
@@ -100,7 +101,7 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
     """
     if "," in name or re.fullmatch(r"\w+:[^/\\]*", name):
         return [(0, load_scene(name))]
-    scene = Scene(name, sample_turns=False)  # what was recorded
+    scene = Scene(name, sample_turns=False)  # samples as they were recorded
     count = len(scene)
     if count < 1:
         raise ValueError(f"{name}: there is no interval, its meshes never move")
@@ -114,18 +115,18 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
 
 
 def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mesh and the motion of a generated scene."""
+    """Returns the mesh and the motion of a generated scene."""
     if generator not in GENERATORS:
         raise ValueError(f"{name}: there is no generator {generator}, only {', '.join(GENERATORS)}")
-    if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _FEWEST_TRIANGLES <= int(triangles) <= _MOST_TRIANGLES:
+    if not re.fullmatch(r"[0-9]{1,9}", triangles) or not _MIN_TRIANGLES <= int(triangles) <= _MAX_TRIANGLES:
         raise ValueError(
-            f"{name}: the number of triangles must be in [{_FEWEST_TRIANGLES}, {_MOST_TRIANGLES}], not {triangles!r}"
+            f"{name}: the number of triangles must be in [{_MIN_TRIANGLES}, {_MAX_TRIANGLES}], not {triangles!r}"
         )
     return GENERATORS[generator](int(triangles))
 
 
 def _load_pair(name: str) -> BenchmarkScene:
-    """A step from the vertices of one mesh file to those of another."""
+    """Returns a step from the vertices of one mesh file to those of another."""
     paths = name.split(",")
     if len(paths) != 2:
         raise ValueError(f"{name}: expected two files joined by a comma, got {len(paths)}")
@@ -135,7 +136,7 @@ def _load_pair(name: str) -> BenchmarkScene:
     if not np.array_equal(first.faces, second.faces):
         raise ValueError(f"{name}: the two have different faces")
     x0, x1 = np.array(first.vertices), np.array(second.vertices)
-    # trimesh returns double precision, whatever the file has
+    # trimesh returns double precision for any file
     singles = [x.astype(np.float32) for x in (x0, x1)]
     if all(np.array_equal(x, single) for x, single in zip((x0, x1), singles, strict=True)):
         x0, x1 = singles
@@ -158,7 +159,7 @@ def _read_mesh(path):
 
 
 def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A wrinkled sheet, folded in half, that closes until the wrinkles of its two layers meet.
+    """Returns a wrinkled sheet, folded in half, that closes until the wrinkles of its two layers meet.
 
     Args:
         triangles: Approximate number of triangles.
@@ -178,7 +179,7 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     wrinkles = 0.01 * wrinkles + 0.1 / rows * noise[2]
 
     def fold(radius):
-        """Two straight layers, joined by half a circle."""
+        """Returns two straight layers, joined by half a circle."""
         straight = 0.5 * (1.0 - np.pi * radius)
         turn = np.clip((along - straight) / radius, 0.0, np.pi)
         layer = np.where(turn < 0.5 * np.pi, along - straight, 1.0 - straight - along)
@@ -190,7 +191,7 @@ def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def generate_crash(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A square tube of thin sheet, crushed along its axis and pushed aside; every second fold just closes.
+    """Returns a square tube of thin sheet, crushed along its axis and pushed aside; every second fold just closes.
 
     A fold has 16 triangles, and no vertex moves further than a few of them, so that candidates and hits grow in
     proportion to the number of triangles.
@@ -231,7 +232,7 @@ GENERATORS: dict[str, Callable[[int], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def _grid_shape(quads: int) -> tuple[int, int]:
-    """Rows and columns of a nearly square grid of about this number of quads."""
+    """Returns rows and columns of a nearly square grid of about this number of quads."""
     side = int(quads**0.5)
     rows = np.arange(int(0.8 * side), side + 1)
     columns = np.round(quads / rows).astype(int)
@@ -240,7 +241,7 @@ def _grid_shape(quads: int) -> tuple[int, int]:
 
 
 def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
-    """Two triangles for each four vertices of a grid; in a closed grid the first column is next to the last."""
+    """Returns two triangles for each four vertices of a grid; in a closed grid the first column is next to the last."""
     vertex = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     if closed:
         vertex = np.column_stack([vertex, vertex[:, 0]])
@@ -249,7 +250,7 @@ def _grid_faces(rows: int, columns: int, *, closed: bool = False) -> np.ndarray:
 
 
 def _noise(*shape: int) -> np.ndarray:
-    """Random numbers in [-1, 1), the same each time, so that no two features are aligned exactly."""
+    """Returns random numbers in [-1, 1), the same each time, so that no two features are aligned exactly."""
     return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
 

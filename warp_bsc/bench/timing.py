@@ -12,7 +12,7 @@ __all__ = ["count_threads", "limited_threads", "median_milliseconds", "replay_gr
 
 
 def median_milliseconds(run: Callable[[], None], device: wp.Device, repeat: int) -> float:
-    """Median time of a run [ms]: on a GPU of a replay of it as a CUDA graph, on the CPU of a call.
+    """Returns the median time of a run [ms]: on a GPU of a replay of it as a CUDA graph, on the CPU of a call.
 
     A first run, which loads the kernels, is not timed.
     """
@@ -31,7 +31,7 @@ def median_milliseconds(run: Callable[[], None], device: wp.Device, repeat: int)
 
 
 def replay_graph(graph: wp.Graph, device: wp.Device, *, replays: int) -> float:
-    """Median time of a replay of a CUDA graph [ms], measured by events; a first replay is not timed."""
+    """Returns the median time of a replay of a CUDA graph [ms], measured by events; a first replay is not timed."""
     stream = wp.get_stream(device)
     wp.capture_launch(graph)
     milliseconds = []
@@ -45,7 +45,7 @@ def replay_graph(graph: wp.Graph, device: wp.Device, *, replays: int) -> float:
 
 
 def count_threads() -> int:
-    """Number of cores that this process may use."""
+    """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -1,9 +1,9 @@
 """The slowest query of each method: suspects by the processor's clock, times by copies of a query.
 
 A tracing kernel reads the clock before and after each query, a few times, as interrupts and waits for memory lengthen a
-query; the fewest cycles count. These cycles only choose suspects. The suspects are timed by the method itself: each one
-alone, in a launch of copies that is long against the start of a kernel. The shortest of several launches counts. On a
-GPU the copies fill the device, so that every warp is full of the same query.
+query; the smallest number of cycles counts. Cycles only select suspects. Each suspect is then timed by the method
+itself, in a launch of copies that is long compared with the start of a kernel. The shortest of several launches counts.
+On a GPU the copies fill the device, so that all threads of a warp have the same query.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
 
 _LOOKS = 3
 _SUSPECTS = 24
-_FEWEST_COPIES, _MOST_COPIES = 256, 2**16
+_MIN_COPIES, _MAX_COPIES = 256, 2**16
 _GPU_COPIES = 2**18
-_CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would take too many copies
+_CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would need too many copies
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str,
 
 
 def adversarial_queries(kind: PairKind, count: int, *, seed: int = 0) -> Queries:
-    """Random degenerate queries, whose coordinates are small integers, so that many polynomials are exactly zero.
+    """Returns random degenerate queries: coordinates are small integers, so that many polynomials are exactly zero.
 
     A third of them move in one plane, a third start in one plane and leave it, and a third have points anywhere: these
     touch at corners and edges, rest, or turn back from zero.
@@ -80,7 +80,7 @@ def adversarial_queries(kind: PairKind, count: int, *, seed: int = 0) -> Queries
 
 
 def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
-    """Indices of the queries that are likely to be the slowest."""
+    """Returns the indices of the queries that are likely to be the slowest."""
     stages, cycles = trace(queries, method)
     for _ in range(_LOOKS - 1):
         cycles = np.minimum(cycles, trace(queries, method)[1])
@@ -94,13 +94,13 @@ def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
 
 
 def _time_alone(method: str, kind: PairKind, points: np.ndarray, device: wp.Device, repeat: int) -> float:
-    """Time of a query [ns] among copies of itself."""
+    """Returns the time of a query [ns] among copies of itself."""
     if device.is_cuda:
         copies = _GPU_COPIES
     else:
-        copies = _FEWEST_COPIES
+        copies = _MIN_COPIES
         estimate = _time_copies(method, kind, points, copies, device, 1)
-        copies = int(np.clip(_CPU_NANOSECONDS / estimate, _FEWEST_COPIES, _MOST_COPIES))
+        copies = int(np.clip(_CPU_NANOSECONDS / estimate, _MIN_COPIES, _MAX_COPIES))
     return _time_copies(method, kind, points, copies, device, repeat)
 
 

@@ -27,8 +27,8 @@ __all__ = ["add_to"]
 
 _DESCRIPTION = """\
 Measure the detector, from positions on the device to results on the device and
-on the host. A scene is a USD file, one interval of which is measured; two mesh
-files joined by a comma; or generated: cloth:TRIANGLES, a wrinkled sheet that
+on the host. A scene is one interval of a USD file; two mesh files joined by a
+comma; or generated: cloth:TRIANGLES, a wrinkled sheet that
 folds onto itself, or crash:TRIANGLES, a thin tube that is crushed. Default:
 cloth_twist.usd if this is a checkout, cloth:5000 and cloth:50000."""
 

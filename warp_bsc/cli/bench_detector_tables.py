@@ -110,7 +110,7 @@ def print_detector_benchmarks(
 def detector_benchmarks_to_dict(
     benchmarks: list[DetectorBenchmark], *, method: str, device: wp.Device, threads: int, repeat: int
 ) -> dict[str, Any]:
-    """The measurements as plain data for JSON. Arguments: as of :func:`print_detector_benchmarks`."""
+    """Returns the measurements as plain data for JSON. Arguments: as of :func:`print_detector_benchmarks`."""
     return {
         "benchmark": "detector",
         "method": method,
@@ -148,5 +148,5 @@ def detector_benchmarks_to_dict(
 
 
 def _shorten(scenes: list[str]) -> list[str]:
-    """The names of scenes without their folders."""
+    """Returns the names of scenes without their folders."""
     return [",".join(os.path.basename(path) for path in scene.split(",")) for scene in scenes]

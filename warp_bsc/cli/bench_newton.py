@@ -20,11 +20,11 @@ __all__ = ["add_to"]
 _DESCRIPTION = """\
 Run Newton's own examples, unchanged, and measure them: plain, and with
 SolverCCD put behind their solver, or behind each entry of a coupled solver that
-has particles. Each run is a process of its own, in which
-the example captures its own CUDA graph and runs its own tests. Reported are the
-times of frames, without drawing and without the first two; the edges of cloth
-or soft bodies that cross faces at the start, and the most at frame ends, found
-in exact arithmetic; what the stage could not certify; and whether the example's
+has particles. Each run is a process of its own, in which the example captures
+its own CUDA graph and runs its own tests. A row has the times of frames,
+without drawing and without the first two; the edges of cloth or soft bodies
+that cross faces at the start, and the most at frame ends, found in exact
+arithmetic; the steps that the stage did not certify; and whether the example's
 own tests pass. Default: the examples of newton.examples.cloth, softbody and
 multiphysics that have cloth or soft bodies. Any other example of Newton can be
 named. Options of the example itself follow its name, in quotes. A run that
@@ -85,7 +85,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _modes(text: str) -> tuple[str, ...]:
-    """The modes that an argument lists, each once."""
+    """Returns the modes that an argument lists, each once."""
     modes = tuple(dict.fromkeys(text.split(",")))
     for mode in modes:
         if mode not in MODES:

@@ -31,7 +31,7 @@ def print_examples(console: Console, examples: list[NewtonExample]) -> None:
 
 
 def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.Device, partial: bool) -> None:
-    """Prints the times, the crossings and the tests of examples, a row a run, and what the stage reports.
+    """Prints the times, the crossings and the tests of examples, a row a run, and the reports of the stage.
 
     Args:
         console: The terminal or file to print to.
@@ -66,8 +66,8 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     sizes |= {run.example: run.measured for run in runs if run.measured and run.measured.stage}
     if sizes:
         console.print()
-        headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "Uncer-\ntified", "Trun-\ncated", "Stand-\ning")
-        caption = "Steps of the stage: all, not certified, with paths truncated, with vertices left standing."
+        headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
+        caption = "Steps of the stage: all, not certified, with paths truncated, with vertices frozen."
         table = make_table("Example", *headers, caption=caption)
         for name, took in sizes.items():
             counts = [took.particles, took.triangles, took.frames, *(asdict(took.stage).values() if took.stage else ())]
@@ -78,7 +78,7 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
 
 
 def example_runs_to_dict(runs: list[ExampleRun], *, device: wp.Device, partial: bool) -> dict[str, Any]:
-    """The measurements as plain data for JSON. Arguments: as of :func:`print_example_runs`."""
+    """Returns the measurements as plain data for JSON. Arguments: as of :func:`print_example_runs`."""
     return {
         "benchmark": "newton",
         "device": str(device),
@@ -109,7 +109,7 @@ def _measurement_to_dict(took: ExampleMeasurement) -> dict[str, Any]:
 
 
 def _find_failures(took: ExampleMeasurement) -> list[str]:
-    """The messages of an example's tests that failed, and the frame at which positions were not finite."""
+    """Returns the messages of an example's tests that failed, and the frame at which positions were not finite."""
     failures = [f"test_post_step: {took.test_post_step}"] if took.test_post_step not in (None, "ok") else []
     failures += [f"test_final: {took.test_final}"] if took.test_final not in (None, "ok") else []
     if took.first_frame_not_finite is not None:

@@ -26,10 +26,10 @@ _DESCRIPTION = """\
 Measure the paper's five benchmarks, on the candidate pairs of each scene: the
 mean and the worst time of a query by this project's methods, by a
 floating-point cubic solver, by the paper's own inside tests and, if installed,
-by the IPC Toolkit's methods; the wrong answers of each, found by exact
+by the IPC Toolkit's methods; the wrong results of each, found by exact
 arithmetic; the stages that decide the queries; and the time of a detection by
 stage. A scene is one of the five by name, or a scene of warp-bsc bench
-detector. All five take some minutes, with --quick one or two."""
+detector. All five together need several minutes, with --quick one or two."""
 
 _EPILOG = f"""\
 examples:
@@ -49,7 +49,7 @@ def add_to(commands: Commands) -> None:
         commands, "paper", _run, summary="measure the paper's benchmarks", description=_DESCRIPTION, epilog=_EPILOG
     )
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure (default: the paper's five)")
-    command.add_argument("--quick", action="store_true", help="take a first look: few intervals and queries")
+    command.add_argument("--quick", action="store_true", help="measure only a few intervals and queries")
     command.add_argument(
         "--device", help="Warp device, such as cpu or cuda:0 (default: the CPU, and the first GPU if there is one)"
     )
@@ -115,7 +115,7 @@ def _needs_assets(names: list[str]) -> bool:
 
 
 def _outputs(arguments: argparse.Namespace) -> dict[str, str]:
-    """The files to write by option; they are opened before anything is measured, so that no result is lost."""
+    """Returns the files to write by option, opened before anything is measured, so that no result is lost."""
     outputs = {"json": None if arguments.json == STDOUT else arguments.json, "figure": arguments.figure}
     return {option: path for option, path in outputs.items() if path}
 

@@ -59,7 +59,7 @@ def print_paper_benchmarks(
 
 
 def _short(name: str) -> str:
-    """The name of a scene without folder and ending."""
+    """Returns the name of a scene without folder and ending."""
     return ",".join(Path(path).stem if "/" in path or path.endswith(".usd") else path for path in name.split(","))
 
 
@@ -102,7 +102,7 @@ def _print_times(console: Console, rows: list[tuple[str, Timing]]) -> None:
 
 
 def _few_digits(number: float) -> str:
-    """A number without fraction, or with two digits if it is small, as times on a GPU are."""
+    """Returns a number without fraction, or with two digits if it is small, as times on a GPU are."""
     return f"{number:,.0f}" if number >= 10.0 else f"{number:.2g}"
 
 
@@ -136,7 +136,7 @@ def _print_worst(console: Console, rows: _Rows, adversarial: list[tuple[Place, d
 
 def _print_errors(console: Console, rows: _Rows) -> None:
     table = make_table(
-        "Wrong answers",
+        "Wrong results",
         "Checked",
         *_HEADERS.values(),
         caption="False positives + false negatives, of all collisions by any method and a random sample.",
@@ -147,7 +147,7 @@ def _print_errors(console: Console, rows: _Rows) -> None:
     console.print(table)
     for name, found in rows:
         if found.disagreeing:
-            say(console, f"{name}: {count(found.disagreeing, 'answer')} depended on the device.")
+            say(console, f"{name}: {count(found.disagreeing, 'result')} depended on the device.")
     console.print()
 
 
@@ -185,7 +185,7 @@ def _print_ipc_toolkit(console: Console, rows: _Rows) -> None:
 def paper_benchmarks_to_dict(
     benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]], *, quick: bool
 ) -> dict[str, Any]:
-    """The measurements as plain data for JSON.
+    """Returns the measurements as plain data for JSON.
 
     Args:
         benchmarks: The measurements of each scene.

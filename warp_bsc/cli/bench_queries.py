@@ -1,4 +1,4 @@
-"""The command ``warp-bsc bench queries``: measures how many elementary queries a second are answered."""
+"""The command ``warp-bsc bench queries``: measures how many elementary queries a second are decided."""
 
 import argparse
 import json
@@ -16,7 +16,6 @@ from .options import (
     add_json,
     add_repeat,
     add_threads,
-    naming_options,
     positive,
 )
 from .tables import Console
@@ -24,9 +23,9 @@ from .tables import Console
 __all__ = ["add_to"]
 
 _DESCRIPTION = """\
-Measure how many elementary queries a second are answered. The queries are
+Measure how many elementary queries a second are decided. The queries are
 random and the same on every device; a third of them survive the culls. Queries
-and answers stay on the device. On a GPU, replays of a CUDA graph are timed by
+and results stay on the device. On a GPU, replays of a CUDA graph are timed by
 events."""
 
 _EPILOG = f"""\
@@ -54,8 +53,7 @@ def add_to(commands: Commands) -> None:
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.count is not None:
-        with naming_options("count"):
-            check_query_count(arguments.count)
+        check_query_count(arguments.count)
     device = find_device(arguments.device)
     options = {"device": device, "repeat": arguments.repeat}
     with limited_threads(arguments.threads):

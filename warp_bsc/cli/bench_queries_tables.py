@@ -20,7 +20,7 @@ def print_query_benchmarks(
     threads: int,
     repeat: int,
 ) -> None:
-    """Prints the answers to random queries, and how many a second were answered.
+    """Prints the results of random queries, and how many a second were decided.
 
     Args:
         console: The terminal or file to print to.
@@ -36,8 +36,8 @@ def print_query_benchmarks(
     table = make_table("Kind", "Queries", "Survivors", "Share", "Free", "Hit", "Unsure", caption=caption)
     for found in benchmarks:
         numbers = [len(found.status), found.survivors, found.free, found.hits, found.unsure]
-        number, survivors, *answers = (f"{number:,}" for number in numbers)
-        table.add_row(found.kind.display_name, number, survivors, f"{found.survivor_share:.1%}", *answers)
+        number, survivors, *statuses = (f"{number:,}" for number in numbers)
+        table.add_row(found.kind.display_name, number, survivors, f"{found.survivor_share:.1%}", *statuses)
     console.print(table)
     console.print()
 
@@ -72,7 +72,7 @@ def print_query_benchmarks(
 def query_benchmarks_to_dict(
     benchmarks: list[QueryBenchmark], *, copy_rate: float, device: wp.Device, threads: int, repeat: int
 ) -> dict[str, Any]:
-    """The measurements as plain data for JSON. Arguments: as of :func:`print_query_benchmarks`."""
+    """Returns the measurements as plain data for JSON. Arguments: as of :func:`print_query_benchmarks`."""
     return {
         "benchmark": "queries",
         "device": str(device),

@@ -1,4 +1,4 @@
-"""Finds the Warp device and loads kernels, with a message if they have to be compiled."""
+"""Finds the Warp device and loads kernels, with a message if they are compiled."""
 
 import contextlib
 import threading
@@ -12,6 +12,7 @@ from ..detection import start
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
+from ..detection.settings import Method
 from .tables import Console
 
 __all__ = ["find_device", "load_detector", "loading_kernels"]
@@ -20,7 +21,7 @@ _SILENT_SECONDS = 2.0
 
 
 def find_device(name: str | None) -> wp.Device:
-    """The Warp device of a name, Warp's preferred one for None.
+    """Returns the Warp device of a name, Warp's preferred one for None.
 
     Raises:
         ValueError: If there is no such device.
@@ -33,7 +34,7 @@ def find_device(name: str | None) -> wp.Device:
 
 @contextlib.contextmanager
 def loading_kernels(device: wp.Device) -> Iterator[None]:
-    """Prints on standard error why the block takes long, if it does: kernels are being compiled."""
+    """Prints a message on standard error if the block, which may compile kernels, takes more than two seconds."""
     message = f"Compiling kernels for {device}, once for each version: up to a few minutes."
     timer = threading.Timer(_SILENT_SECONDS, Console(stderr=True).print, [message])
     timer.start()
@@ -44,7 +45,7 @@ def loading_kernels(device: wp.Device) -> Iterator[None]:
 
 
 def load_detector(
-    method: str,
+    method: Method,
     dtype: npt.DTypeLike,
     device: wp.Device,
     *,
@@ -52,7 +53,16 @@ def load_detector(
     proximities: bool = False,
     strands: bool = False,
 ) -> None:
-    """Loads the detector's kernels for one type of position, other finders' if wanted; may compile them."""
+    """Loads the detector's kernels for a type of positions, which may compile them.
+
+    Args:
+        method: Method of detection.
+        dtype: Type of the positions, float32 or float64.
+        device: The Warp device.
+        intersections: Whether to load the kernels that find intersections.
+        proximities: Whether to load the kernels that find proximities.
+        strands: Whether to load the kernels for curves and points.
+    """
     triangles = CollisionMesh(np.arange(6).reshape(2, 3), 6, device=device)
     points = np.zeros((6, 3), dtype)
     detector = CollisionDetector(triangles, method=method)

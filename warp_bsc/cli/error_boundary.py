@@ -1,4 +1,4 @@
-"""Turns every error and every signal that ends a command into an exit status and one line. Imports little."""
+"""Turns each error or signal that ends a command into an exit status and one line. Imports little."""
 
 import contextlib
 import io
@@ -11,6 +11,7 @@ from pathlib import Path
 from .._atomic_file import naming
 from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
+from .option_names import with_option
 
 __all__ = ["describe", "run_guarded"]
 
@@ -22,8 +23,8 @@ def run_guarded(command: Callable[[], int]) -> int:
         command: Returns the exit status.
 
     Returns:
-        2 after an error, 128 plus the number of a signal after a signal; a line on standard error says which. 141
-        without a line if the reader of standard output or standard error has closed it.
+        2 after an error, 128 plus its number after a signal, each with a line on standard error; 141 without a line if
+        the reader of standard output or standard error has closed it.
     """
     with INTERRUPTS.handled(), _encodable_output():
         try:
@@ -43,11 +44,14 @@ def run_guarded(command: Callable[[], int]) -> int:
 
 
 def describe(error: BaseException) -> str:
-    """The message of an error in one line; of an unforeseen error also its type and the line that raised it."""
+    """Returns the message of an error in one line, with the option in place of the argument that it begins with.
+
+    For an unforeseen error, its type and the line that raised it are added.
+    """
     usd_errors = [part.commentary for part in error.args if hasattr(part, "commentary")]  # of a Tf.ErrorException
     text = " ".join(("; ".join(usd_errors) or str(error)).split())
     if usd_errors or (isinstance(error, OSError | ValueError) and text):
-        return text
+        return with_option(text)
     text = ": ".join(filter(None, [type(error).__name__, text]))
     folder = Path(__file__).parents[1]
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if folder in Path(frame.filename).parents]
@@ -82,7 +86,7 @@ def _explain(line: str, status: int) -> int:
 
 
 def _discard(*outputs: int) -> None:
-    """Discards what is still buffered for standard output (1) or error (2): Python would fail on it at exit."""
+    """Discards the buffer of standard output (1) or error (2), on which Python would fail at exit."""
     with open(os.devnull, "w") as nowhere:
         for output in outputs:
             os.dup2(nowhere.fileno(), output)

@@ -1,4 +1,4 @@
-"""The exit statuses of all commands, and the part of their help texts on these. Imports little."""
+"""The exit statuses of all commands, and their explanation for help texts. Imports little."""
 
 import textwrap
 from enum import IntEnum
@@ -20,17 +20,17 @@ class ExitStatus(IntEnum):
 _TEXTS = {
     ExitStatus.DONE: "done",
     ExitStatus.FOUND: "done, and found what --fail-on names",
-    ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error says what and where",
-    ExitStatus.DISAGREES: "replay --validate found a wrong answer",
+    ExitStatus.ERROR: "wrong usage, bad input or another error; a line on standard error names it and its place",
+    ExitStatus.DISAGREES: "replay --validate found a wrong decision",
     ExitStatus.LEFT_OUT: "replay is done, but parts of the scene that may hold geometry could not be read and were "
     "left out; replay --strict ends with 2 instead",
-    ExitStatus.BROKEN_PIPE: "the reader of the output has closed it, as head -1 does",
+    ExitStatus.BROKEN_PIPE: "the reader of the output, such as head -1, has closed it",
 }
 _SIGNALS = "  129, 130, 143  interrupted by SIGHUP, by Ctrl-C, by SIGTERM"
 
 
 def explain_statuses(*statuses: ExitStatus) -> str:
-    """Returns the part of a help text on the exit statuses: the given ones, and those that every command has."""
+    """Returns the explanation of some exit statuses, and of those that every command has, for a help text."""
     lines = ["exit status:"]
     for status in sorted({ExitStatus.DONE, ExitStatus.ERROR, *statuses} - {ExitStatus.BROKEN_PIPE}):
         lines += _wrap(status)

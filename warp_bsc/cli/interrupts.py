@@ -1,4 +1,4 @@
-"""Signals that end the program: raised once, as KeyboardInterrupt, so that finished results can be kept."""
+"""Signals that end the program, raised once as KeyboardInterrupt so that finished results can be kept."""
 
 import contextlib
 import signal
@@ -26,11 +26,11 @@ class Interrupted(KeyboardInterrupt):
 class _Interrupts:
     """Handles SIGINT, SIGTERM and SIGHUP within :meth:`handled`.
 
-    Ignored signals, as under ``nohup``, stay ignored. In other threads than the main one, in which Python runs no
-    signal handlers, nothing changes.
+    Ignored signals, as under ``nohup``, stay ignored. Only in the main thread, where Python runs signal handlers, are
+    signals handled.
 
     Attributes:
-        came: The first signal that came, None if none has come.
+        came: The first signal that has arrived, None without one.
     """
 
     def __init__(self):
@@ -40,25 +40,25 @@ class _Interrupts:
 
     @contextlib.contextmanager
     def handled(self) -> Iterator[None]:
-        """Lets signals wait in the block, except where they are raised; restores the handlers at its end."""
+        """Delays signals in the block, except where they are raised; restores the handlers at its end."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
         self._raises = False
         try:
             for number in _NUMBERS:
-                # None is a handler that was not set from Python; it could not be restored.
+                # None is a handler that was not set from Python, which could not be restored.
                 if signal.getsignal(number) not in (signal.SIG_IGN, None):
                     self._handlers[number] = signal.signal(number, self._handle)
             yield
         finally:
             while self._handlers:
                 signal.signal(*self._handlers.popitem())
-            self.came = None  # a later run in another thread would take it for its own
+            self.came = None  # a later run in another thread would raise it
 
     @contextlib.contextmanager
     def raised(self, raises: bool = True) -> Iterator[None]:
-        """Raises the first signal that comes in the block; later ones wait, so that they do not disturb the cleanup."""
+        """Raises the first signal that arrives in the block; delays later ones, so that they do not disturb cleanup."""
         before, self._raises = self._raises, raises
         try:
             yield
@@ -66,11 +66,11 @@ class _Interrupts:
             self._raises = before and (self._raises or not raises)
 
     def held(self) -> contextlib.AbstractContextManager[None]:
-        """Lets signals wait in the block."""
+        """Delays signals in the block."""
         return self.raised(False)
 
     def check(self) -> None:
-        """Raises the signal that came, if any: while it waited, or where its exception was swallowed."""
+        """Raises the signal that has arrived, if any: one that was delayed, or whose exception was swallowed."""
         if self.came:
             raise self.came
 

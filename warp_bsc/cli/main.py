@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import NoReturn
 
-from .. import __version__
+from .._version import __version__
 from . import bench_detector, bench_newton, bench_paper, bench_queries, query, replay
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
@@ -41,7 +41,7 @@ _BENCHMARKS = {"paper": bench_paper, "detector": bench_detector, "queries": benc
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors end as those of bad input do: in one line."""
+    """A parser whose errors are raised as a ValueError, like those of bad input."""
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message}; see {self.prog} --help")
@@ -88,15 +88,15 @@ def _build_parser() -> argparse.ArgumentParser:
 
 
 def _with_benchmark(argv: list[str]) -> list[str]:
-    """The arguments with the default benchmark inserted if ``bench`` names none."""
+    """Returns the arguments with the default benchmark inserted if ``bench`` names none."""
     if argv[:1] == ["bench"] and argv[1:2] not in [[name] for name in (*_BENCHMARKS, "-h", "--help")]:
         return ["bench", "paper", *argv[1:]]
     return argv
 
 
 def _with_joined_frames(argv: list[str]) -> list[str]:
-    """The arguments with the value of --frames joined to it: argparse would take "-10:-8" for an option."""
+    """Returns the arguments with the value of --frames joined to it, as argparse would take "-10:-8" for an option."""
     if "--frames" not in argv[:-1]:
         return argv
-    place = argv.index("--frames")
-    return [*argv[:place], "=".join(argv[place : place + 2]), *_with_joined_frames(argv[place + 2 :])]
+    index = argv.index("--frames")
+    return [*argv[:index], "=".join(argv[index : index + 2]), *_with_joined_frames(argv[index + 2 :])]

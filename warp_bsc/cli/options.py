@@ -1,12 +1,10 @@
-"""What several commands share: options, their types, and the parts of the help texts."""
+"""Options that several commands share, with their types and help texts."""
 
 import argparse
-import contextlib
 import math
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
-from .._arguments import LEAST_DISTANCE
+from .._arguments import SMALLEST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
@@ -19,7 +17,6 @@ __all__ = [
     "add_repeat",
     "add_threads",
     "distance",
-    "naming_options",
     "natural",
     "positive",
 ]
@@ -64,8 +61,8 @@ def add_detection_options(command: argparse.ArgumentParser, *, method: str) -> N
         "--method",
         choices=METHODS,
         default=method,
-        help="float: the signs that floating point computes decide; conservative: pairs that floating point cannot "
-        "certify count as collisions; exact: exact arithmetic decides these pairs (default: %(default)s)",
+        help="float: trust the signs that floating point computes; conservative: count pairs that floating point "
+        "cannot certify as collisions; exact: decide these pairs in exact arithmetic (default: %(default)s)",
     )
     add_device(command)
 
@@ -85,14 +82,14 @@ def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> N
 
     Args:
         group: The command, or a group of its options.
-        reasons: What may be found, and an explanation of each, which may be empty.
+        reasons: The kinds of finding, and an explanation of each, which may be empty.
     """
 
     def parse(text: str) -> frozenset[str]:
         named = frozenset(text.split(","))
         if unknown := named - reasons.keys():
-            wanted = ", ".join(reasons)
-            raise argparse.ArgumentTypeError(f"must be of {wanted}, not {', '.join(sorted(unknown))!r}")
+            known = ", ".join(reasons)
+            raise argparse.ArgumentTypeError(f"must be of {known}, not {', '.join(sorted(unknown))!r}")
         return named
 
     explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
@@ -125,46 +122,34 @@ def add_threads(command: argparse.ArgumentParser) -> None:
 
 
 def distance(text: str) -> float:
-    """The distance that an argument holds.
+    """Returns the distance that a text holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no number, not finite or less than 2^-1021, as 0 is.
+        argparse.ArgumentTypeError: If it is not a number, not finite or less than 2^-1021, for example 0.
     """
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not LEAST_DISTANCE <= number < math.inf:
+    if not SMALLEST_DISTANCE <= number < math.inf:
         raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
     return number
 
 
-@contextlib.contextmanager
-def naming_options(*names: str) -> Iterator[None]:
-    """Names the option in place of the argument, one of some names, with which the message of an error begins."""
-    try:
-        yield
-    except ValueError as error:
-        argument = re.match("|".join(names), str(error))
-        if not argument:
-            raise
-        raise ValueError(f"--{argument[0].replace('_', '-')}{str(error)[argument.end() :]}") from error
-
-
 def positive(text: str) -> int:
-    """The integer that an argument holds.
+    """Returns the integer that a text holds.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no integer or not in [1, 2^31).
+        argparse.ArgumentTypeError: If it is not an integer in [1, 2^31).
     """
     return _integer(text, 1)
 
 
 def natural(text: str) -> int:
-    """The integer that an argument holds, which may be 0.
+    """Returns the integer that a text holds, which may be 0.
 
     Raises:
-        argparse.ArgumentTypeError: If it is no integer or not in [0, 2^31).
+        argparse.ArgumentTypeError: If it is not an integer in [0, 2^31).
     """
     return _integer(text, 0)
 

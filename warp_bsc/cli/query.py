@@ -1,4 +1,4 @@
-"""The command ``warp-bsc query``: answers the elementary queries of CSV files."""
+"""The command ``warp-bsc query``: decides the elementary queries of CSV files."""
 
 import argparse
 import dataclasses
@@ -20,22 +20,22 @@ from .options import (
     distance,
 )
 from .query_file import KINDS, find_query_files, read_query_file
-from .query_tables import QueryAnswers, print_queries, queries_to_dict
+from .query_tables import QueryResults, print_queries, queries_to_dict
 from .tables import Console
 
 __all__ = ["add_to"]
 
 _DESCRIPTION = """\
-Answer elementary queries and, if the truth is known, compare the answers with
+Decide elementary queries and, if the truth is known, compare the results with
 it. A query is eight rows of a CSV file, one a point; a row holds the numerators
-and denominators of x, y and z and, if known, the true answer, 0 or 1. The true
-answers may also be in NAME_mma_bool.json."""
+and denominators of x, y and z and, if known, the true result, 0 or 1. The true
+results may also be in NAME_mma_bool.json."""
 
 _EPILOG = f"""\
 examples:
   warp-bsc query 227vf.csv 227ee.csv
   warp-bsc query unit-tests --method float
-  warp-bsc query pairs.csv --kind edge-edge --json > answers.json
+  warp-bsc query pairs.csv --kind edge-edge --json > results.json
   warp-bsc query 227vf.csv --min-distance 0.001
 
 {explain_statuses(ExitStatus.FOUND)}"""
@@ -46,7 +46,7 @@ _QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_
 def add_to(commands: Commands) -> None:
     """Adds the command with its options."""
     command = add_command(
-        commands, "query", _run, summary="answer queries of CSV files", description=_DESCRIPTION, epilog=_EPILOG
+        commands, "query", _run, summary="decide queries of CSV files", description=_DESCRIPTION, epilog=_EPILOG
     )
     command.add_argument(
         "paths", metavar="FILE", nargs="+", help="a CSV file, or a folder: all CSV files in it and below"
@@ -54,15 +54,15 @@ def add_to(commands: Commands) -> None:
     command.add_argument(
         "--kind",
         choices=KINDS,
-        help="kind of the queries (default: told by a folder vertex-face or edge-edge, or a name ending in vf or ee)",
+        help="kind of the queries (default: that of a folder vertex-face or edge-edge, or a name ending in vf or ee)",
     )
     command.add_argument(
         "--min-distance",
         type=distance,
         default=0.0,
         metavar="D",
-        help="pairs collide that come within D of each other, in the unit of the points (default: that touch); true "
-        "answers in the files, which are those without a distance, are not compared then",
+        help="count pairs that come within D of each other, in the unit of the points, as collisions (default: pairs "
+        "that touch); the true results in the files, which hold without a distance, are not compared then",
     )
     add_detection_options(command, method="exact")
     add_json(command)
@@ -79,14 +79,14 @@ def _run(arguments: argparse.Namespace) -> int:
     with loading_kernels(device):
         for kind in {file.kind for file in files}:
             _QUERIES[kind](np.zeros((1, 8, 3)), **options)
-    answers = []
+    results = []
     for file in files:
         start = time.perf_counter()
         result = _QUERIES[file.kind](file.points, **options)
-        answers.append(QueryAnswers(file, result, 1e3 * (time.perf_counter() - start)))
-    said = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
+        results.append(QueryResults(file, result, 1e3 * (time.perf_counter() - start)))
+    settings = {"method": arguments.method, "device": str(device), "min_distance": arguments.min_distance}
     if arguments.json:
-        print(json.dumps(queries_to_dict(answers, **said)))
+        print(json.dumps(queries_to_dict(results, **settings)))
     else:
-        print_queries(Console(), answers, **said)
-    return ExitStatus.FOUND if arguments.fail_on and any(answer.hits for answer in answers) else ExitStatus.DONE
+        print_queries(Console(), results, **settings)
+    return ExitStatus.FOUND if arguments.fail_on and any(file.hits for file in results) else ExitStatus.DONE

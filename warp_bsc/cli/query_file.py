@@ -1,12 +1,12 @@
-"""Reads the query files of the CCD benchmark: elementary queries in exact rational numbers, with their true answers.
+"""Reads the query files of the CCD benchmark: elementary queries in exact rational numbers, with their true results.
 
 A file holds eight rows for each query, the points in the order of :func:`warp_bsc.query_vertex_face` or
 :func:`warp_bsc.query_edge_edge`. A row holds six integers, the numerator and denominator of x, y and z, or seven: the
-seventh is the query's true answer, 0 or 1, the same on all of its rows. The true answers may also be in
+seventh is the query's true result, 0 or 1, the same on all of its rows. The true results may also be in
 ``NAME_mma_bool.json`` next to ``NAME.csv``, as a list of true and false.
 
 Files of vertex-face and of edge-edge queries look the same. The folder, ``vertex-face`` or ``edge-edge``, or a name
-that ends in ``vf`` or ``ee`` tells their kind.
+that ends in ``vf`` or ``ee`` defines their kind.
 """
 
 import json
@@ -36,8 +36,8 @@ class QueryFile:
         path: The file.
         kind: ``"vertex-face"`` or ``"edge-edge"``.
         points: The points, exactly the numbers of the file, float64, shape [query_count, 8, 3].
-        truth: The true answers, bool, shape [query_count]; None if they are not known.
-        truth_path: The file with the true answers; None if they are not known.
+        truth: The true results, bool, shape [query_count]; None if they are not known.
+        truth_path: The file with the true results; None if they are not known.
     """
 
     path: Path
@@ -48,7 +48,7 @@ class QueryFile:
 
 
 def find_query_files(paths: Iterable[str | os.PathLike]) -> list[Path]:
-    """The given files, with each folder replaced by all ``.csv`` files in it and below.
+    """Returns the given files, with each folder replaced by all ``.csv`` files in it and below.
 
     Raises:
         FileNotFoundError: If a path does not exist, or a folder has no such file.
@@ -72,12 +72,12 @@ def read_query_file(path: str | os.PathLike, *, kind: str | None = None) -> Quer
 
     Args:
         path: The file.
-        kind: ``"vertex-face"`` or ``"edge-edge"``; default: told by the path.
+        kind: ``"vertex-face"`` or ``"edge-edge"``; default: that of the path.
 
     Raises:
-        ValueError: If the path does not tell the kind, the file is not as described above, a number in it is not
-            exactly a double (the answer would be that of another query), or the true answers are in both places and
-            differ. The message names the file and the line.
+        ValueError: If the path does not define the kind, the file is malformed, a number in it is not exactly a double
+            (the result would be that of another query), or the true results in both files differ. The message names
+            the file and the line.
     """
     path = Path(path)
     kind = kind or _kind_of(path)
@@ -88,8 +88,8 @@ def read_query_file(path: str | os.PathLike, *, kind: str | None = None) -> Quer
         truth_of_rows = _truth_of_rows(path, rows[:, 6])
         if truth is not None and (truth != truth_of_rows).any():
             query = int(np.argmax(truth != truth_of_rows))
-            answers = f"is {truth_of_rows[query]:d}, but {truth[query]:d} in {truth_path}"
-            raise ValueError(f"{path}:{8 * query + 1}: the true answer {answers}")
+            values = f"is {truth_of_rows[query]:d}, but {truth[query]:d} in {truth_path}"
+            raise ValueError(f"{path}:{8 * query + 1}: the true result {values}")
         truth, truth_path = truth_of_rows, path
     return QueryFile(path, kind, points, truth, truth_path)
 
@@ -101,18 +101,18 @@ def _kind_of(path: Path) -> str:
     for ending, kind in zip(("vf", "ee"), KINDS, strict=True):
         if path.stem.lower().endswith(ending):
             return kind
-    raise ValueError(f"{path}: vertex-face or edge-edge queries? Say so with --kind")
+    raise ValueError(f"kind: {path} defines neither vertex-face nor edge-edge queries")
 
 
 def _read_rows(path: Path) -> np.ndarray:
-    """The integers of a file, shape [row_count, 6 or 7], int64 where all fit and Python's own otherwise."""
+    """Returns the integers of a file, shape [row_count, 6 or 7], int64 where all fit and Python's own otherwise."""
     text = path.read_text(encoding="ascii", errors="replace").rstrip("\n")
     if not text:
         raise ValueError(f"{path}: the file is empty")
     lines = text.split("\n")
     width = lines[0].count(",") + 1
     if width not in {6, 7}:
-        raise ValueError(f"{path}:1: {width} columns; a row has 6, or 7 with the true answer")
+        raise ValueError(f"{path}:1: {width} columns; a row has 6, or 7 with the true result")
     rows = []
     for number, line in enumerate(lines, 1):
         if not _INTEGERS.fullmatch(line):
@@ -126,7 +126,7 @@ def _read_rows(path: Path) -> np.ndarray:
             raise ValueError(f"{path}:{number}: {len(row)} columns, but {width} on the lines before")
         rows.append(row)
     if len(rows) % 8:
-        raise ValueError(f"{path}:{len(rows)}: the file ends within a query: {len(rows)} rows are no multiple of 8")
+        raise ValueError(f"{path}:{len(rows)}: the file ends within a query: {len(rows)} rows are not a multiple of 8")
     try:
         return np.array(rows, dtype=np.int64)
     except OverflowError:
@@ -134,11 +134,11 @@ def _read_rows(path: Path) -> np.ndarray:
 
 
 def _divide(path: Path, numerators: np.ndarray, denominators: np.ndarray) -> np.ndarray:
-    """The exact quotients as doubles, shape [row_count, 3]."""
+    """Returns the exact quotients as doubles, shape [row_count, 3]."""
     quotients = np.zeros(numerators.shape)
     exact = np.zeros(numerators.shape, bool)
     if numerators.dtype != object:
-        # A double divided by a power of two stays one.
+        # A double divided by a power of two is exact.
         exact = (abs(numerators) <= 2**53) & (denominators > 0) & (denominators & (denominators - 1) == 0)
         np.divide(numerators, denominators, out=quotients, where=exact)
     for row, column in np.argwhere(~exact):
@@ -158,7 +158,7 @@ def _divide(path: Path, numerators: np.ndarray, denominators: np.ndarray) -> np.
 
 
 def _ratio(numerator: int, denominator: int) -> str:
-    """A ratio as text, shortened if it is long."""
+    """Returns a ratio as text, shortened if it is long."""
     return f"{reprlib.repr(numerator)}/{reprlib.repr(denominator)}"
 
 
@@ -167,7 +167,7 @@ def _truth_of_rows(path: Path, column: np.ndarray) -> np.ndarray:
     wrong = (truth != truth[:, :1]) | ((truth != 0) & (truth != 1))
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise ValueError(f"{path}:{row + 1}: the true answer must be 0 or 1, and the same on the 8 rows of a query")
+        raise ValueError(f"{path}:{row + 1}: the true result must be 0 or 1, and the same on the 8 rows of a query")
     return truth[:, 0].astype(bool)
 
 
@@ -179,8 +179,8 @@ def _truth_beside(path: Path, query_count: int) -> tuple[np.ndarray | None, Path
         truth = json.loads(truth_path.read_bytes(), parse_int=float)  # which takes any number of digits
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{truth_path}: not JSON: {error}") from None
-    if not isinstance(truth, list) or not all(isinstance(answer, bool) for answer in truth):
+    if not isinstance(truth, list) or not all(isinstance(value, bool) for value in truth):
         raise ValueError(f"{truth_path}: not a list of true and false")
     if len(truth) != query_count:
-        raise ValueError(f"{truth_path}: {len(truth)} true answers for the {query_count} queries of {path}")
+        raise ValueError(f"{truth_path}: {len(truth)} true results for the {query_count} queries of {path}")
     return np.array(truth), truth_path

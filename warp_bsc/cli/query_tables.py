@@ -1,4 +1,4 @@
-"""Shows the answers to query files: tables for people, plain data for programs."""
+"""Shows the results of query files: tables for people, plain data for programs."""
 
 import os
 from collections.abc import Iterable
@@ -12,19 +12,19 @@ from ..detection.query import QueryResult
 from .query_file import QueryFile
 from .tables import count, make_table, say
 
-__all__ = ["QueryAnswers", "print_queries", "queries_to_dict"]
+__all__ = ["QueryResults", "print_queries", "queries_to_dict"]
 
 _STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
 
 
 @dataclass(frozen=True)
-class QueryAnswers:
-    """The answers to the queries of a file.
+class QueryResults:
+    """The results of the queries of a file.
 
     Attributes:
         file: The queries.
-        result: Their answers.
-        milliseconds: Time to answer all of them [ms].
+        result: Their results.
+        milliseconds: Time to decide all of them [ms].
     """
 
     file: QueryFile
@@ -33,12 +33,12 @@ class QueryAnswers:
 
     @property
     def hits(self) -> int:
-        """Number of queries answered with a collision."""
+        """Number of queries decided as collisions."""
         return int(self.result.hit.sum())
 
     @property
     def certified(self) -> dict[str, int]:
-        """Number of queries that floating point certified free, certified to be hits, and could not certify."""
+        """Number of queries that floating point certified as free, as hits, and could not certify."""
         return {name: int((self.result.status == code).sum()) for code, name in enumerate(_STATUS)}
 
     @property
@@ -56,30 +56,30 @@ class QueryAnswers:
 
 
 def print_queries(
-    console: Console, answers: list[QueryAnswers], *, method: str, device: str, min_distance: float
+    console: Console, results: list[QueryResults], *, method: str, device: str, min_distance: float
 ) -> None:
-    """Prints the answers to query files and, where the truth is known, compares them with it.
+    """Prints the results of query files and compares them with the truth, where that is known.
 
     Args:
         console: The terminal or file to print to.
-        answers: The answers to each file.
+        results: The results of each file.
         method: The method.
         device: The device.
         min_distance: Distance up to which pairs collide; 0 if they must touch.
     """
-    folder = os.path.commonpath([answer.file.path.absolute().parent for answer in answers])
+    folder = os.path.commonpath([found.file.path.absolute().parent for found in results])
     distance = f"; minimum distance {min_distance:g}" if min_distance else ""
-    say(console, f"{count(len(answers), 'file')} in {folder}; method {method} on {device}{distance}")
+    say(console, f"{count(len(results), 'file')} in {folder}; method {method} on {device}{distance}")
     say(console, "Free, hit and unsure: the certificates of floating point, the same for every method.")
     table = make_table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
     _add_files(
         table,
         folder,
-        [(a.file, [len(a.file.points), a.hits, *a.certified.values(), a.milliseconds]) for a in answers],
+        [(a.file, [len(a.file.points), a.hits, *a.certified.values(), a.milliseconds]) for a in results],
     )
     console.print(table)
 
-    known = [(answer.file, answer.confusion) for answer in answers if answer.confusion]
+    known = [(found.file, found.confusion) for found in results if found.confusion]
     if known:
         table = make_table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
         _add_files(table, folder, [(file, list(confusion.values())) for file, confusion in known])
@@ -90,29 +90,27 @@ def print_queries(
             say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
 
 
-def queries_to_dict(answers: list[QueryAnswers], *, method: str, device: str, min_distance: float) -> dict[str, Any]:
-    """The answers as plain data for JSON. Arguments: as of :func:`print_queries`."""
+def queries_to_dict(results: list[QueryResults], *, method: str, device: str, min_distance: float) -> dict[str, Any]:
+    """Returns the results as plain data for JSON; arguments as of :func:`print_queries`."""
     return {
         "method": method,
         "device": device,
         "min_distance": min_distance,
         "files": [
             {
-                "path": str(answer.file.path),
-                "kind": answer.file.kind,
-                "queries": len(answer.file.points),
-                "hits": answer.hits,
-                "certified": answer.certified,
-                "truth_path": str(answer.file.truth_path) if answer.file.truth_path else None,
-                "confusion": answer.confusion,
-                "milliseconds": answer.milliseconds,
-                "hit": answer.result.hit.tolist(),
-                "status": [_STATUS[status] for status in answer.result.status],
-                "toi": None
-                if answer.result.toi is None
-                else [toi if toi <= 1.0 else None for toi in answer.result.toi],
+                "path": str(found.file.path),
+                "kind": found.file.kind,
+                "queries": len(found.file.points),
+                "hits": found.hits,
+                "certified": found.certified,
+                "truth_path": str(found.file.truth_path) if found.file.truth_path else None,
+                "confusion": found.confusion,
+                "milliseconds": found.milliseconds,
+                "hit": found.result.hit.tolist(),
+                "status": [_STATUS[status] for status in found.result.status],
+                "toi": None if found.result.toi is None else [toi if toi <= 1.0 else None for toi in found.result.toi],
             }
-            for answer in answers
+            for found in results
         ],
     }
 

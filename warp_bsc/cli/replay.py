@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import errno
 import importlib
-import math
 import os
 import shlex
 import time
@@ -26,61 +25,18 @@ from ..replay.summary import Summary
 from ..replay.threads import WriteBehind
 from ..replay.usd_overlay import SHOWN_BY, Overlay
 from ..replay.workers import device_of_cluster
-from ..usd.scene import FrameRange, Scene
-from ..usd.selection import PURPOSES, Selection
+from ..usd.scene import Scene
+from ..usd.selection import Selection
 from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
-from .exit_status import ExitStatus, explain_statuses
+from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
-from .options import (
-    Commands,
-    add_command,
-    add_detection_options,
-    add_fail_on,
-    distance,
-    naming_options,
-    positive,
-)
+from .options import Commands, add_command
+from .replay_options import DESCRIPTION, EPILOG, add_replay_options
 from .replay_tables import print_new, print_replay, print_work
 from .tables import Console, say
 
 __all__ = ["add_to", "open_scene", "run_replay"]
-
-_DESCRIPTION = """\
-Find the collisions of the meshes of a USD scene, with themselves and with each
-other, between each two consecutive time samples; vertices move straight from
-sample to sample. Meshes that never move are obstacles: contacts between
-obstacles are excluded, and so are contacts of a mesh with itself if only its
-transform moves it. Linear curves and points take part, with half their widths
-as radii. Rotations are sampled at every whole time code as well.
-At the time samples themselves, find the edges that pass through faces and the
-meshes that are wholly inside closed ones, obstacles and linear curves included;
-where nothing moves, this is done at one time.
-Parts that cannot be read are named and left out. Files are written atomically.
-A run that Ctrl-C, SIGTERM, SIGHUP or an error stops leaves valid files of the
-finished intervals, marked partial; one that is killed leaves, with --json, what
---resume needs."""
-
-_EPILOG = f"""\
-examples:
-  warp-bsc replay cloth.usd
-  warp-bsc replay shot.usd --overlay hits.usda --report hits.html
-  warp-bsc replay shot.usd --between '/World/Coat' '/World/Body*' --no-self
-  warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
-  warp-bsc replay cloth.usd --device cpu --method conservative
-  warp-bsc replay cloth.usd --json > collisions.json
-  warp-bsc replay cloth.usd --min-distance 0.002 --fail-on distance
-  warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
-  warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
-  warp-bsc replay shot.usd --workers 16 --json hits.json --resume
-  warp-bsc replay shot.usd --scheduler tcp://head:8786 --report hits.html
-
-  a recording of one of Newton's examples:
-  python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
-      --output-path twist.usd
-  warp-bsc replay twist.usd
-
-{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
 
 _LOG_SECONDS = 10.0
 """Time between two lines on the progress, where there is no terminal."""
@@ -93,156 +49,10 @@ def add_to(commands: Commands) -> None:
         "replay",
         _run,
         summary="find the collisions in a USD scene",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
+        description=DESCRIPTION,
+        epilog=EPILOG,
     )
-    command.add_argument("scene", metavar="SCENE", nargs="?", help="a .usd, .usda, .usdc or .usdz file")
-
-    which = command.add_argument_group("selection")
-    patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
-    which.add_argument(
-        "--prims",
-        **patterns,
-        help="only meshes at or below these prims or instances, named as in the report; * matches any text",
-    )
-    which.add_argument("--exclude", **patterns, help="no meshes at or below these prims")
-    which.add_argument(
-        "--self",
-        dest="self_collisions",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="check each mesh with itself (default: yes, unless only its transform moves it)",
-    )
-    which.add_argument(
-        "--intersections",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "
-        "are wholly inside others (default: yes)",
-    )
-    which.add_argument(
-        "--min-distance",
-        type=distance,
-        metavar="D",
-        help="find the vertices and faces, and the edges, that are at most D apart at the time samples themselves, in "
-        "the scene's unit, without neighbours: those that share a vertex or that an edge joins. Distances between the "
-        "samples are not checked, nor are those of curves and points; an edge through a face is an intersection, "
-        "however far their vertices are",
-    )
-    which.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="only pairs of a mesh of pattern A and one of pattern B"
-    )
-    which.add_argument(
-        "--ignore",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("A", "B"),
-        help="ignore pairs of a mesh of pattern A and one of pattern B, which are only counted; may be repeated",
-    )
-    which.add_argument(
-        "--ignore-from",
-        metavar="FILE",
-        help="pairs to ignore from a file: two patterns a line, in quotation marks if they contain blanks; # begins a "
-        "comment",
-    )
-    which.add_argument(
-        "--ignore-initial",
-        action="store_true",
-        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; of those "
-        "that are inside others then, ignore only that they are inside",
-    )
-    which.add_argument(
-        "--purpose",
-        nargs="+",
-        action="extend",
-        choices=PURPOSES,
-        metavar="PURPOSE",
-        help="purposes of the meshes: default, render, proxy, guide (default: default render)",
-    )
-    which.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="START:END:STEP",
-        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
-    )
-    which.add_argument(
-        "--subdivide",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="divide the time from each sample to the next into N intervals, for motion that is not linear, such as "
-        "rotations (default: 1)",
-    )
-    which.add_argument(
-        "--strict",
-        action="store_true",
-        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
-    )
-    which.add_argument(
-        "--allow-missing",
-        **patterns,
-        help="only note that these files, or files or prims to which these prims refer, are missing; * matches any "
-        "text. Materials, textures and other files that cannot hold geometry may always be missing",
-    )
-    which.add_argument(
-        "--validate",
-        type=_validate,
-        default=0,
-        metavar="all|N",
-        help="compare answers with the exact checker: all, or N hits and N other pairs of each interval",
-    )
-
-    out = command.add_argument_group("output")
-    out.add_argument(
-        "--overlay",
-        metavar="FILE",
-        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
-    )
-    file = {"type": _output, "metavar": "FILE"}
-    out.add_argument(
-        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
-    )
-    printed = {"nargs": "?", "const": STDOUT, **file}
-    out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
-    out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
-    out.add_argument(
-        "--baseline",
-        metavar="FILE",
-        help="compare with the JSON file of an earlier replay, which had the same options: print which meshes collide, "
-        "cross, are inside others or, with --min-distance, near each other at times at which they were not",
-    )
-    add_fail_on(
-        out,
-        {
-            "intersections": "edges through faces, meshes inside others",
-            "collisions": "",
-            "distance": "what --min-distance finds",
-            "new": "what --baseline does not have",
-        },
-    )
-    run = command.add_argument_group("running")
-    run.add_argument(
-        "--workers",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="check intervals in N processes on this machine, which share its cores, or use a GPU each, in turns, "
-        "unless --device names one, such as cuda:0; more processes than GPUs share these (default: 1)",
-    )
-    run.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="check intervals in the workers of a Dask cluster with this scheduler, which must see the scene by the "
-        "same path; needs pip install 'warp-bsc[cluster]'",
-    )
-    run.add_argument(
-        "--resume",
-        action="store_true",
-        help="take what the file of --json, or that file with .part appended, has of an earlier run with the same "
-        "options and files, which was stopped or killed, and check the rest; without these files, check all",
-    )
-    add_detection_options(command, method="exact")
+    add_replay_options(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -252,14 +62,15 @@ def _run(arguments: argparse.Namespace) -> int:
         baseline = Baseline(
             arguments.baseline,
             method=arguments.method,
-            min_distance=arguments.min_distance,
+            clearance=arguments.clearance,
             options=_describe_options(scene, arguments),
         )
-    if arguments.scheduler:
+    if isinstance(arguments.workers, str):
         try:
-            return run_replay(scene, arguments, device_of_cluster(arguments.scheduler, arguments.device), baseline)
-        except ModuleNotFoundError as error:
-            raise ValueError(f"--scheduler: {error}") from error
+            device = device_of_cluster(arguments.workers, arguments.device)
+        except ModuleNotFoundError as error:  # wrong usage, not an unforeseen error
+            raise ValueError(str(error)) from error
+        return run_replay(scene, arguments, device, baseline)
     device = find_device(arguments.device)
     with loading_kernels(device):
         load_detector(
@@ -267,7 +78,7 @@ def _run(arguments: argparse.Namespace) -> int:
             scene.dtype,
             device,
             intersections=arguments.intersections,
-            proximities=arguments.min_distance is not None,
+            proximities=arguments.clearance is not None,
             strands=scene.has_strands,
         )
     return run_replay(scene, arguments, str(device), baseline)
@@ -291,21 +102,19 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
-    if "distance" in arguments.fail_on and arguments.min_distance is None:
-        raise ValueError("--fail-on distance needs --min-distance")
+    if "distance" in arguments.fail_on and arguments.clearance is None:
+        raise ValueError("--fail-on distance needs --clearance")
     if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
-        raise ValueError("--no-intersections: --ignore-initial and --fail-on intersections need them")
+        raise ValueError("--ignore-initial and --fail-on intersections need --intersections")
     if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
-    if arguments.scheduler and arguments.workers > 1:
-        raise ValueError("--workers, --scheduler: either processes on this machine, or those of a cluster")
     if outputs.count(STDOUT) > 1:
-        raise ValueError("--json, --csv and --report to standard output: only one of them can be printed")
+        raise ValueError("--json, --csv and --report: only one of them can be printed on standard output")
     written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
-    places = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
-    for place in places:
-        if places.count(place) > 1:
-            raise ValueError(f"{place}: named twice, as two files of a replay")
+    paths = [os.path.realpath(file) for file in [arguments.scene, *written] if file != STDOUT]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path}: named twice, as two files of a replay")
     selection = Selection(
         prims=tuple(arguments.prims),
         exclude=tuple(arguments.exclude),
@@ -315,11 +124,10 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         ignore=(*map(tuple, arguments.ignore), *(_read_pairs(arguments.ignore_from) if arguments.ignore_from else ())),
     )
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
-        importlib.import_module("warp_bsc.usd.meshes")
+        importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     try:
-        names = "prims", "exclude", "between", "frames", "subdivide"
-        with naming_options(*names), _Progress("Comparing vertices") as progress:
+        with _Progress("Comparing vertices") as progress:
             scene = Scene(
                 arguments.scene,
                 selection=selection,
@@ -346,13 +154,13 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         scene: The scene.
         arguments: The options.
         device: Name of the Warp device.
-        baseline: What an earlier replay has found, to compare with; None for nothing.
+        baseline: The earlier replay to compare with, None without one.
 
     Raises:
-        ValueError: If the scene is broken at some time, or a file cannot be written. The finished intervals are on the
-            disk, as far as it has space.
+        ValueError: If the scene is broken at some time, or a file cannot be written. The files contain the finished
+            intervals, or as many as the disk has space for.
     """
-    settings = {"method": arguments.method, "device": device, "min_distance": arguments.min_distance}
+    settings = {"method": arguments.method, "device": device, "clearance": arguments.clearance}
     facts = replay_facts(scene, **settings, options=_describe_options(scene, arguments))
     with contextlib.ExitStack() as stack:
         earlier = find_earlier(arguments.json, facts) if arguments.resume else None
@@ -386,19 +194,19 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
             except KeyboardInterrupt as stopped:
                 interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
             except Exception as error:
-                interrupt = INTERRUPTS.came  # which a library may have turned into another error
+                interrupt = INTERRUPTS.came  # a library may have turned it into another error
                 problems += [] if interrupt else [_explain(error, scene)]
             try:
                 written.wait()
             except Exception as error:
-                problem = _explain(error, scene)  # a change of the scene's files is found by all that read or write
+                problem = _explain(error, scene)  # readers and writers all find a change of the scene's files
                 problems += [] if interrupt or problem in problems else [problem]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
             summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
-            if len(intervals) < earlier_count:  # or a shorter one, from which a later run can go on
+            if len(intervals) < earlier_count:  # or than a shorter one, as a later run can resume it
                 finished = [output for output in finished if not isinstance(output, HitsJson)]
-            # No signal disturbs the files. It does stop the streams, whose reader may never read to the end.
+            # Signals do not interrupt the files. They do interrupt streams, whose reader may not read to the end.
             problems += _finish([output for output in finished if not output.file.is_stream], summary)
             try:
                 with INTERRUPTS.raised():
@@ -437,7 +245,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
 
 
 def _explain(error: Exception, scene: Scene) -> str:
-    """Describes what stopped a replay: a change of the scene's files, which may cause any error, or the error."""
+    """Returns why a replay stopped: a change of the scene's files, which may cause any error, or else the error."""
     try:
         scene.files.check()
     except ValueError as changed:
@@ -448,12 +256,13 @@ def _explain(error: Exception, scene: Scene) -> str:
 
 
 def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
-    """Puts files in their places, without the last intervals if the disk is full; returns the parts that are missing.
+    """Finishes files, without their last intervals if the disk is full; returns messages on missing parts.
 
-    On a full disk all files shrink, but not below half of their intervals: tables matter more than a page.
+    On a full disk all files shrink down to half of their intervals. After that only the file that does not fit
+    shrinks, or is omitted; the page comes first, as it matters least.
     """
     problems, shortages = [], {}
-    shared = 5  # times an eighth is a half
+    shared = 5  # number of eighths that all files lose, which leave about a half
     waiting = outputs[::-1]  # the tables, which are the largest, come last
     while waiting:
         output = waiting[0]
@@ -461,7 +270,7 @@ def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
             output.finish(summary)
         except Exception as error:
             if isinstance(error, BrokenPipeError) and str(output.file.path) == STDOUT:
-                raise  # nobody reads it any more, which is no error
+                raise  # its reader has closed it, which is not an error
             number = error.errno if isinstance(error, OSError) else None
             sharing, smaller = [output], []
             if number in (errno.ENOSPC, errno.EDQUOT) and shared:
@@ -484,7 +293,7 @@ def _open_outputs(
     facts: dict[str, Any],
     earlier_count: int,
 ) -> list[ReplayOutput]:
-    """Opens the files to write; the stack discards those that are not finished."""
+    """Opens the files that the options name; the stack discards those that are not finished."""
     makers = (
         (
             arguments.json,
@@ -503,12 +312,12 @@ def _open_outputs(
 
 
 class _Progress:
-    """Shows how far a run is: a bar on a terminal, else a line on standard error every few seconds."""
+    """Shows the progress of a run: a bar on a terminal, else a line on standard error every ten seconds."""
 
-    def __init__(self, what: str):
-        self._what = what
+    def __init__(self, activity: str):
+        self._activity = activity
         self._bar = Progress(
-            TextColumn(what),
+            TextColumn(activity),
             BarColumn(bar_width=None),
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}"),
@@ -518,7 +327,7 @@ class _Progress:
         )
         self._bar.disable = not self._bar.console.is_terminal
         self._task = self._bar.add_task("", total=None, note="")
-        self._started = self._said = time.monotonic()
+        self._started = self._last_line = time.monotonic()
 
     def __enter__(self) -> "_Progress":
         self._bar.start()
@@ -528,15 +337,15 @@ class _Progress:
         self._bar.stop()
 
     def show(self, done: int, total: int, note: str = "") -> None:
-        """Shows how much is done of all, and a note on it."""
+        """Shows how much of the total is done, and a note."""
         now = time.monotonic()
         if done:
             note += f"{', ' * bool(note)}{done / max(now - self._started, 1e-9):.1f}/s"
         self._bar.update(self._task, completed=done, total=total, note=note)
-        if self._bar.disable and done and now - self._said > _LOG_SECONDS:
-            self._said = now
+        if self._bar.disable and done and now - self._last_line > _LOG_SECONDS:
+            self._last_line = now
             left = (now - self._started) / done * (total - done)
-            say(self._bar.console, f"{self._what}: {done} of {total}, {note}, about {left:,.0f} s left")
+            say(self._bar.console, f"{self._activity}: {done} of {total}, {note}, about {left:,.0f} s left")
 
 
 def _track(
@@ -551,18 +360,17 @@ def _track(
             device=arguments.device,
             intersections=arguments.intersections,
             ignore_initial=arguments.ignore_initial,
-            min_distance=arguments.min_distance,
-            validate_most=arguments.validate,
+            clearance=arguments.clearance,
+            validate=arguments.validate,
             earlier=earlier.results(scene) if earlier else (),
             workers=arguments.workers,
-            scheduler=arguments.scheduler,
         ):
             yield result
             progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the options that the results depend on, but for those that the facts of a replay contain anyway."""
+    """Returns the options that the results depend on, except method, device and clearance."""
     selection = asdict(scene.selection)
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
     names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
@@ -588,34 +396,3 @@ def _read_pairs(path: str) -> list[tuple[str, str]]:
                 raise ValueError(f"{path}: line {number}: must be two patterns, not {len(patterns)}")
             pairs += [(patterns[0], patterns[1])] if patterns else []
     return pairs
-
-
-def _output(text: str) -> str:
-    return STDOUT if text == "/dev/stdout" else text
-
-
-def _frames(text: str) -> FrameRange:
-    parts = text.split(":")
-    if len(parts) > 3:
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP, not {text!r}")
-    try:
-        numbers = [float(part) if part else None for part in parts]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}") from None
-    start, end, step = numbers + [None] * (3 - len(numbers))
-    if any(number is not None and not math.isfinite(number) for number in numbers):
-        raise argparse.ArgumentTypeError(f"must be finite numbers, not {text!r}")
-    if step is not None and step <= 0:
-        raise argparse.ArgumentTypeError(f"STEP must be more than 0, not {step:g}")
-    if len(parts) < 2 or (start is not None and end is not None and end <= start):
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END after START, not {text!r}")
-    return FrameRange(start, end, step)
-
-
-def _validate(text: str) -> int | None:
-    if text == "all":
-        return None
-    try:
-        return positive(text)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"must be all or an integer of at least 1, not {text}") from error

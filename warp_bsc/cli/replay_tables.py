@@ -9,6 +9,7 @@ from ..replay.baseline import NewFinding
 from ..replay.results import IntersectionSummary, IntervalSummary, Work
 from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
+from .option_names import with_option
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_new", "print_replay", "print_work"]
@@ -32,7 +33,7 @@ def print_replay(console: Console, summary: Summary) -> None:
         f"{summary.device}",
     )
     for warning in scene.warnings:
-        say(console, f"note: {warning}")
+        say(console, f"note: {with_option(warning)}")
     say(console, f"note: {summary.motion}")
     if not summary.is_complete:
         say(
@@ -57,8 +58,8 @@ def print_replay(console: Console, summary: Summary) -> None:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
     if summary.intersections:
         _print_intersections(console, summary)
-    if summary.min_distance is not None:
-        _print_proximities(console, summary, summary.min_distance)
+    if summary.clearance is not None:
+        _print_proximities(console, summary, summary.clearance)
     if summary.ignored:
         ignored = sum(hits for _, hits in summary.ignored)
         say(console, f"Ignored: {count(ignored, 'colliding pair')} of {count(len(summary.ignored), 'pair')} of meshes.")
@@ -77,11 +78,11 @@ def print_replay(console: Console, summary: Summary) -> None:
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
-    """Prints which part of the work took how long.
+    """Prints the times of the parts of the work.
 
     Args:
         console: The terminal or file to print to.
-        works: The work for each interval, None for those found earlier.
+        works: The work for each interval, None for those of an earlier run.
         writing: Time to write all of them [s].
     """
     done = [work for work in works if work]
@@ -111,15 +112,15 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
 
 
 def print_new(console: Console, new: list[NewFinding]) -> None:
-    """Prints what is new against a baseline."""
+    """Prints the findings that a baseline does not contain."""
     if not new:
         say(console, "Nothing is new against the baseline.")
         return
     say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
     for what, meshes, start, end in new[:LONGEST]:
-        says = " is inside ".join(meshes) if what == "is inside" else f"{_pair(meshes)} {what}"
+        finding = " is inside ".join(meshes) if what == "is inside" else f"{_pair(meshes)} {what}"
         when = f"at {start:g}" if start == end else f"from {start:g} to {end:g}"
-        say(console, f"  {says} {when}")
+        say(console, f"  {finding} {when}")
     if len(new) > LONGEST:
         say(console, f"  and {len(new) - LONGEST} more.")
 
@@ -141,7 +142,7 @@ def _print_certificate(console: Console, summary: Summary) -> None:
             f"certify: {unsure:,}.",
         )
     else:
-        say(console, f"Certified for {CERTIFIED_FOR}: every answer.")
+        say(console, f"Certified for {CERTIFIED_FOR}: every pair tested.")
 
 
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
@@ -175,12 +176,12 @@ def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
         wide = console.options.update(width=1000)
         if not stages or console.measure(table, options=wide).maximum <= console.width:
             break
-        stages.pop()  # the stage of least interest, as the table is too wide
+        stages.pop()  # the least interesting stage, as the table is too wide
     console.print(table)
 
 
 def _print_collisions(console: Console, summary: Summary) -> None:
-    """Prints the number of pairs that collide, in all and by meshes, and the first contact."""
+    """Prints the total number of pairs that collide, their numbers by meshes, and the first contact."""
     colliding = summary.colliding
     kinds = ["vertex_face", "edge_edge"] + ["vertex_edge", "vertex_vertex"] * summary.scene.has_strands
     numbers = [sum(getattr(interval, f"{kind}_hits") for interval in colliding) for kind in kinds]
@@ -209,7 +210,7 @@ def _print_collisions(console: Console, summary: Summary) -> None:
 
 
 def _print_intersections(console: Console, summary: Summary) -> None:
-    """Prints what intersects at the times themselves, since when and until when, and how collisions compare."""
+    """Prints the intersections at the times themselves, their spans of time, and the phases of the collisions."""
     samples, spans = summary.intersections, summary.intersection_spans
     times = count(len(samples), "time")
     if not spans:
@@ -217,8 +218,8 @@ def _print_intersections(console: Console, summary: Summary) -> None:
         return
     first = samples[0]
     if not first.is_empty:
-        says = "Already crosses" if first.crossings else "Already touches" if first.touches else "Already inside"
-        say(console, f"{says} at {first.time:g}: {_intersecting(first)}.")
+        state = "Already crosses" if first.crossings else "Already touches" if first.touches else "Already inside"
+        say(console, f"{state} at {first.time:g}: {_intersecting(first)}.")
     worst = max(samples, key=lambda sample: (sample.crossings, sum(sample.inside.values()), sample.touches))
     intersecting = sum(not sample.is_empty for sample in samples)
     say(
@@ -227,8 +228,8 @@ def _print_intersections(console: Console, summary: Summary) -> None:
     )
     for span in spans[:LONGEST]:
         first, second = span.meshes
-        says = f"{first} inside {second}" if span.inside else _pair(span.meshes)
-        say(console, f"  {says}: {_history(span)}")
+        pair = f"{first} inside {second}" if span.inside else _pair(span.meshes)
+        say(console, f"  {pair}: {_history(span)}")
     if len(spans) > LONGEST:
         say(console, f"  and {len(spans) - LONGEST} more; --json has all.")
     if summary.colliding:
@@ -243,20 +244,20 @@ def _print_intersections(console: Console, summary: Summary) -> None:
         )
 
 
-def _print_proximities(console: Console, summary: Summary, min_distance: float) -> None:
-    """Prints which meshes come nearer each other than the distance at the times themselves, and where most."""
+def _print_proximities(console: Console, summary: Summary, clearance: float) -> None:
+    """Prints the number of proximities at the times themselves, and the nearest elements of each two meshes."""
     samples, nearest = summary.proximities, summary.nearest
     times = f"{count(len(samples), 'time')}; between times, distances are not checked"
     if summary.scene.has_strands:
         times += ", nor are those of curves and points at all"
     if not nearest:
-        say(console, f"No elements are at most {min_distance:g} apart, at {times}.")
+        say(console, f"No elements are at most {clearance:g} apart, at {times}.")
         return
     near = sum(bool(sample.pairs) for sample in samples)
     worst = max(samples, key=lambda sample: sample.pairs)
     say(
         console,
-        f"Elements are at most {min_distance:g} apart at {near:,} of {times}. The least distance is "
+        f"Elements are at most {clearance:g} apart at {near:,} of {times}. The smallest distance is "
         f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}.",
     )
     table = make_table("Nearest elements", "Distance", "Time", "x", "y", "z", caption="The nearest of all times.")
@@ -274,7 +275,7 @@ def _print_proximities(console: Console, summary: Summary, min_distance: float) 
 
 
 def _intersecting(found: IntersectionSummary) -> str:
-    """Returns in words how many edges pass through faces and touch them, and how many parts are inside others."""
+    """Returns the numbers of edges through faces, of edges touching faces and of parts inside others, in words."""
     numbers = [
         (found.crossings, "edge", "through faces"),
         (found.touches, "edge", "touching faces"),
@@ -289,19 +290,19 @@ def _pair(meshes: tuple[str, str]) -> str:
 
 
 def _history(span: IntersectionSpan) -> str:
-    """Returns in words since when and until when two meshes intersect."""
-    says = "touches only" if not span.inside and not span.crossings else span.trend
+    """Returns the span of time in which two meshes intersect, and its numbers, in words."""
+    trend = "touches only" if not span.inside and not span.crossings else span.trend
     one = "part" if span.inside else "edge"
     if span.since == span.until:
-        return f"at {span.since:g}, {count(span.first, one)}, {says}"
+        return f"at {span.since:g}, {count(span.first, one)}, {trend}"
     numbers = f"{count(span.first, one)} at first, {span.last:,} at last"
     if span.most > max(span.first, span.last):
         numbers += f", {span.most:,} at {span.most_at:g}"
-    return f"from {span.since:g} to {span.until:g}, {numbers}: {says}"
+    return f"from {span.since:g} to {span.until:g}, {numbers}: {trend}"
 
 
 def _print_validation(console: Console, found: ValidationSummary, has_strands: bool) -> None:
-    """Prints how the answers compare with the exact checker's."""
+    """Prints the comparison with the exact checker."""
     wrong = found.disagreements
     say(
         console,
@@ -319,4 +320,4 @@ def _print_validation(console: Console, found: ValidationSummary, has_strands: b
             console,
             f"False collisions, which method conservative allows: {found.false_hits:,}.",
         )
-    say(console, f"Certified by floating point: {found.certified:,} of {found.answers:,} answers.")
+    say(console, f"Certified by floating point: {found.certified:,} of {found.decided:,} pairs.")

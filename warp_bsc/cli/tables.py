@@ -1,4 +1,4 @@
-"""What all tables and lines on the terminal share."""
+"""The console, lines and tables of all commands."""
 
 import rich.console
 from rich import box
@@ -24,7 +24,7 @@ def say(console: rich.console.Console, line: str) -> None:
 
 
 def make_table(first: str, *others: str, caption: str | None = None) -> Table:
-    """A table whose first column is text, which may wrap; the others are numbers, which may not."""
+    """Returns a table whose first column is text, which may wrap; the other columns are numbers, which may not."""
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
     table.add_column(first, overflow="fold")
     for header in others:
@@ -33,5 +33,5 @@ def make_table(first: str, *others: str, caption: str | None = None) -> Table:
 
 
 def count(number: int, one: str, many: str = "") -> str:
-    """A number with the noun that it counts, singular or plural."""
+    """Returns a number with the noun that it counts, singular or plural."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"

@@ -1,8 +1,8 @@
-"""The narrow phase of a response that keeps distances: pairs that come nearer than they may, and those that are near.
+"""The narrow phase of a response with minimum distances: pairs that come too near, and proximities.
 
 A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance_phase`, or as it was at the
-start, if it was nearer, less the rounding of distances. Pairs that an edge of the mesh joins may come as near as they
-like without touching: neighbours are always near. The reach is how much nearer than that other pairs are reported.
+start, if it was nearer, less the rounding of distances. Pairs that an edge of the mesh joins must only not touch:
+neighbours are always near. Proximities are the other pairs that come within the reach beyond these distances.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
 _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a pair keeps: the search certifies that it does at rest."""
+"""Share of its distance at the start that a pair must keep: the search certifies it for a pair at rest."""
 _ZERO = wp.constant(wp.float64(0.0))
 _TWO = wp.constant(wp.float64(2.0))
 
@@ -47,9 +47,9 @@ class MinDistances:
     Attributes:
         radius: Radius of each vertex, half of the minimum distance included [m].
         of_planes: Radius of infinite planes, half of the minimum distance [m].
-        reach: How much farther apart than their minimum distance near pairs are at most [m].
+        reach: Largest distance of proximities beyond their minimum distance [m].
         rings: Vertices whose elements have no minimum distance.
-        group: Of each vertex; vertices of one group keep their distances by themselves. -1 for none.
+        group: Group of each vertex; pairs within a group are skipped. -1 for none.
     """
 
     radius: wp.array[wp.float64]
@@ -68,7 +68,7 @@ def make_min_distances(
         mesh: The mesh.
         radius: Radius of each vertex, float64, shape [vertex_count].
         of_planes: Radius of infinite planes.
-        reach: How much farther apart near pairs are.
+        reach: Largest distance of proximities beyond their minimum distance.
         group: Group of each vertex, int, shape [vertex_count].
     """
     distances = MinDistances()
@@ -83,9 +83,9 @@ def make_min_distances(
 def distances_of_pair(
     distances: MinDistances, kind: int, corners: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
 ):
-    """Returns the distance of a pair at the start, from its points there, and the distance that it is to keep [m].
+    """Returns the distance of a pair at the start, from its points there, and its minimum distance in the step [m].
 
-    The first is a lower bound; it is 0 if the elements may touch. The second is less, unless that is 0.
+    The first is a lower bound; it is 0 if the elements may touch. The second is less, unless the first is 0.
     """
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     u = wp.where(kind == EDGE_EDGE, b - a, c - b)
@@ -142,7 +142,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         x1: wp.array[dtype],
         distances: MinDistances,
         kind: int,
-        near_pairs: bool,
+        proximities: bool,
         tolerance: wp.float64,
         # in and out
         stages: PairStages,
@@ -158,7 +158,7 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
         result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
         status = result.status
-        if near_pairs:
+        if proximities:
             reach = distances.reach
             if not are_within_rings(v, firsts_of(kind), distances.rings):
                 reach += distance_of_corners(kind, v, distances.radius)
@@ -197,23 +197,23 @@ def run_approach_phases(
     x1: wp.array,
     distances: MinDistances,
     *,
-    near_pairs: bool,
+    proximities: bool,
     tolerance: float = TOLERANCE,
     timer: StageTimer,
 ) -> None:
     """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
 
-    The status of a contact is FREE if the pair is only near. Times of impact are those at which a pair comes nearer
-    than it may, 2 if it does not. With ``near_pairs``, coordinates and normals are those at which the pair comes within
-    reach, at the start if it is within reach then: they depend continuously on the motion, and the direction to move
-    the pair apart vanishes with the distance that it is to be moved.
+    The status of a proximity is FREE. Times of impact are those at which a pair comes nearer than it may, 2 if it does
+    not. With ``proximities``, coordinates and normals are those at which the pair comes within reach, at the start if
+    it is within reach then: they depend continuously on the motion, and the direction to move the pair apart vanishes
+    with the distance that it is to be moved.
 
     Args:
         phases: The buffers of each kind, a :class:`DistanceKind`, with the vertex indices of its second elements.
         x0: Positions at the start of the step, array of vec3 or vec3d.
         x1: Positions at its end, of the same type.
         distances: The minimum distances.
-        near_pairs: Whether to report pairs that are only near.
+        proximities: Whether to report proximities.
         tolerance: Of the times of impact, as a share of the step.
         timer: Measures the stages.
     """
@@ -226,6 +226,7 @@ def run_approach_phases(
     with timer.stage("classify"):
         for phase, elements in phases:
             stages = phase.stages(elements)
-            inputs = [x0, x1, distances, int(phase.kind), near_pairs, tolerance]
-            queue, places = stages.survivors, Count.SURVIVORS
-            launch_over_queue(decide, queue, phase.counts, places, inputs=inputs, outputs=[stages], block_dim=64)
+            inputs = [x0, x1, distances, int(phase.kind), proximities, tolerance]
+            launch_over_queue(
+                decide, stages.survivors, phase.counts, Count.SURVIVORS, inputs=inputs, outputs=[stages], block_dim=64
+            )

@@ -71,7 +71,7 @@ class BodyParts:
         return low, high
 
     def meeting(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
-        """Returns keys of the pairs of parts that meet, and of those of which an edge passes through a face.
+        """Returns keys of the pairs of parts that meet, and of the pairs in which an edge passes through a face.
 
         The part of the edge comes first in each key; parts that share vertices are among those that meet, in both
         orders.
@@ -92,7 +92,7 @@ class BodyParts:
     def touching_edges(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
         """Returns all edges of parts that meet faces of bodies, or have a vertex of them.
 
-        Whatever of a part is left without those of a body stays on one side of that body, and has a vertex of one of
+        The rest of a part, without its edges that touch a body, is on one side of that body, and has a vertex of one of
         these edges unless it is the whole part.
 
         Args:
@@ -134,7 +134,7 @@ class BodyParts:
 
 
 def _divide(elements: np.ndarray, is_shared: np.ndarray, bodies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gives elements that bodies share a number for each body.
+    """Returns elements with a number for each body that shares them.
 
     Args:
         elements: Numbers of the elements of each face, -1 for none, shape [n, 3].
@@ -174,7 +174,7 @@ def connect_cells(nodes: np.ndarray, count: int) -> np.ndarray:
 
 
 def expand_ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the range that each place of some ranges is in, and all these places."""
+    """Returns the range of each index in some ranges, and all these indices."""
     counts = last - first
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)

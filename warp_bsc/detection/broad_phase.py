@@ -1,4 +1,4 @@
-"""What a broad phase does, and which one a device has."""
+"""The interface of a broad phase, and the broad phase for a device."""
 
 import threading
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ class BroadPhase(Protocol):
     """Finds the candidates of a mesh: pairs of elements that share no vertex and whose swept boxes overlap.
 
     A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
-    single precision, rounded so that no overlap is lost. An element with a position that is not finite has no pairs.
+    single precision, rounded so that no overlap is missed. An element with a position that is not finite has no pairs.
 
     Attributes:
-        lock: Held by all that share the broad phase while they run it and read what it enqueued.
+        lock: Held by each user of the broad phase from a run until its queues have been read.
     """
 
     lock: threading.RLock
@@ -63,9 +63,9 @@ class BroadPhase(Protocol):
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
             refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, and
-                nothing is allocated on a GPU. A CPU sorts the tree anew where its boxes have become much larger.
-            changed: Nonzero for each vertex whose pairs are wanted, array of int; None for all. More pairs may be
-                found than wanted.
+                nothing is allocated on a GPU. The tree of a CPU is sorted again if its boxes have become much larger.
+            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. Pairs without one of
+                these vertices may be found as well.
             keep_separated: Whether to enqueue all candidates.
         """
         ...
@@ -107,7 +107,7 @@ class BroadPhase(Protocol):
             pairs: Queue for (edge, face), array of vec2i.
             refit: As of :meth:`pair_elements`.
             is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
-                boxes a CPU uses again.
+                boxes are reused on a CPU.
         """
         ...
 

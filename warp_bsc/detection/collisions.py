@@ -9,7 +9,7 @@ import numpy as np
 
 from .contact_buffer import ContactRows, HostContacts, empty_contacts
 from .differentiable import CollisionArrays
-from .settings import Counts, DistanceKind, PairCounts
+from .settings import Counts, DistanceKind, Method, PairCounts
 from .stage_timer import StageTimer
 
 __all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts", "add_stats"]
@@ -22,12 +22,12 @@ class StageCounts:
     Attributes:
         candidates: Pairs that share no vertex and whose swept boxes overlap.
         survivors: Candidates that no cull decides.
-        free: Candidates certified free, by the culls or later.
+        free: Candidates that are certified free, by the culls or later.
         hits: Candidates certified to collide.
         unsure: Candidates that floating point could not certify either way.
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
         host: Candidates whose exponents are too far apart for that, or that may come within a minimum distance only for
-            a moment of the step. The host decides them, but not in a CUDA graph, where they stay unsure.
+            a moment of the step. The host decides them, except in a CUDA graph, where they stay unsure.
     """
 
     candidates: int = 0
@@ -87,8 +87,8 @@ def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
 class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
-    They are in arrays of their own, on the device until they are first read, and stay as they are whatever is detected
-    later. A detector uses these arrays again once no reference to the result is left.
+    They are in arrays of their own, on the device until they are first read, which later detections do not change. A
+    detector reuses these arrays once no reference to the result is left.
 
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
@@ -103,7 +103,7 @@ class Collisions:
     certified: bool
     overflows: tuple[str, ...]
     arrays: CollisionArrays | None
-    _method: str = field(repr=False)
+    _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
     _timer: StageTimer = field(repr=False)
@@ -247,7 +247,7 @@ class CapturedCollisions:
     _read: Callable[[], Collisions] = field(repr=False)
 
     def read(self) -> Collisions:
-        """Returns what the last replay found; on CUDA what the detector found last, in a graph or not.
+        """Returns the collisions of the last replay; on CUDA those of the detector's last detection, in a graph or not.
 
         Raises:
             RuntimeError: If the graph must be captured again, as the detector's buffers have been replaced since, or on

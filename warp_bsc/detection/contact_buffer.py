@@ -2,7 +2,7 @@
 
 import weakref
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import warp as wp
@@ -21,18 +21,18 @@ __all__ = [
     "read_contacts",
 ]
 
-_MOST_FREE = 4
+_MAX_FREE = 4
 """Free buffers that a pool keeps: those of two results."""
 
 
 @wp.struct
 class ContactBuffer:
-    """Pairs that the culls leave, one a row, with what is known of them; all arrays have the same length.
+    """Pairs that no cull decides, one a row, and their contacts; all arrays have the same length.
 
     Attributes:
         pairs: (vertex, face) or (edge, edge).
         status: What floating point certifies: FREE, HIT or UNSURE.
-        decided: The status after the exact stage, if the method has one; UNSURE is what that leaves to the host.
+        decided: The status after the exact stage, if the method has one; UNSURE for contacts left to the host.
         within_tolerance: Whether the time of impact is within the tolerance.
         toi: Time of impact as a share of the step.
         coordinates: Contact coordinates.
@@ -72,7 +72,7 @@ class HostContacts:
 
     @property
     def hit(self) -> np.ndarray:
-        """Whether a contact is not shown to be free, bool, shape [n]."""
+        """Whether a contact is not decided to be free, bool, shape [n]."""
         return self.decided != FREE
 
     def rows(self, which: np.ndarray) -> "HostContacts":
@@ -110,14 +110,14 @@ def read_contacts(buffer: ContactBuffer, count: int) -> HostContacts:
                 wp.copy(host, array, count=count)
         return host.numpy()
 
-    return HostContacts(**{name: read(getattr(buffer, name)) for name in ContactBuffer.vars})
+    return HostContacts(**{field.name: read(getattr(buffer, field.name)) for field in fields(HostContacts)})
 
 
 def contacts_from_host(contacts: HostContacts, device: wp.Device) -> ContactBuffer:
     """Returns contacts of the host in a buffer on a device."""
     buffer = make_contact_buffer(len(contacts.pairs), device)
-    for name in ContactBuffer.vars:
-        getattr(buffer, name).assign(getattr(contacts, name))
+    for field in fields(HostContacts):
+        getattr(buffer, field.name).assign(getattr(contacts, field.name))
     return buffer
 
 
@@ -142,7 +142,7 @@ class ContactBufferPool:
     """Contact buffers of results, used again once the rows that were taken from the pool are garbage.
 
     Rows that are still referenced keep their buffer. The pool itself keeps a few free buffers at most. It does not see
-    references to the arrays of a buffer: whoever passes these on must not take the buffer from a pool.
+    references to the arrays of a buffer: a caller that passes these on must not take the buffer from a pool.
     """
 
     def __init__(self, device: wp.Device):
@@ -153,10 +153,10 @@ class ContactBufferPool:
         """
         self._device = device
         self._free: list[tuple[wp.Stream | None, ContactBuffer]] = []
-        self._returned: deque[tuple[wp.Stream | None, ContactBuffer]] = deque(maxlen=_MOST_FREE)
+        self._returned: deque[tuple[wp.Stream | None, ContactBuffer]] = deque(maxlen=_MAX_FREE)
         """Appended to by finalizers, which may run at any time."""
 
-    def take(self, count: int) -> ContactRows:
+    def acquire(self, count: int) -> ContactRows:
         """Returns ``count`` rows of a buffer, whose values are undefined.
 
         The buffer is a free one that the device's current stream has used last, the smallest that suffices, so that
@@ -167,7 +167,7 @@ class ContactBufferPool:
         """
         while self._returned:
             self._free.append(self._returned.popleft())
-        del self._free[:-_MOST_FREE]
+        del self._free[:-_MAX_FREE]
         stream = self._device.stream if self._device.is_cuda else None
         fitting = [entry for entry in self._free if entry[0] is stream and len(entry[1].pairs) >= count]
         if fitting:

@@ -34,7 +34,7 @@ class Containment:
 
 
 class _Sides(NamedTuple):
-    """On which side of bodies some queries are, each of which is a point that is compared with parts of one body.
+    """The sides of bodies on which queries are; a query is a point that is compared with parts of one body.
 
     Attributes:
         on_surface: Whether the point is on one of the parts, where that is looked for, shape [n].
@@ -50,23 +50,23 @@ class _Sides(NamedTuple):
 
 
 class ContainmentFinder:
-    """Finds what is inside what, in one configuration after another, in meshes that consist of several bodies.
+    """Finds parts of bodies that are inside others, in one configuration after another of a mesh of several bodies.
 
-    A part of a body is what its faces and its edges without faces connect. A part is closed if an even number of its
-    faces meet at each edge, and it has no other edges. Closed parts enclose what they wind around; where the faces of a
-    part are not oriented alike, what a ray from it passes an odd number of times. All closed parts of a body count
-    together, with their signs: what is in the cavity of a hollow body, whose inner surface is turned inwards, is not
-    inside. Open parts enclose nothing.
+    A part of a body consists of vertices that its faces, and its edges without faces, connect. A part is closed if an
+    even number of its faces meet at each edge, and it has no other edges. Closed parts enclose the points that they
+    wind around; where the faces of a part are not oriented alike, the points from which a ray passes the part an odd
+    number of times. All closed parts of a body count together, with their signs: a point in the cavity of a hollow
+    body, whose inner surface is turned inwards, is not inside. Open parts enclose nothing.
 
     A part is wholly inside a body if it is inside at one of its vertices and its edges and faces pass through none of
     the body's. A part that touches the body is inside if none of its vertices is outside, and not all are on the body.
     A point is inside a body if the body's closed parts enclose it, and it is on none of them.
 
-    No floating-point error can change the answer: signs that are not certain are computed exactly.
+    The result is exact: signs that floating point does not certify are computed exactly.
     """
 
     def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
-        """Takes a mesh; finds its parts when they are needed first.
+        """Stores a mesh, whose parts are found when they are first needed.
 
         Args:
             mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
@@ -74,13 +74,13 @@ class ContainmentFinder:
         """
         self._mesh, self._bodies = mesh, bodies.astype(np.int64)
 
-    def find(self, x: np.ndarray, found: Intersections, are_wanted: Callable[[np.ndarray], np.ndarray]) -> Containment:
-        """Returns what is inside what in one configuration.
+    def find(self, x: np.ndarray, found: Intersections, is_sought: Callable[[np.ndarray], np.ndarray]) -> Containment:
+        """Returns the parts of bodies that are inside others in one configuration.
 
         Args:
             x: Positions, finite, any unit of length, shape [vertex_count, 3].
             found: The intersections of the mesh in this configuration.
-            are_wanted: Returns which pairs of an inner and an outer body are looked for, given shape [m, 2].
+            is_sought: Returns which pairs of an inner and an outer body are looked for, given shape [m, 2].
         """
         none = Containment(np.zeros((0, 2), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
         if not len(self._bodies) or self._bodies.min() == self._bodies.max() or not self._parts.closed.any():
@@ -91,7 +91,7 @@ class ContainmentFinder:
         pairs = _enclosing(low, high, low[outer], high[outer], 3)
         pairs[:, 1] = outer[pairs[:, 1]]
         pairs = pairs[parts.body[pairs[:, 0]] != parts.body[pairs[:, 1]]]
-        pairs = pairs[are_wanted(parts.body[pairs])]
+        pairs = pairs[is_sought(parts.body[pairs])]
         if not len(pairs):
             return none
         meeting, passing = parts.meeting(found)
@@ -105,14 +105,14 @@ class ContainmentFinder:
         return self._decide(x, found, pairs[kept], is_touching[kept])
 
     def find_points(
-        self, x: np.ndarray, points: np.ndarray, are_wanted: Callable[[np.ndarray], np.ndarray]
+        self, x: np.ndarray, points: np.ndarray, is_sought: Callable[[np.ndarray], np.ndarray]
     ) -> np.ndarray:
         """Returns which points are strictly inside which bodies in one configuration.
 
         Args:
             x: Positions of the vertices, finite, any unit of length, shape [vertex_count, 3].
             points: The points, finite, of the same type, shape [n, 3].
-            are_wanted: Returns which pairs of a point and a body are looked for, given shape [m, 2].
+            is_sought: Returns which pairs of a point and a body are looked for, given shape [m, 2].
 
         Returns:
             Pairs of a point and a body, sorted, int64, shape [k, 2].
@@ -126,7 +126,7 @@ class ContainmentFinder:
         pairs = _enclosing(points, points, low[closed], high[closed], 3)
         pairs[:, 1] = closed[pairs[:, 1]]
         of_body = np.stack([pairs[:, 0], parts.body[pairs[:, 1]]], axis=1)
-        kept = are_wanted(of_body)
+        kept = is_sought(of_body)
         if not kept.any():
             return none
         queries, query_of_pair = np.unique(of_body[kept], axis=0, return_inverse=True)
@@ -144,7 +144,7 @@ class ContainmentFinder:
         Args:
             x: As of :meth:`find`.
             found: As of :meth:`find`.
-            pairs: Pairs of parts of which one's box is in the other's, shape [m, 2].
+            pairs: Pairs of parts where the box of one is in that of the other, shape [m, 2].
             is_touching: Whether they touch each other, shape [m].
         """
         parts = self._parts
@@ -192,7 +192,7 @@ class ContainmentFinder:
         low, high = corners.min(axis=1), corners.max(axis=1)
 
         def pair_up(box_low: np.ndarray, axes: int) -> np.ndarray:
-            """Returns queries and faces of which the point is in the box, the first axes, of y, z and x, bounded."""
+            """Returns queries and faces whose box contains the point along the first axes of y, z and x."""
             turned = [1, 2, 0]
             found = _enclosing(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
             keys = found[:, 0] * len(parts.body) + parts.of_face[faces[found[:, 1]]]
@@ -235,8 +235,8 @@ class ContainmentFinder:
         chosen = [np.array([parts.first_vertex[part]]) for part in cases[:, 0]]
         if touches.any():
             of_edges, ends = parts.touching_edges(found)
-            wanted = pair_keys(cases, int(parts.body.max()) + 1)
-            first, last = np.searchsorted(of_edges, wanted), np.searchsorted(of_edges, wanted, side="right")
+            keys = pair_keys(cases, int(parts.body.max()) + 1)
+            first, last = np.searchsorted(of_edges, keys), np.searchsorted(of_edges, keys, side="right")
             for case in np.flatnonzero(touches & (last > first)):
                 chosen[case] = np.unique(ends[first[case] : last[case]])
         case_of_vertex = np.repeat(np.arange(len(cases)), list(map(len, chosen)))
@@ -244,14 +244,14 @@ class ContainmentFinder:
 
     def _faces_ahead(self, x: np.ndarray, points: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Returns the faces of some parts that are not on the same side of all rays from some points, ascending."""
-        is_wanted = np.zeros(len(self._parts.body), dtype=bool)
-        is_wanted[parts] = True
+        is_compared = np.zeros(len(self._parts.body), dtype=bool)
+        is_compared[parts] = True
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
         sides = np.zeros(len(x), dtype=np.uint8)
         for bit, is_aside in enumerate((x[:, 0] < low[0], *(x[:, 1:] < low[1:]).T, *(x[:, 1:] > high[1:]).T)):
             sides |= is_aside.astype(np.uint8) << bit
         a, b, c = (sides[corners] for corners in self._mesh.faces.T)
-        return np.flatnonzero(is_wanted[self._parts.of_face[: len(a)]] & (a & b & c == 0))
+        return np.flatnonzero(is_compared[self._parts.of_face[: len(a)]] & (a & b & c == 0))
 
 
 def _enclosing(
@@ -259,7 +259,7 @@ def _enclosing(
 ) -> np.ndarray:
     """Returns the pairs of an inner box and an outer one that contains it, borders included.
 
-    Outer boxes are grouped by size. For each group, boxes are put into a grid by their lowest corners; the cells are as
+    Outer boxes are grouped by size. For each group, a grid holds the boxes by their lowest corners; its cells are as
     large as the outer boxes, so that an outer box is in the cell of the inner box or in the one before along some axes.
 
     Args:
@@ -293,8 +293,8 @@ def _enclosing(
         keys, members = keys[order], near[members[order]]
         of_inner = (np.floor((starts - corner) / cell).astype(np.int64) + 1) @ weights
         for step in itertools.product((0, 1), repeat=axes):
-            wanted = of_inner - np.array(step) @ weights
-            first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
+            cells = of_inner - np.array(step) @ weights
+            first, last = np.searchsorted(keys, cells), np.searchsorted(keys, cells, side="right")
             for rows, places in _expand_in_chunks(first, last):
                 inner, outer = rows, members[places]
                 for axis in range(3):

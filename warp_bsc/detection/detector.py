@@ -17,7 +17,7 @@ from .mesh import CollisionMesh
 from .narrow_phase import decide_on_host
 from .pipeline import DetectionPipeline
 from .proximities import Proximities, ProximityFinder
-from .settings import TOLERANCE, Counts, DistanceKind, PairKind
+from .settings import TOLERANCE, Counts, DistanceKind, Method, PairKind
 from .stage_timer import StageTimer
 
 __all__ = ["CollisionDetector"]
@@ -31,24 +31,24 @@ class CollisionDetector:
     added and rounded in double precision; the sum counts as exact. Points of the mesh then also collide with edges that
     no face has, and with each other. Pairs that a few edges join are excluded, since neighbours are always near.
 
-    Run one detection first to size the buffers. After that a detection can be captured in a CUDA graph, where it
-    allocates nothing and does not synchronize, and replayed on new positions in the same arrays.
+    Run one detection first to size the buffers. After that :meth:`capture` adds a detection to a CUDA graph, where it
+    allocates nothing and does not synchronize, and which is replayed on new positions in the same arrays.
 
-    Threads may share a detector: each detection waits for the one before, and its results stay as they are. To detect
-    at the same time, make a detector for each thread; they may share the mesh.
+    Threads may share a detector: each detection waits for the one before, and its results do not change. To detect at
+    the same time, make a detector for each thread; they may share the mesh.
 
     Attributes:
         mesh: The mesh.
         method: The method.
-        tolerance: Of the times of impact, as a share of the step.
-        min_distance: The minimum distance.
+        tolerance: Tolerance of the times of impact, as a share of the step.
+        min_distance: The minimum distance, in the unit of the positions.
     """
 
     def __init__(
         self,
         mesh: CollisionMesh,
         *,
-        method: str = "conservative",
+        method: Method = "conservative",
         tolerance: float = TOLERANCE,
         min_distance: float = 0.0,
         rings: int = 1,
@@ -57,19 +57,19 @@ class CollisionDetector:
 
         Args:
             mesh: The mesh.
-            method: What becomes of pairs that floating point cannot certify: "float" takes the signs that it
-                computes, "conservative" counts them as hits, "exact" decides them exactly.
+            method: How to decide pairs that floating point cannot certify: "float" by the signs that it computes,
+                "conservative" as hits, "exact" by exact arithmetic.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, beside the radii of the mesh, in the unit of the
                 positions: 0, or from 2^-1021 to 2^1000. With 0 and without radii pairs collide that touch.
-            rings: With a minimum distance, pairs are excluded if a vertex of one is within so many edges of the mesh of
-                a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat grid at
-                rest has no collisions at a distance below half of its shortest edge; triangles much thinner than their
-                edges are long need more. At most so many that vertices have 256 others within these on average.
+            rings: With a minimum distance, pairs are excluded if a vertex of one is within this number of edges of the
+                mesh of a vertex of the other; 0 excludes only those that share a vertex. With the default of 1 a flat
+                grid at rest has no collisions at a distance below half of its shortest edge; triangles much thinner
+                than their edges are long need more. Vertices must not have more than 256 others within it on average.
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
+            ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
         """
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
         self.mesh = mesh
@@ -81,7 +81,7 @@ class CollisionDetector:
             rings=rings,
             only_used_vertices=True,
         )
-        self.method = method
+        self.method: Method = method
         self.tolerance = self._pipeline.tolerance
         self.min_distance = checked_distance(min_distance, "min_distance")
         self._lock = self._pipeline.broad_phase.lock
@@ -90,29 +90,23 @@ class CollisionDetector:
         self._has_run = False
 
     @one_at_a_time
-    def detect(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Collisions | CapturedCollisions:
-        """Finds the collisions of a motion.
+    def detect(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Collisions:
+        """Returns all collisions of a motion.
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
-                array. They are taken as exact; those of vertices that no face uses may be anything. In a graph, or if
-                it requires gradients, a Warp array of vec3 or vec3d on the mesh's device.
+                array. They are taken as exact; those of vertices that no face uses may be anything. If it requires
+                gradients, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
-
-        Returns:
-            All collisions; while a graph is captured :class:`CapturedCollisions`, to be read after a replay.
 
         Raises:
             TypeError: If the positions are no arrays of numbers.
             ValueError: If they have another shape or type, differ in type, or are not finite.
-            RuntimeError: If the first detection is captured in a CUDA graph.
+            RuntimeError: If the device captures a graph, see :meth:`capture`.
         """
-        x0 = self.mesh.device_positions(x0, "x0")
-        x1 = self.mesh.device_positions(x1, "x1")
-        if x0.dtype != x1.dtype:
-            raise ValueError(f"x1 must have the type of x0, {x0.dtype.__name__}, not {x1.dtype.__name__}")
         if self.mesh.device.is_capturing:
-            return (self._capture_on_cpu if self.mesh.device.is_cpu else self._capture_on_cuda)(x0, x1)
+            raise RuntimeError(f"{self.mesh.device} captures a graph: call capture(x0, x1) there instead of detect")
+        x0, x1 = self._checked_positions(x0, x1)
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
@@ -129,7 +123,7 @@ class CollisionDetector:
         with timer.stage("sort"):
             contacts = self._ordered_contacts(counts, recycle=not differentiable)
         if self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
-            with timer.stage("exact"):  # now, while the positions are what they were
+            with timer.stage("exact"):  # now, while the arrays hold these positions
                 for narrow_phase in self._pipeline.narrow_phases:
                     kind = DistanceKind(narrow_phase.kind)
                     contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
@@ -137,6 +131,35 @@ class CollisionDetector:
         if differentiable:
             arrays = self._differentiable(x0, x1, {kind: rows.buffer for kind, rows in contacts.items()})
         return Collisions(self.method != "float", (), arrays, self.method, counts, contacts, timer)
+
+    @one_at_a_time
+    def capture(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
+        """Adds a detection to the graph that the device captures, and returns its results, to be read after a replay.
+
+        Each replay detects the collisions of the positions that the arrays then hold::
+
+            detector.detect(x0, x1)
+            with wp.ScopedCapture(device) as capture:
+                captured = detector.capture(x0, x1)
+            wp.capture_launch(capture.graph)
+            collisions = captured.read()
+
+        Args:
+            x0: Positions at the start, as of :meth:`detect`, Warp array of vec3 or vec3d on the mesh's device. On the
+                CPU it must not require gradients.
+            x1: Positions at the end, of the same type.
+
+        Raises:
+            TypeError: If the positions are no arrays of numbers.
+            ValueError: If they have another shape or type, differ in type, are elsewhere, or require gradients on the
+                CPU.
+            RuntimeError: If the device captures no graph, or if a GPU captures one before the first :meth:`detect`.
+        """
+        device = self.mesh.device
+        if not device.is_capturing:
+            raise RuntimeError(f"{device} captures no graph: call capture(x0, x1) within wp.ScopedCapture, or detect")
+        x0, x1 = self._checked_positions(x0, x1)
+        return self._capture_on_cpu(x0, x1) if device.is_cpu else self._capture_on_cuda(x0, x1)
 
     def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
@@ -163,9 +186,9 @@ class CollisionDetector:
 
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
-                vertices that take no part may be anything.
+                vertices that no element uses may be anything.
             distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
-            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
+            rings: Pairs are excluded if a vertex of one is within this number of edges of a vertex of the other.
 
         Raises:
             TypeError: If an argument has another type.
@@ -178,20 +201,28 @@ class CollisionDetector:
         """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
+    def _checked_positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> tuple[wp.array, wp.array]:
+        """Returns the positions of a motion on the device, of one type."""
+        x0 = self.mesh.device_positions(x0, "x0")
+        x1 = self.mesh.device_positions(x1, "x1")
+        if x0.dtype != x1.dtype:
+            raise ValueError(f"x1 must have the type of x0, {x0.dtype.__name__}, not {x1.dtype.__name__}")
+        return x0, x1
+
     def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
-        """Returns the sorted contacts of each kind of pair, as far as the buffers held them.
+        """Returns the sorted contacts of each kind of pair, without those that overflowed.
 
         Args:
             counts: The counts of the detection.
-            recycle: Whether to take buffers of earlier results that are garbage, and to let later results take these;
-                not where others refer to the arrays. Otherwise the buffers are new, with no row to spare.
+            recycle: Whether to use buffers of earlier results that are garbage, and to let later results use these;
+                not where others refer to the arrays. Otherwise the buffers are new, without spare rows.
         """
         contacts = {}
         for narrow_phase in self._pipeline.narrow_phases:
             kind = DistanceKind(narrow_phase.kind)
             count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
             if recycle:
-                rows = self._result_buffers.take(count)
+                rows = self._result_buffers.acquire(count)
             else:
                 rows = ContactRows(make_contact_buffer(count, self.mesh.device), count)
             narrow_phase.ordered_contacts(count, rows.buffer)
@@ -199,7 +230,7 @@ class CollisionDetector:
         return contacts
 
     def _decide_on_host(self, kind: DistanceKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
-        """Returns the contacts without those that the host refutes, and with what it finds of the others."""
+        """Returns the contacts without those that the host refutes; the others get its times and points."""
         contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
         elements, radius = self.mesh.device_elements(kind), self._pipeline.radius
@@ -213,13 +244,11 @@ class CollisionDetector:
     def _capture_on_cpu(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
         """Adds a detection to the graph that the CPU captures."""
         if x0.requires_grad or x1.requires_grad:
-            raise ValueError("a graph on the CPU cannot capture gradients of collisions: detect outside the graph")
+            raise ValueError("x0 and x1 must not require gradients in a graph on the CPU: detect outside the graph")
         replayed: list[Collisions] = []
 
         def detect() -> None:
-            collisions = self.detect(x0, x1)
-            assert isinstance(collisions, Collisions)  # a replay is not captured
-            replayed[:] = [collisions]
+            replayed[:] = [self.detect(x0, x1)]
 
         def read() -> Collisions:
             if not replayed:

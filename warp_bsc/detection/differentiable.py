@@ -21,7 +21,7 @@ __all__ = ["CollisionArrays"]
 
 @made_once
 def _kernel(dtype: type) -> wp.Kernel:
-    """The kernel for one type of position, in a module of its own."""
+    """Returns the kernel for one type of position, in a module of its own."""
 
     @wp.kernel(module="unique", module_options={"fuse_fp": False})
     def differentiate(
@@ -77,7 +77,7 @@ def _kernel(dtype: type) -> wp.Kernel:
 
 @made_once
 def _distance_kernel(dtype: type) -> wp.Kernel:
-    """The kernel for pairs with a minimum distance, for one type of position, in a module of its own."""
+    """Returns the kernel for pairs with a minimum distance, for one type of position, in a module of its own."""
 
     @wp.kernel(module="unique", module_options={"fuse_fp": False})
     def differentiate_distances(
@@ -129,7 +129,7 @@ class CollisionArrays:
     """The collisions of one motion as Warp arrays on the device, in the order of :class:`Collisions`.
 
     Times, coordinates and normals are differentiable functions of the positions; which pairs collide is a constant.
-    They have gradients, and what made them is recorded on the tape that was active. For collisions of a detection in a
+    Their gradients are recorded on the tape that was active. For collisions of a detection in a
     CUDA graph the arrays are as long as the detector's queues, and rows without a collision have the pair (-1, -1) and
     the time 2.0. All lengths are the same for a kind of pair.
 
@@ -173,15 +173,15 @@ class CollisionArrays:
         contacts: Mapping[DistanceKind, ContactBuffer],
         radius: wp.array | None = None,
     ):
-        """Makes the arrays, and records on the tape how.
+        """Launches the kernels that compute the arrays, and records them on the tape.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
             mesh: The mesh.
             tolerance: Of the times of impact, as a share of the step.
-            contacts: The sorted contacts of each kind of pair, which nothing may change any more.
-            radius: Of each vertex, the sum of two of which is the distance of a pair; None without minimum distances.
+            contacts: The sorted contacts of each kind of pair, which must not change afterwards.
+            radius: Radius of each vertex; the distance of a pair is the sum of two. None without minimum distances.
         """
         for kind, found in contacts.items():
             elements = mesh.device_elements(kind)

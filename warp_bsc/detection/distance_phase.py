@@ -24,7 +24,7 @@ from .kernels import PairStages
 from .launch import launch, launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
 from .rings import Rings, are_within_rings
-from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind
+from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind, Method
 from .stage_timer import StageTimer
 
 __all__ = [
@@ -36,8 +36,8 @@ __all__ = [
 _BLOCK = 64
 """Threads of a block that searches."""
 _ADVANCING, _SUBDIVIDING = 384, 256
-"""Threads of a multiprocessor that search, as many as their registers allow, each one pair after another. On a CPU a
-thread has one."""
+"""Threads of a multiprocessor that search, limited by their registers, each for one pair after another. On a CPU, each
+thread searches for one pair."""
 
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
@@ -185,7 +185,7 @@ def _kernels(dtype: type) -> _Kernels:
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
-        # the threads of a warp advance together, whatever the pairs
+        # the threads of a warp advance together, each with a pair of its own
         while i < filled:
             at = search_next(at, kind, x0, x1, stages.elements, radius, stages.survivors, int(i), roundoff, tolerance)
             at.search = advance(at.motion, at.distance, timed, at.search)
@@ -259,7 +259,7 @@ def run_distance_phases(
     radius: wp.array,
     rings: Rings,
     *,
-    method: str,
+    method: Method,
     timed: bool = True,
     tolerance: float = TOLERANCE,
     timer: StageTimer,
@@ -272,9 +272,10 @@ def run_distance_phases(
         x1: Positions at its end, of the same type.
         radius: Radius of each vertex, array of float64.
         rings: Vertices whose elements are excluded.
-        method: One of :data:`METHODS`; with "exact" pairs left undecided go to :func:`decide_distances_on_host`.
+        method: One of :data:`METHODS`; with "exact", pairs that stay UNSURE are left to
+            :func:`decide_distances_on_host`.
         timed: Whether to find times of impact within the tolerance.
-        tolerance: Of the times of impact, as a share of the step.
+        tolerance: Tolerance of the times of impact, as a share of the step.
         timer: Measures the stages.
     """
     kernels = _kernels(x0.dtype)

@@ -1,13 +1,13 @@
 """The exact stage: wide integers decide, on the device, the contacts that floating point cannot.
 
-Contacts that the stage before has enqueued are decided in integers of one limb a coordinate, see
+Contacts that the previous stage has enqueued are decided in integers of one limb a coordinate, see
 :mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
 for two limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are
 too wide for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays
 small.
 
-Of contacts with a minimum distance, those are decided that :mod:`warp_bsc.kernels.exact.distance` can. The host decides
-the others, and those that are too wide.
+Contacts with a minimum distance are decided as far as :mod:`warp_bsc.kernels.exact.distance` can. The host decides the
+others, and those that are too wide.
 """
 
 import math
@@ -25,7 +25,7 @@ from ..kernels.pipeline.pairs import distance_of_corners, points_of_pair, vertic
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, HIT, UNSURE
-from ..kernels.time_of_impact import LEAST_DIGITS
+from ..kernels.time_of_impact import MIN_DIGITS
 from .contact_buffer import ContactBuffer, make_contact_buffer
 from .kernels import PairStages
 from .launch import launch_over_queue, made_once
@@ -40,7 +40,7 @@ _REFUTED = wp.constant(int(Count.REFUTED))
 
 @made_once
 def _kernel(dtype: type, limbs: int) -> wp.Kernel:
-    """The kernel for one type of position and one width, in a module of its own."""
+    """Returns the kernel for one type of position and one width, in a module of its own."""
     decide = decide_in(limbs)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
@@ -93,7 +93,7 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
         else:
             contacts.decided[i] = wp.int8(HIT)
             if timed:
-                # where floating point has given up is a lower bound too
+                # the time at which floating point has stopped is a lower bound too
                 time = wp.max(time, contacts.toi[i])
                 motion = relative_motion(
                     kind,
@@ -118,7 +118,7 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
 
 @made_once
 def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
-    """The kernel for contacts with a minimum distance, for one type of position and one width."""
+    """Returns the kernel for contacts with a minimum distance, for one type of position and one width."""
     decide = decide_distance_in(limbs)
     is_last = limbs == max(DISTANCE_BITS)
 
@@ -175,7 +175,7 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
 def are_within_distance(
     kind: DistanceKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns which pairs at rest are within a distance, and which of these answers are known; bool, shape [n] each.
+    """Returns which pairs at rest are within a distance, and which pairs are decided; bool, each of shape [n].
 
     Args:
         kind: The kind of pair.
@@ -211,7 +211,7 @@ def launch_exact_distances(
     tolerance: float,
     stages: PairStages,
 ) -> None:
-    """Decides contacts with a minimum distance exactly, and counts those left to the host; waits for no GPU.
+    """Decides contacts with a minimum distance exactly, and counts those left to the host; does not synchronize.
 
     Args:
         x0: Positions at the start of the step, array of vec3 or vec3d.
@@ -222,7 +222,7 @@ def launch_exact_distances(
         tolerance: Of the times of impact, as a share of the step.
         stages: The buffers of the narrow phase.
     """
-    digits = 1 + max(LEAST_DIGITS, math.ceil(-math.log2(tolerance)))
+    digits = 1 + max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     for limbs in DISTANCE_BITS:
         launch_over_queue(
             _distance_kernel(x0.dtype, limbs),
@@ -264,23 +264,23 @@ def launch_exact_stage(
         queues: Rows of the contacts to decide, and a queue for those that are too wide; both are overwritten. Arrays
             of int.
         counts: Counts of the narrow phase, array of int64.
-        filled: Place of the number of contacts to decide in it.
-        too_wide: Places of the numbers of those too wide for 1, 2 and 8 limbs.
-        refuted: Place of the number of those decided to be free.
+        filled: Index of the number of contacts to decide in it.
+        too_wide: Indices of the numbers of those too wide for 1, 2 and 8 limbs.
+        refuted: Index of the number of those decided to be free.
         contacts: The contacts; without times only ``pairs`` and ``decided`` are used.
         keys: Sorting keys of the contacts, array of int64.
         last_key: Key of a contact that is refuted.
     """
-    digits = max(LEAST_DIGITS, math.ceil(-math.log2(tolerance)))
+    digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     queue, left = queues
     for limbs, too_wide_for_it in zip(BITS, too_wide, strict=True):
-        places = [int(filled), int(too_wide_for_it), int(refuted)]
+        indices = [int(filled), int(too_wide_for_it), int(refuted)]
         launch_over_queue(
             _kernel(x0.dtype, limbs),
             queue,
             counts,
             filled,
-            inputs=[x0, x1, elements, int(kind), timed, digits, queue, *places, last_key],
+            inputs=[x0, x1, elements, int(kind), timed, digits, queue, *indices, last_key],
             outputs=[counts, contacts, keys, left],
             block_dim=64,
         )

@@ -21,8 +21,8 @@ _GROUP = wp.constant(GROUP)
 _LARGE = wp.constant(4096)
 """Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
 
-_LEAST_OWN_CLUSTER = 8
-"""Connected components of fewer faces share clusters, so that at most three of four places are empty."""
+_MIN_OWN_CLUSTER = 8
+"""Connected components with fewer faces share clusters, so that at most three of four places are empty."""
 
 
 @wp.func
@@ -262,13 +262,13 @@ def _order_components(
                     order[i] = queue[i]
                 split = _split_at(begin, end)
                 best = int(0)
-                least = int(2147483647)
+                least_cut = int(2147483647)
                 for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
                     _sort(begin, end, axis, order, distances, keys, buckets, queue)
                     stamp += 1
                     cut = _count_cut(links, begin, split, end, stamp, queue, place_of, visited)
-                    if cut < least:
-                        least = cut
+                    if cut < least_cut:
+                        least_cut = cut
                         best = axis
                 _sort(begin, end, best, order, distances, keys, buckets, queue)
                 for i in range(begin, end):
@@ -302,13 +302,13 @@ def _links(faces: np.ndarray) -> np.ndarray:
 def _component_places(sizes: np.ndarray) -> np.ndarray:
     """Returns the place at which each connected component starts, and the number of places at last.
 
-    Components of at least :data:`_LEAST_OWN_CLUSTER` faces start at a cluster of their own. Smaller ones follow one
+    Components of at least :data:`_MIN_OWN_CLUSTER` faces start at a cluster of their own. Smaller ones follow one
     another without a gap.
     """
-    small = sizes < _LEAST_OWN_CLUSTER
+    small = sizes < _MIN_OWN_CLUSTER
     joins = np.zeros(len(sizes), dtype=bool)
     joins[1:] = small[1:] & small[:-1]
-    # runs of components without a gap, each of which starts at a cluster
+    # runs of components without a gap; each run starts at a cluster
     run = np.cumsum(~joins) - 1
     run_sizes = np.bincount(run, weights=sizes).astype(np.int64)
     run_places = np.concatenate([[0], np.cumsum(-(-run_sizes // CLUSTER) * CLUSTER)])
@@ -345,7 +345,7 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     inputs = [on_host(links), order, on_host(np.zeros(n)), starts, count, queue]
     launch(_find_components, 1, inputs=inputs, device="cpu", record_tape=False)
 
-    # neighbours get numbers close to one another, which processor caches reward
+    # neighbours get numbers close to one another, for the sake of processor caches
     face_of = queue.numpy()
     number_of = np.empty(n + 1, dtype=np.int32)
     number_of[face_of] = np.arange(n)

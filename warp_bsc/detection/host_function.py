@@ -2,8 +2,8 @@
 
 Warp captures a graph on the CPU as a list of kernel launches with their dimensions, and runs no kernel while it
 captures. A function that reads numbers between launches (the length of a queue, whether to go on) cannot be captured as
-such a list: its branches and dimensions would stay those of the capture. Here the list holds one kernel, which calls
-the function.
+this list: its branches and dimensions would stay those of the capture. Here the list holds one kernel, which calls the
+function.
 """
 
 import ctypes
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from .._private_names import cpu_graph
 from .launch import launch
 
 __all__ = ["run_on_host"]
@@ -84,7 +85,13 @@ def _call_native(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _call_kernel(call: wp.uint64, number: wp.int64, failed: wp.array[int]):
+def _call_kernel(
+    # in
+    call: wp.uint64,
+    number: wp.int64,
+    # in and out
+    failed: wp.array[int],
+):
     _call_native(call, number, failed)
 
 
@@ -104,7 +111,7 @@ def run_on_host(function: Callable[[], object], device: wp.Device) -> None:
     if not (device.is_cpu and device.is_capturing):
         function()
         return
-    graph = wp._src.context.runtime._apic_graph  # Warp has no public access to it
+    graph = cpu_graph()
     if graph.apic:
         raise RuntimeError("a graph that is to be saved cannot hold this: it runs Python at each replay")
     if graph not in _failures:

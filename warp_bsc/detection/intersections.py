@@ -26,12 +26,12 @@ __all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_in
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _PAIRS_OF_HIT = 8
-"""Pairs of an edge and a face for each collision, roughly. More of them than edges take longer than a search."""
+"""Pairs of an edge and a face for each collision, roughly. If these are more than the edges, a search is faster."""
 
 
 @made_once
 def _keep_crossings(dtype: type) -> wp.Kernel:
-    """The kernel that keeps the pairs that are not certified apart, for one type of position."""
+    """Returns the kernel that keeps the pairs that are not certified apart, for one type of position."""
 
     @wp.kernel(**NO_GRADIENTS)
     def keep_crossings(
@@ -58,22 +58,22 @@ def _keep_crossings(dtype: type) -> wp.Kernel:
         a = x[faces[face, 0]]
         b = x[faces[face, 1]]
         c = x[faces[face, 2]]
-        answer = edge_crosses_face(p, q, a, b, c)
-        if answer == UNSURE:
+        certified = edge_crosses_face(p, q, a, b, c)
+        if certified == UNSURE:
             if edge_beside_face(p, q, a, b, c):
-                answer = FREE
-        if answer != FREE:
+                certified = FREE
+        if certified != FREE:
             slot = take_slot(counts, _FOUND)
             if slot < wp.int64(kept.shape[0]):
                 kept[wp.int32(slot)] = pairs[i]
-                status[wp.int32(slot)] = wp.int8(answer)
+                status[wp.int32(slot)] = wp.int8(certified)
 
     return keep_crossings
 
 
 @made_once
 def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
-    """The kernel that decides unsure pairs in wide integers, for one type of position and one width."""
+    """Returns the kernel that decides UNSURE pairs in wide integers, for one type of position and one width."""
     edge_meets_face = edge_meets_face_in(limbs)
 
     @wp.kernel(**NO_GRADIENTS)
@@ -94,7 +94,7 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
             return
         edge = pairs[i][0]
         face = pairs[i][1]
-        answer = edge_meets_face(
+        decided = edge_meets_face(
             double(x[edges[edge, 0]]),
             double(x[edges[edge, 1]]),
             double(x[faces[face, 0]]),
@@ -104,7 +104,7 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
             double(x[across[face, 1]]),
             double(x[across[face, 2]]),
         )
-        status[i] = wp.int8(answer)
+        status[i] = wp.int8(decided)
 
     return decide_exactly
 
@@ -151,7 +151,7 @@ def points_on_faces(mesh: CollisionMesh, x: np.ndarray, points: np.ndarray, face
     edges = wp.array(np.repeat(len(x) + rows[:, None], 2, axis=1), dtype=int, device=device)  # both ends at one point
     pairs = wp.array(np.stack([rows, faces], axis=1), dtype=wp.vec2i, device=device)
     status = wp.full(n, int(UNSURE), dtype=wp.int8, device=device)
-    # what passes through a face does not matter, nor do the faces' neighbours
+    # whether an edge passes through a face does not matter, so that any vertices across its sides will do
     status = _decided(mesh, positions, edges, mesh.device_faces, pairs, status, n)
     on_face = status != FREE
     (unsure,) = np.nonzero(status == UNSURE)
@@ -183,7 +183,7 @@ class CrossingCandidates:
             broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
         self.lock = broad_phase.lock
         self._broad_phase = broad_phase
-        # the counts of the edges' pairs with faces take the place of those with edges
+        # the counts of edge-edge pairs serve for those of edges with faces
         self.counts = self._counters.edge_edge
         self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self.count = 0
@@ -193,8 +193,8 @@ class CrossingCandidates:
         self._counters.array.zero_()
         self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, refit=refit, is_end=is_end)
 
-    def put(self, pairs: np.ndarray) -> None:
-        """Enqueues these pairs, int32, shape [n, 2], instead of those that the broad phase finds."""
+    def enqueue(self, pairs: np.ndarray) -> None:
+        """Enqueues given pairs, int32, shape [n, 2], in place of those that the broad phase finds."""
         self._counters.array.zero_()
         self.counts[Count.QUEUED : Count.QUEUED + 1].fill_(len(pairs))
         if len(pairs) > len(self.pairs):
@@ -257,7 +257,7 @@ class IntersectionFinder:
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
                 vertices that no face uses may be anything.
-            is_end: Whether they are those at the end of the last motion that the given broad phase has seen.
+            is_end: Whether they are those at the end of the motion that the given broad phase has boxed last.
 
         Raises:
             TypeError: If the positions are no array of numbers.
@@ -278,8 +278,8 @@ class IntersectionFinder:
         Args:
             x: Positions at the end, as of :meth:`find`.
             start: The intersections at the start.
-            collisions: The collisions of the motion, the last one that the given broad phase has seen, by a detector
-                of the same mesh without a minimum distance.
+            collisions: The collisions of the motion, the one that the given broad phase has boxed last, from a
+                detector of the same mesh without a minimum distance.
 
         Raises:
             ValueError: As :meth:`find`.
@@ -289,7 +289,7 @@ class IntersectionFinder:
         if is_slower or not collisions.certified or not self._has_sides:
             return self.find(x, is_end=True)
         pairs = self._pairs_that_may_meet(start, collisions)
-        return self._find(x, lambda _: self._candidates.put(pairs))
+        return self._find(x, lambda _: self._candidates.enqueue(pairs))
 
     @one_at_a_time
     def _find(self, x: np.ndarray | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
@@ -363,9 +363,9 @@ class IntersectionFinder:
         )
 
     def _pairs_that_may_meet(self, start: Intersections, collisions: Collisions) -> np.ndarray:
-        """Returns the pairs (edge, face) that met at the start, or of which a part of each is in a collision.
+        """Returns the pairs (edge, face) that met at the start, or that a collision of their parts implies may meet.
 
-        Pairs that share a vertex are left out. Each other one is there once. Shape [n, 2], int32.
+        Pairs that share a vertex are excluded; each other pair is listed once. Shape [n, 2], int32.
         """
         mesh = self._mesh
         rows, edges = self._edges_of_vertices.of(collisions.vertex_face[:, 0])
@@ -393,7 +393,7 @@ class IntersectionFinder:
 
 
 class _Incidence:
-    """For each of some elements, such as vertices, those of which it is a part, such as edges."""
+    """The elements that have a part, such as the edges of a vertex, for each part."""
 
     def __init__(self, parts: np.ndarray, count: int):
         """Sorts by parts.
@@ -406,7 +406,7 @@ class _Incidence:
         self._starts = np.cumsum(np.bincount(parts.ravel() + 1, minlength=count + 1))
 
     def of(self, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns for some parts all elements that have them: the row of the part, and the element, shape [m] each."""
+        """Returns all elements that have some parts: the row of the part, and the element, each of shape [m]."""
         first, counts = self._starts[parts], self._starts[parts + 1] - self._starts[parts]
         rows = np.repeat(np.arange(len(parts)), counts)
         places = np.arange(len(rows)) + np.repeat(first - (np.cumsum(counts) - counts), counts)

@@ -52,7 +52,7 @@ class PairStages:
         order: Indices of the contacts, to be sorted by their keys.
         for_exact: Indices of contacts for the exact stage, or for subdivision with a minimum distance.
         second_bits: Bits of the second element in a key.
-        last_key: Key of what is no contact, greater than those of contacts.
+        last_key: Key of rows that are no contacts, greater than those of contacts.
     """
 
     elements: wp.array2d[int]
@@ -81,7 +81,7 @@ class PairKernels(NamedTuple):
 
 @wp.func
 def _kind_at(i: int, capacity: int):
-    """Returns the kind of pair of a thread, and the place in the queue of that kind, whose first has a capacity."""
+    """Returns the kind of pair of a thread, and its index in the queue of that kind, from the capacity of the first."""
     if i < capacity:
         return VERTEX_FACE, i
     return EDGE_EDGE, i - capacity
@@ -314,7 +314,7 @@ def pad_keys(
     # out
     keys: wp.array[wp.int64],
 ):
-    """Writes the last key behind the contacts."""
+    """Writes the last key to the rows after the contacts."""
     i = first + wp.tid()
     if wp.int64(i) >= counts[_CONTACTS]:
         keys[i] = last_key

@@ -1,7 +1,7 @@
-"""Launches in any thread, over queues whose length only the device knows, and until the buffers suffice.
+"""Launches in any thread, over queues whose length is on the device, repeated until the buffers suffice.
 
-Warp neither loads one module in two threads at once nor two modules of one name, such as that of a kernel made twice:
-the process crashes. Here, one lock is held while a kernel is made, and while it is launched for the first time.
+The process crashes where Warp loads one module in two threads at once, or two modules of one name, such as those of a
+kernel that was made twice. Here, one lock is held while a kernel is made, and while it is launched first.
 """
 
 import contextlib
@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
+from .._private_names import may_run_in_threads
+
 __all__ = [
     "GrowingBuffers",
     "cores",
@@ -23,7 +25,7 @@ __all__ = [
     "launch_over",
     "launch_over_queue",
     "made_once",
-    "most_blocks",
+    "max_blocks",
     "retry_until_fits",
 ]
 
@@ -38,14 +40,14 @@ _KERNELS = threading.RLock()
 """Held while a kernel is made or loaded."""
 
 _loaded: weakref.WeakKeyDictionary[wp.Kernel, set[tuple[str, int]]] = weakref.WeakKeyDictionary()
-"""Devices and sizes of blocks for which a kernel has been launched; 0 for the default size, which the CPU has."""
+"""Devices and thread block sizes for which a kernel has been launched; 0 for the default size, as on the CPU."""
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
 def made_once(make: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Returns a function that makes kernels as this one does, once for each of its arguments, in whichever thread."""
+    """Returns a function that makes kernels as the given one does, once for the same arguments, in any thread."""
     cached = functools.cache(make)
 
     @functools.wraps(make)
@@ -58,7 +60,7 @@ def made_once(make: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
 
 @contextlib.contextmanager
 def _loading(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> Iterator[None]:
-    """Keeps other threads from loading kernels within, if this one must be loaded."""
+    """Keeps other threads from loading kernels in the context, if this kernel is not loaded."""
     key, loaded = (device.alias, block_dim), _loaded.setdefault(kernel, set())
     if key in loaded:
         yield
@@ -69,7 +71,7 @@ def _loading(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> Iterator[N
 
 
 def launch(kernel: wp.Kernel, dim: int, *, device: wp.DeviceLike, **options: Any) -> None:
-    """Launches a kernel as :func:`warp.launch` does, in whichever thread."""
+    """Launches a kernel as :func:`warp.launch` does, from any thread; does nothing for a dimension of 0."""
     device = wp.get_device(device)
     if dim:
         with _loading(kernel, device, options.get("block_dim", 0)):
@@ -78,7 +80,7 @@ def launch(kernel: wp.Kernel, dim: int, *, device: wp.DeviceLike, **options: Any
 
 @contextlib.contextmanager
 def cores(count: int) -> Iterator[None]:
-    """Keeps launches on the CPU that are made within to as many threads: if 1, to the one that makes them."""
+    """Limits launches on the CPU to ``count`` threads in the context; if 1, to the thread that launches."""
     token = _threads.set(count)
     try:
         yield
@@ -88,34 +90,23 @@ def cores(count: int) -> Iterator[None]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads for the CPU: Warp runs a kernel on one, but lets others run meanwhile."""
+    """Returns threads for the CPU: Warp runs a kernel on one, and other threads run at the same time."""
     return ThreadPoolExecutor(threads)
 
 
-def _may_share(kernel: wp.Kernel) -> bool:
-    """Whether several threads may run a kernel at once.
+def max_blocks(device: wp.Device, block_dim: int) -> int:
+    """Returns the largest number of blocks of a launch over a queue, so that unused capacity takes next to no time.
 
-    Warp's kernels on a CPU share a pointer to the stack of the thread that set it last, for their tiles. A kernel
-    without tiles does not follow it, once it is optimized.
-    """
-    options = kernel.module.options
-    mode, level = options["mode"] or wp.config.mode, options["optimization_level"]
-    level = wp.config.optimization_level if level is None else level
-    return mode == "release" and level != 0
-
-
-def most_blocks(device: wp.Device, block_dim: int) -> int:
-    """Returns the most blocks of a launch over a queue, so that a capacity costs next to nothing beside what is filled.
-
-    Their threads go on to further entries, in Warp's loop around a kernel. Up to four times as many as run at once
-    balance the work; more cost time where the queue is empty.
+    Warp's loop around a kernel takes their threads on to further entries. Up to four times the number that runs at once
+    balances the work; more take time where the queue is empty.
 
     Args:
         device: The device.
         block_dim: Threads of a block.
 
     Returns:
-        The number of blocks; 0, without a limit, for the CPU and where Warp is configured to make no such loops.
+        The number of blocks; 0, without a limit, for the CPU and where Warp is configured to make no loops. Versions
+        without this configuration always make them.
     """
     if device.is_cpu or not getattr(wp.config, "default_grid_stride", True):
         return 0
@@ -135,12 +126,12 @@ def launch_over(
 ) -> None:
     """Launches a kernel over ``count`` entries, on all cores where the device is the CPU.
 
-    The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small blocks of threads
+    The kernel's first argument is the entry at which its part starts: ``i = first + wp.tid()``. Small thread blocks
     suit kernels in which few threads work long. A core takes at least ``chunk`` entries at a time. At most
     ``max_blocks`` blocks run on a GPU, 0 for any number.
 
     Raises:
-        RuntimeError: If the CPU captures a graph: it would hold the count of now, see :mod:`.host_function`.
+        RuntimeError: If the CPU captures a graph, which would keep the present count, see :mod:`.host_function`.
     """
     if device.is_cuda:
         launch(
@@ -158,9 +149,9 @@ def launch_over(
         raise RuntimeError("a graph on the CPU cannot capture this, as the host reads results between launches")
     if not count:
         return
-    threads = _threads.get() if _may_share(kernel) else 1
+    threads = _threads.get() if may_run_in_threads(kernel) else 1
     chunk = max(chunk, -(-count // (8 * threads if threads > 1 else 1)))
-    # Threads only run what this one has prepared: Warp loads a kernel and packs its arguments for one thread at a time.
+    # other threads only run commands: Warp cannot load a kernel and pack its arguments in several threads at once
     options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
     with _loading(kernel, device, 0):
         commands = [
@@ -181,15 +172,15 @@ def launch_over_queue(
     outputs: list,
     block_dim: int = 256,
 ) -> None:
-    """Launches a kernel over a queue: its filled entries on the CPU; all on a GPU, without synchronizing.
+    """Launches a kernel over a queue: its filled entries on the CPU; its capacity on a GPU, without synchronizing.
 
-    On a GPU a large capacity costs next to nothing, see :func:`most_blocks`.
+    On a GPU a large capacity takes next to no time, see :func:`max_blocks`.
 
     Args:
         kernel: The kernel, with a first argument as for :func:`launch_over`.
         queue: The queue.
         counts: Counts of several queues, array of int64.
-        count: Place of the queue's count in it.
+        count: Index of the queue's count in it.
         inputs: Arguments of the kernel after the first.
         outputs: The rest of its arguments.
         block_dim: Threads of a block on a GPU.
@@ -205,12 +196,12 @@ def launch_over_queue(
         outputs=outputs,
         device=device,
         block_dim=block_dim,
-        max_blocks=most_blocks(device, block_dim),
+        max_blocks=max_blocks(device, block_dim),
     )
 
 
 class GrowingBuffers(Protocol):
-    """Buffers that count on the device how much they would have to hold."""
+    """Buffers with counts on the device of the entries that they would have to hold."""
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
@@ -218,7 +209,7 @@ class GrowingBuffers(Protocol):
 
 
 def retry_until_fits(launch: Callable[[], _Result], buffers: GrowingBuffers, device: wp.Device) -> _Result:
-    """Launches, and again with larger buffers while some were too small; once where a graph is captured.
+    """Launches until the buffers suffice, enlarging those that were too small; only once where a graph is captured.
 
     Args:
         launch: Launches everything that writes to the buffers, from the start.

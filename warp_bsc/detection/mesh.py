@@ -1,4 +1,4 @@
-"""The collision mesh: the faces, edges and vertices that take part in collision detection."""
+"""The collision mesh: the faces, edges and vertices for collision detection."""
 
 import functools
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ __all__ = ["CollisionMesh"]
 class CollisionMesh:
     """The faces, edges and vertices of a mesh whose positions change and whose connectivity does not.
 
-    Vertices that no face uses (the inner particles of a soft body, say) take no part, unless they are ends of given
+    Vertices that no face uses (such as the inner particles of a soft body) are excluded, unless they are ends of given
     edges (ropes, strands) or given points. Several bodies make one mesh: their faces index one array of positions.
 
     Attributes:
@@ -36,7 +36,7 @@ class CollisionMesh:
             [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
-        only_free: Whether pairs of which faces have both elements are left out.
+        only_free: Whether pairs are left out in which both elements belong to faces.
         device: Warp device of the arrays that the detector uses.
     """
 
@@ -57,9 +57,9 @@ class CollisionMesh:
         Args:
             faces: Vertex indices, integers, shape [face_count, 3] with less than 2^28 faces, NumPy or Warp array.
             vertex_count: Number of positions.
-            edges: Vertex indices of edges that take part although no face has them, integers, shape [n, 2], NumPy or
-                Warp array. Those that faces have are no others.
-            points: Vertices that take part although no face has them, integers, shape [n], NumPy or Warp array.
+            edges: Vertex indices of edges that are included although no face has them, integers, shape [n, 2], NumPy or
+                Warp array. Edges of faces among them are not counted twice.
+            points: Vertices that are included although no face has them, integers, shape [n], NumPy or Warp array.
             radius: Radius of each vertex, in the unit of the positions, 0 or at least 2^-1021, float, shape
                 [vertex_count], NumPy or Warp array; or one for all. A pair collides if it comes within the sum of its
                 two radii.
@@ -73,7 +73,7 @@ class CollisionMesh:
             TypeError: If an argument has another type.
             ValueError: If the faces, edges, points, radii or worlds have another shape or type or are out of range, an
                 index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one vertex twice, entries are
-                masked, the worlds differ within a face or an edge, or there is no such device.
+                masked, the worlds differ within a face or an edge, or the device does not exist.
         """
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
@@ -196,15 +196,15 @@ class CollisionMesh:
             )
         if not np.issubdtype(elements.dtype, np.integer):
             raise ValueError(f"{name}s must be integers, not {elements.dtype}")
-        if len(elements) >= 2**28:  # queues have room for eight pairs a face from the start, and are indexed by int32
-            raise ValueError(f"a mesh must have less than 2^28 {name}s, not {len(elements)}")
+        if len(elements) >= 2**28:  # queues start with a capacity of eight pairs a face, and are indexed by int32
+            raise ValueError(f"{name}s must have less than 2^28 rows, not {len(elements)}")
         bad = np.flatnonzero(
             ((elements < 0) | (elements >= self.vertex_count)).reshape(len(elements), corners).any(axis=1)
         )
         if len(bad):
             raise ValueError(
                 f"{name}s[{bad[0]}] is {elements[bad[0]].tolist()}, but the mesh has {self.vertex_count} vertices"
-                + (f" ({len(bad)} such {name}s)" if len(bad) > 1 else "")
+                + (f" (so do {len(bad) - 1} other {name}s)" if len(bad) > 2 else "")
             )
         return np.ascontiguousarray(elements, dtype=np.int32)
 
@@ -215,7 +215,7 @@ class CollisionMesh:
         return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
-        """The world of each vertex, int32, shape [vertex_count], the same for the vertices of a face or an edge."""
+        """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""
         worlds = as_numpy(world.numpy() if isinstance(world, wp.array) else world, "world")
         if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):
             raise ValueError(

@@ -1,7 +1,7 @@
 """The narrow phase: queued pairs -> culls -> certified classification -> times of impact -> exact stage -> order.
 
 Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
-the device; a queue that was too small shows in them, see :mod:`warp_bsc.kernels.pipeline.queues`.
+the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipeline.queues`.
 """
 
 import dataclasses
@@ -16,8 +16,8 @@ from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
 from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
-from .launch import launch, launch_over, launch_over_queue, most_blocks
-from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
+from .launch import launch, launch_over, launch_over_queue, max_blocks
+from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
 __all__ = ["NarrowPhase", "decide_on_host", "run_narrow_phases"]
@@ -41,7 +41,7 @@ class NarrowPhase:
 
         Args:
             kind: The kind of pair.
-            counts: Array of int64 with a place for each :class:`Count`.
+            counts: Counts by :class:`Count`, array of int64.
             capacity: Capacity for pairs at first.
             elements: Numbers of first and of second elements that pairs may have.
         """
@@ -69,7 +69,7 @@ class NarrowPhase:
 
     @property
     def capacities(self) -> PairCounts:
-        """Capacities for what is counted."""
+        """Capacities for the counts."""
         unlimited = PairCounts(*[UNLIMITED] * len(Count))
         queue, survivors, contacts = len(self.queue), len(self._survivors), len(self.contacts.pairs)
         return dataclasses.replace(unlimited, queued=queue, survivors=survivors, contacts=contacts)
@@ -104,7 +104,7 @@ class NarrowPhase:
         x1: wp.array,
         elements: wp.array,
         *,
-        method: str,
+        method: Method,
         timed: bool = True,
         tolerance: float = TOLERANCE,
         timer: StageTimer,
@@ -115,7 +115,8 @@ class NarrowPhase:
             x0: Positions at the start of the step, array of vec3 or vec3d.
             x1: Positions at its end, of the same type.
             elements: Vertex indices of the faces (VERTEX_FACE) or edges (EDGE_EDGE), two-dimensional array of int.
-            method: One of :data:`METHODS`; pairs too wide for the device are left to :func:`decide_on_host`.
+            method: One of :data:`METHODS`; with "exact", pairs too wide for the device are left to
+                :func:`decide_on_host`.
             timed: Whether to find times of impact, coordinates and normals.
             tolerance: Of the times of impact, as a share of the step.
             timer: Measures the stages.
@@ -123,7 +124,7 @@ class NarrowPhase:
         run_narrow_phases([(self, elements)], x0, x1, method=method, timed=timed, tolerance=tolerance, timer=timer)
 
     def stages(self, elements: wp.array) -> PairStages:
-        """Returns the buffers as kernels take them, with the vertex indices of the faces or edges."""
+        """Returns the buffers as one argument of kernels, with the vertex indices of the faces or edges."""
         stages = PairStages()
         stages.elements, stages.counts = elements, self.counts
         stages.queue, stages.survivors, stages.contacts = self.queue, self._survivors, self.contacts
@@ -133,7 +134,7 @@ class NarrowPhase:
 
     @property
     def _last_key(self) -> int:
-        """Sorting key of what is no contact, which sorts it behind the others."""
+        """Sorting key of rows that are no contacts, greater than those of contacts."""
         return 1 << sum(self._bits)
 
     def decide_exactly(self, x0: wp.array, x1: wp.array, elements: wp.array, *, timed: bool, tolerance: float) -> None:
@@ -186,7 +187,7 @@ def run_narrow_phases(
     x0: wp.array,
     x1: wp.array,
     *,
-    method: str,
+    method: Method,
     timed: bool = True,
     tolerance: float = TOLERANCE,
     timer: StageTimer,
@@ -210,7 +211,7 @@ def run_narrow_phases(
     stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
 
     def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int) -> None:
-        """Launches a kernel over a buffer of both kinds, of one after the other on the CPU and if they are too long."""
+        """Launches a kernel over a buffer of both kinds, one after the other on the CPU and if they are too long."""
         entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
         together = [list(stages)]
         if device.is_cpu or sum(entries.values()) >= 2**31:
@@ -220,7 +221,7 @@ def run_narrow_phases(
             dim = sum(entries[kind] for kind in kinds)
             if device.is_cpu:
                 dim = min(dim, int(stages[kinds[0]].counts.numpy()[count]))
-            blocks = most_blocks(device, block_dim)
+            blocks = max_blocks(device, block_dim)
             inputs = [*motion, *arguments]
             launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
 

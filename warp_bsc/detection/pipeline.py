@@ -11,13 +11,23 @@ from .launch import launch, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase, run_narrow_phases
 from .rings import Rings, make_rings
-from .settings import METHODS, NO_GRADIENTS, TOLERANCE, Counters, Counts, DistanceKind, PairKind, checked_tolerance
+from .settings import (
+    METHODS,
+    NO_GRADIENTS,
+    TOLERANCE,
+    Counters,
+    Counts,
+    DistanceKind,
+    Method,
+    PairKind,
+    checked_tolerance,
+)
 from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
 
-LEAST_CAPACITY = 4096
-"""Least capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
+MIN_CAPACITY = 4096
+"""Smallest capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
 
 _LARGEST_RADIUS = 2.0**1000
 """The sum of two is finite."""
@@ -27,7 +37,7 @@ _UNTIMED = StageTimer(None)
 
 @made_once
 def _count_not_finite(dtype: type) -> wp.Kernel:
-    """The kernel that counts positions that are not finite, for one type of position."""
+    """Returns the kernel that counts positions that are not finite, for one type of position."""
 
     @wp.kernel(**NO_GRADIENTS)
     def count_not_finite(
@@ -60,7 +70,7 @@ def _radius(mesh: CollisionMesh, min_distance: float) -> np.ndarray | None:
 
 
 def _queues(*narrow_phases: NarrowPhase) -> list[wp.array]:
-    """Returns counts and queue of each narrow phase, as a broad phase takes them."""
+    """Returns counts and queue of each narrow phase, in the order of a broad phase's arguments."""
     return [queue for narrow_phase in narrow_phases for queue in (narrow_phase.counts, narrow_phase.queue)]
 
 
@@ -82,7 +92,7 @@ class DetectionPipeline:
         counters: Counts of the last run, on the device.
         counts: The same on the host, as the last :meth:`grow` has read them.
         capacities: Capacities for the counts, in the order of the counters, and 0 for positions that are not finite,
-            Warp array of int64: where a count is larger, something is missing.
+            Warp array of int64: where a count is larger, contacts are missing.
         vertex_face: The narrow phase of vertex-face pairs.
         edge_edge: The narrow phase of edge-edge pairs.
         points: The narrow phases of pairs of a point and an edge, and of two points; none without a minimum distance
@@ -97,11 +107,11 @@ class DetectionPipeline:
         self,
         mesh: CollisionMesh,
         *,
-        method: str = "conservative",
+        method: Method = "conservative",
         tolerance: float = TOLERANCE,
         min_distance: float = 0.0,
         rings: int = 1,
-        keeping: "MinDistances | None" = None,
+        min_distances: "MinDistances | None" = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
     ):
@@ -109,26 +119,26 @@ class DetectionPipeline:
 
         Args:
             mesh: The mesh.
-            method: What becomes of pairs that floating point cannot certify, see :class:`CollisionDetector`.
+            method: How to decide pairs that floating point cannot certify, see :class:`CollisionDetector`.
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, see :class:`CollisionDetector`.
-            rings: Pairs that so few edges join are excluded, see :class:`CollisionDetector`.
-            keeping: Distances that pairs are to keep, see :mod:`.approach_phase`, instead of those that radii and
-                ``min_distance`` make; None for these.
+            rings: Pairs within this number of edges are excluded, see :class:`CollisionDetector`.
+            min_distances: Minimum distances of a response, see :mod:`.approach_phase`, in place of those from radii and
+                ``min_distance``; None for these.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
-            pairs_per_face: Capacity of each queue at first, for each face, at least :data:`LEAST_CAPACITY` together;
+            pairs_per_face: Capacity of each queue at first, for each face, at least :data:`MIN_CAPACITY` together;
                 twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs
                 memory, but no time. Default: eight pairs of faces, one vertex-face and two edge-edge pairs.
 
         Raises:
-            ValueError: If there is no such method, or the tolerance, the distance or the rings are out of range.
+            ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
         """
         checked_choice(method, "method", METHODS)
         tolerance, rings = checked_tolerance(tolerance), checked_integer(rings, "rings")
         min_distance = checked_distance(min_distance, "min_distance")
         self.mesh = mesh
-        self.method = method
+        self.method: Method = method
         self.tolerance = tolerance
         self.generation = 0
         self._checked_vertices = mesh.device_vertices if only_used_vertices else None
@@ -137,12 +147,12 @@ class DetectionPipeline:
         self.counters = Counters(mesh.device)
         self.counts = self.counters.read()
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
-        self._keeping = keeping
-        if keeping is None:
+        self._min_distances = min_distances
+        if min_distances is None:
             self.radius = _radius(mesh, min_distance)
         else:
-            self.radius = keeping.radius.numpy() + 0.5 * keeping.reach
-        self._rings = Rings() if self.radius is None or keeping is not None else make_rings(mesh, rings)
+            self.radius = min_distances.radius.numpy() + 0.5 * min_distances.reach
+        self._rings = Rings() if self.radius is None or min_distances is not None else make_rings(mesh, rings)
         self.device_radius = padding = None
         if self.radius is not None:
             self.device_radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
@@ -151,7 +161,7 @@ class DetectionPipeline:
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs_per_face is not None:
-            vertex_face = edge_edge = min(max(pairs_per_face * elements, LEAST_CAPACITY), 2**31 - 1)
+            vertex_face = edge_edge = min(max(pairs_per_face * elements, MIN_CAPACITY), 2**31 - 1)
             face_pairs = min(2 * vertex_face, 2**31 - 1)  # of layers that lie on each other, most have none of elements
         self._broad_phase = make_broad_phase(
             mesh,
@@ -191,16 +201,16 @@ class DetectionPipeline:
         timer: StageTimer = _UNTIMED,
         side_stream: wp.Stream | None = None,
     ) -> None:
-        """Launches the broad phase and both narrow phases, whose ``contacts`` are the result.
+        """Launches the broad phase and the narrow phases, whose ``contacts`` are the result.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            refit: Whether to keep the tree of the run before, which is fast if little has moved since. A GPU's never
-                changes.
+            refit: Whether to keep the tree of the run before, which is fast if little has moved since. The tree of a
+                GPU never changes.
             changed: Nonzero for each vertex whose motion has changed since the run before, or that was in a contact
-                then. Pairs without such a vertex have no contact again, and are excluded. Warp array of int; None for
-                all.
+                then. Pairs without one of these vertices have no contact again, and are excluded. Warp array of int;
+                None for all.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
             timer: Measures the stages.
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
@@ -217,9 +227,9 @@ class DetectionPipeline:
                 self._launch_count_not_finite(x0, x1)
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
-        if self._keeping is not None:
+        if self._min_distances is not None:
             options = {"tolerance": self.tolerance, "timer": timer}
-            run_approach_phases(narrow_phases, x0, x1, self._keeping, near_pairs=not refit, **options)
+            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=not refit, **options)
         elif self.device_radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:

@@ -29,15 +29,15 @@ _LARGEST = 2.0**1000
 
 
 @made_once
-def _keep_near(dtype: type) -> wp.Kernel:
-    """The kernel that keeps the pairs that are near and not joined, for one type of position."""
+def _keep_proximities(dtype: type) -> wp.Kernel:
+    """Returns the kernel that keeps the pairs that are near and not within the rings, for one type of position."""
 
     @wp.func
     def point(x: wp.array[dtype], vertex: int) -> wp.vec3d:
         return wp.vec3d(wp.float64(x[vertex][0]), wp.float64(x[vertex][1]), wp.float64(x[vertex][2]))
 
     @wp.kernel(**NO_GRADIENTS)
-    def keep_near(
+    def keep_proximities(
         first: int,
         # mesh
         x: wp.array[dtype],
@@ -91,7 +91,7 @@ def _keep_near(dtype: type) -> wp.Kernel:
             kept_distance[k] = found
             kept_position[k] = one + wp.float64(0.5) * (other - one)
 
-    return keep_near
+    return keep_proximities
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Proximities:
         edge_edge: (edge, edge), the smaller first, edges as in ``mesh.edges``, sorted, int32, shape [m, 2].
         vertex_edge: (point, edge), edges that no face has, sorted, int32, shape [k, 2].
         vertex_vertex: (point, point), the smaller first, sorted, int32, shape [l, 2].
-        distance: Least distances of the pairs in the order of the attributes above, in the unit of the positions,
+        distance: Distances of the pairs in the order of the attributes above, in the unit of the positions,
             float64, shape [n + m + k + l].
         position: Points halfway between the closest points, float64, shape [n + m + k + l, 3].
     """
@@ -116,12 +116,12 @@ class Proximities:
     position: np.ndarray
 
 
-class _NearPairs:
-    """The queue of candidates of one kind, and those of them that are near."""
+class _ProximityQueue:
+    """The queue of candidates of one kind, and the proximities among them."""
 
     def __init__(self, kind: DistanceKind, counts: wp.array, capacity: int, device: wp.Device):
         self.kind, self.counts, self._device = kind, counts, device
-        self.queue = wp.empty(capacity, dtype=wp.vec2i, device=device)
+        self.candidates = wp.empty(capacity, dtype=wp.vec2i, device=device)
         self._allocate(capacity)
         self._count = 0
 
@@ -134,11 +134,11 @@ class _NearPairs:
         """Enlarges the buffers that were too small for some counts, and returns whether any was."""
         self._count = found
         grown = False
-        if queued > len(self.queue):
+        if queued > len(self.candidates):
             capacity = capacity_for(queued, f"{self.kind.display_name} candidates")
-            self.queue, grown = wp.empty(capacity, dtype=wp.vec2i, device=self._device), True
+            self.candidates, grown = wp.empty(capacity, dtype=wp.vec2i, device=self._device), True
         if found > len(self.pairs):
-            self._allocate(capacity_for(found, f"near {self.kind.display_name} pairs"))
+            self._allocate(capacity_for(found, f"{self.kind.display_name} proximities"))
             grown = True
         return grown
 
@@ -163,7 +163,7 @@ class ProximityFinder:
         Args:
             mesh: The mesh.
             distance: Distance up to which pairs are near, in the unit of the positions, more than 0, taken as exact.
-            rings: Pairs are excluded if a vertex of one is within so many edges of a vertex of the other.
+            rings: Pairs are excluded if a vertex of one is within this number of edges of a vertex of the other.
 
         Raises:
             TypeError: If an argument has another type.
@@ -176,8 +176,9 @@ class ProximityFinder:
         self._broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
         self._lock = self._broad_phase.lock
         elements = len(mesh.faces) + len(mesh.free_edges) + len(mesh.points)
-        self._near = [
-            _NearPairs(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device) for kind in DistanceKind
+        self._queues = [
+            _ProximityQueue(kind, getattr(self._counters, kind.label), 2 * elements, mesh.device)
+            for kind in DistanceKind
         ]
         self._rings = make_rings(mesh, rings)
         self._has_run = False
@@ -209,28 +210,28 @@ class ProximityFinder:
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
         self._has_run = True
-        found = [self._exactly(near, x, largest) for near in self._near]
+        found = [self._decide(queue, x, largest) for queue in self._queues]
         vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
         distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
         return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position)
 
-    def _exactly(self, near: _NearPairs, x: wp.array, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns pairs, distances and positions of a kind, without the pairs that are farther than the distance."""
-        pairs, distance, position = near.read()
+    def _decide(self, queue: _ProximityQueue, x: wp.array, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns pairs, distances and positions of a kind, without the pairs that are farther apart."""
+        pairs, distance, position = queue.read()
         # differences of positions are at most twice the largest coordinate
         unsure = distance >= self._distance - 4.0 * float(DISTANCE_ERROR) * largest
         if not unsure.any():
             return pairs, distance, position
-        elements = self._mesh.device_elements(near.kind)
+        elements = self._mesh.device_elements(queue.kind)
         (rows,) = np.nonzero(unsure)
         kept = np.ones(len(pairs), dtype=bool)
-        kept[rows], known = are_within_distance(near.kind, x, elements, pairs[rows], self._distance)
+        kept[rows], known = are_within_distance(queue.kind, x, elements, pairs[rows], self._distance)
         rows = rows[~known]
         if len(rows):
             positions = x.numpy()
-            corners, _ = pair_distances(near.kind, elements.numpy(), pairs[rows], np.zeros(len(positions)))
+            corners, _ = pair_distances(queue.kind, elements.numpy(), pairs[rows], np.zeros(len(positions)))
             points = positions[corners]
-            kept[rows] = getattr(checker, near.kind.label)(np.concatenate([points, points], axis=1), self._distance)
+            kept[rows] = getattr(checker, queue.kind.label)(np.concatenate([points, points], axis=1), self._distance)
         return pairs[kept], distance[kept], position[kept]
 
     def grow(self) -> bool:
@@ -238,8 +239,8 @@ class ProximityFinder:
         counts = self._counters.read()
         grown = counts.face_pairs > self._broad_phase.capacity
         self._broad_phase.grow(counts.face_pairs)
-        for near in self._near:
-            grown |= near.grow(counts.pairs[near.kind].queued, counts.pairs[near.kind].found)
+        for queue in self._queues:
+            grown |= queue.grow(counts.pairs[queue.kind].queued, counts.pairs[queue.kind].found)
         return grown
 
     def _enlarge(self, positions: np.ndarray) -> tuple[wp.array, wp.array]:
@@ -254,32 +255,33 @@ class ProximityFinder:
             pad = np.nextafter(kind(0.5 * self._distance), kind(np.inf))
             moved = positions - pad, positions + pad
         if not all(np.isfinite(x[self._mesh.vertices]).all() for x in moved):
-            raise ValueError(f"the distance {self._distance:g} is out of the range of the positions' type")
+            raise ValueError(f"distance must be in the range of the type of the positions, not {self._distance:g}")
         dtype = wp.vec3 if kind is np.float32 else wp.vec3d
         lower, upper = (wp.array(x, dtype=dtype, device=self._mesh.device) for x in moved)
         return lower, upper
 
     def _launch(self, x: wp.array, lower: wp.array, upper: wp.array) -> None:
         self._counters.array.zero_()
-        queues = [array for near in self._near for array in (near.counts, near.queue)]
-        # these move on the same way: axes that separate them at both ends do not keep enlarged boxes apart
+        queues = [array for queue in self._queues for array in (queue.counts, queue.candidates)]
+        # all positions move from lower to upper: an axis that separates two elements at both ends may not separate
+        # their enlarged boxes
         options = {"refit": self._has_run, "keep_separated": True}
         self._broad_phase.pair_elements(lower, upper, *queues[:4], **options)
         self._broad_phase.pair_points(lower, upper, *queues[4:], **options)
         mesh = self._mesh
-        for near in self._near:
+        for queue in self._queues:
             launch_over_queue(
-                _keep_near(x.dtype),
-                near.queue,
-                near.counts,
+                _keep_proximities(x.dtype),
+                queue.candidates,
+                queue.counts,
                 Count.QUEUED,
                 inputs=[
                     x,
-                    int(near.kind),
-                    mesh.device_elements(near.kind),
+                    int(queue.kind),
+                    mesh.device_elements(queue.kind),
                     self._rings,
                     wp.float64(self._distance),
-                    near.queue,
+                    queue.candidates,
                 ],
-                outputs=[near.counts, near.pairs, near.distance, near.position],
+                outputs=[queue.counts, queue.pairs, queue.distance, queue.position],
             )

@@ -12,7 +12,7 @@ from .distance_phase import decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
 from .rings import Rings
-from .settings import METHODS, TOLERANCE, Count, DistanceKind, PairCounts, PairKind, checked_tolerance
+from .settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from .stage_timer import StageTimer
 from .start import checked_device
 
@@ -21,19 +21,19 @@ __all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_
 
 @dataclass(frozen=True)
 class QueryResult:
-    """Answers to elementary queries, one row each, without gradients: :mod:`warp_bsc.kernels` has those.
+    """The results of elementary queries, one row each, without gradients: :mod:`warp_bsc.kernels` has those.
 
     Attributes:
         hit: Whether the query collides, by the method, bool, shape [n].
-        status: What floating point could certify, whatever the method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
+        status: Certified status by floating point, for any method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
         toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
-            if not wanted.
+            for a query without times.
         coordinates: Where they touch or come within the minimum distance, float64, shape [n, 3]: barycentric
             coordinates in the face, (s, r, 0) along the edges, (s, 0, 0) along the edge of a vertex-edge pair; NaN
-            where there is no hit. None if no times were wanted.
+            where there is no hit. None for a query without times.
         normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other
             feature; with a minimum distance from the other feature to it. float64, shape [n, 3]; NaN where there is
-            no hit. None if no times were wanted.
+            no hit. None for a query without times.
     """
 
     hit: np.ndarray
@@ -47,7 +47,7 @@ def query_vertex_face(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -70,7 +70,7 @@ def query_vertex_face(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or there is no such method.
+            tolerance is out of range, or the method is unknown.
     """
     return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
@@ -79,7 +79,7 @@ def query_edge_edge(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -102,7 +102,7 @@ def query_edge_edge(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or there is no such method.
+            tolerance is out of range, or the method is unknown.
     """
     return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
 
@@ -111,7 +111,7 @@ def query_vertex_edge(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -141,7 +141,7 @@ def query_vertex_vertex(
     points: np.ndarray | wp.array,
     *,
     min_distance: float | np.ndarray = 0.0,
-    method: str = "exact",
+    method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
@@ -171,7 +171,7 @@ def _query(
     kind: DistanceKind,
     points: np.ndarray | wp.array,
     min_distance: float | np.ndarray,
-    method: str,
+    method: Method,
     timed: bool,
     tolerance: float,
     device: wp.DeviceLike,
@@ -216,9 +216,9 @@ def _query(
     radius = radius.ravel()
     device_radius = wp.array(radius, dtype=wp.float64, device=device)
 
-    def solve(method: str) -> tuple[HostContacts, np.ndarray]:
-        """The contacts by a method, and the query of each."""
-        # exactly also the times of certified hits that floating point could not find within the tolerance
+    def solve(method: Method) -> tuple[HostContacts, np.ndarray]:
+        """Returns the contacts by a method, and the query of each."""
+        # the exact stage also finds the times of certified hits that floating point did not find within the tolerance
         stages = "exact" if method == "conservative" and timed else method
 
         def launch() -> None:
@@ -233,7 +233,7 @@ def _query(
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
         contacts = contacts.rows(contacts.status != FREE)
         if method == "conservative":
-            contacts.decided[:] = HIT  # whatever the exact stage has decided
+            contacts.decided[:] = HIT  # also those that the exact stage has refuted
         if method != "float":
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":

@@ -31,7 +31,7 @@ def query_points(elements: np.ndarray, pairs: np.ndarray, x0: np.ndarray, x1: np
     Raises:
         TypeError: If an argument is no array of numbers.
         ValueError: If the elements are neither faces nor edges, or positions have another shape or differ in type.
-        IndexError: If there is no such element or vertex.
+        IndexError: If an index of an element or a vertex is out of range.
     """
     x0, x1 = checked_shape(x0, (3,), "x0"), checked_shape(x1, (3,), "x1")
     if x0.dtype != x1.dtype or x0.shape != x1.shape:
@@ -50,7 +50,7 @@ def query_points(elements: np.ndarray, pairs: np.ndarray, x0: np.ndarray, x1: np
 
 
 def _checked_indices(given, name, count):
-    """Returns indices as NumPy; raises an error if they are no integers, or not all in [0, count)."""
+    """Returns indices as NumPy; raises an error if they are not integers in [0, count)."""
     indices = as_numpy(given, name)
     if indices.dtype.kind not in "iu":
         raise ValueError(f"{name} must be integers, got {indices.dtype}")

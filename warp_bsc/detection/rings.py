@@ -1,4 +1,4 @@
-"""Rings of edges: which vertices of a mesh are so few edges apart that their elements are always near."""
+"""Rings of edges: the vertices of a mesh within a number of edges of each other, whose elements are always near."""
 
 import numpy as np
 import warp as wp
@@ -8,16 +8,16 @@ from .mesh import CollisionMesh
 
 __all__ = ["Rings", "are_within_rings", "make_rings"]
 
-_MOST_NEIGHBOURS = 256
+_MAX_NEIGHBOURS = 256
 """Vertices within the rings of one, on average: each candidate compares its vertices with these."""
 
-_MOST_PAIRS = 2**22
-"""Pairs of vertices that a small mesh may always have."""
+_MAX_PAIRS = 2**22
+"""Largest number of pairs of vertices of a mesh that is too small for that average."""
 
 
 @wp.struct
 class Rings:
-    """The vertices within some edges of each vertex, but itself; without arrays there are none.
+    """The other vertices within a number of edges of each vertex; without arrays there are none.
 
     Attributes:
         starts: Where those of each vertex start in ``neighbours``, and its length at last.
@@ -30,7 +30,7 @@ class Rings:
 
 @wp.func
 def are_within_rings(corners: wp.vec4i, firsts: int, rings: Rings) -> bool:
-    """Whether one of the first corners of a pair, 1 or 2, is within the rings of one of the others."""
+    """Returns whether one of the first corners of a pair, 1 or 2, is within the rings of one of the others."""
     if not rings.starts:
         return False
     for first in range(firsts):
@@ -43,7 +43,7 @@ def are_within_rings(corners: wp.vec4i, firsts: int, rings: Rings) -> bool:
 
 
 def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
-    """Returns the vertices within so many edges of each vertex of a mesh, on its device.
+    """Returns the vertices within ``rings`` edges of each vertex of a mesh, on its device.
 
     Args:
         mesh: The mesh.
@@ -51,15 +51,15 @@ def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
 
     Raises:
         TypeError: If the number is no integer.
-        ValueError: If it is negative, or so large that vertices have more than 256 others within it on average, and all
-            together more than 2^22.
+        ValueError: If it is negative, or vertices have more than 256 others within it on average, and more than 2^22
+            together.
     """
     rings = checked_integer(rings, "rings")
     result = Rings()
     if rings == 0:
         return result
     n = mesh.vertex_count
-    most = min(max(_MOST_PAIRS, _MOST_NEIGHBOURS * n), 2**31 - 1)
+    most = min(max(_MAX_PAIRS, _MAX_NEIGHBOURS * n), 2**31 - 1)
     edges = np.unique(np.concatenate([mesh.edges, mesh.edges[:, ::-1]]).astype(np.int64), axis=0)
     starts = np.searchsorted(edges[:, 0], np.arange(n + 1))
     # each pair (vertex, neighbour) is one number; those of a ring are neighbours of the ring before it

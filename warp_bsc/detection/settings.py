@@ -1,7 +1,8 @@
-"""What all parts of the detection share: kinds of pairs, methods, tolerances, options of kernels, and counters."""
+"""Settings and counters that all parts of the detection share: kinds of pairs, methods, tolerances, kernel options."""
 
 import enum
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
@@ -19,21 +20,25 @@ __all__ = [
     "Counters",
     "Counts",
     "DistanceKind",
+    "Method",
     "PairCounts",
     "PairKind",
     "capacity_for",
     "checked_tolerance",
 ]
 
-METHODS = ("float", "conservative", "exact")
+Method = Literal["float", "conservative", "exact"]
 """What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
 arithmetic decides."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
+"""The methods."""
 
 TOLERANCE = 2.0**-20
 """Default tolerance of the time of impact, as a share of the step."""
 
 UNLIMITED = 2**62
-"""Capacity of what is only counted."""
+"""Capacity for entries that are only counted."""
 
 NO_GRADIENTS = {"enable_backward": False, "module": "unique"}
 """Options of a kernel without gradients, in a module of its own."""
@@ -43,7 +48,7 @@ NO_FUSED_OPERATIONS = NO_GRADIENTS | {"module_options": {"fuse_fp": False}}
 
 
 class PairKind(enum.IntEnum):
-    """The two kinds of pairs, with the values that kernels take."""
+    """The two kinds of pairs, with their numbers in kernels."""
 
     VERTEX_FACE = int(polynomials.VERTEX_FACE)
     EDGE_EDGE = int(polynomials.EDGE_EDGE)
@@ -60,7 +65,7 @@ class PairKind(enum.IntEnum):
 
 
 class DistanceKind(enum.IntEnum):
-    """The kinds of pairs that may have a minimum distance, with the values that kernels take."""
+    """The kinds of pairs that may have a minimum distance, with their numbers in kernels."""
 
     VERTEX_FACE = int(polynomials.VERTEX_FACE)
     EDGE_EDGE = int(polynomials.EDGE_EDGE)
@@ -79,7 +84,7 @@ class DistanceKind(enum.IntEnum):
 
     @property
     def point_order(self) -> list[int]:
-        """The point of the pair at each of the four places that kernels take: p a b a, p q q q."""
+        """The point of the pair for each of the four arguments of kernels: p a b a, p q q q."""
         if self == DistanceKind.VERTEX_EDGE:
             return [0, 1, 2, 1]
         return [0, 1, 1, 1] if self == DistanceKind.VERTEX_VERTEX else [0, 1, 2, 3]
@@ -91,7 +96,7 @@ class DistanceKind(enum.IntEnum):
 
 
 def checked_tolerance(tolerance: float) -> float:
-    """Returns a tolerance; raises TypeError or ValueError if it is not in the range that halving the step reaches."""
+    """Returns a tolerance; raises TypeError or ValueError if it is not in [2^-38, 1]."""
     return checked_number(tolerance, "tolerance", 2.0**-38, 1.0)
 
 
@@ -99,7 +104,7 @@ def capacity_for(count: int, buffer: str) -> int:
     """Returns the capacity of a buffer that is to hold ``count`` entries, with a quarter to spare.
 
     Raises:
-        ValueError: If a buffer cannot have as many; names the buffer.
+        ValueError: If the capacity would be out of range; names the buffer.
     """
     capacity = int(count) + int(count) // 4
     if capacity >= 2**31:
@@ -108,7 +113,7 @@ def capacity_for(count: int, buffer: str) -> int:
 
 
 class Count(enum.IntEnum):
-    """Places of the counts of one kind of pair in an array, in the order of the stages.
+    """Indices of the counts of one kind of pair in an array, in the order of the stages.
 
     Attributes:
         CANDIDATES: Pairs that share no vertex and whose swept boxes overlap.
@@ -118,7 +123,7 @@ class Count(enum.IntEnum):
         CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
         FOUND: Contacts that are not certified free when their time of impact is sought either.
         UNSURE: Found pairs that are not certified hits either.
-        FOR_EXACT: Found pairs that the exact stage decides or, where times are wanted, times.
+        FOR_EXACT: Found pairs that the exact stage decides, or whose times it finds.
         TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
         TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
         TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs or, with a minimum
@@ -182,7 +187,7 @@ class PairCounts:
 
 
 _NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
-"""Places of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+"""Indices of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +229,7 @@ class Counts:
 
 
 class Counters:
-    """The counts of a detection on its device, which any thread may raise.
+    """The counts of a detection on its device, which any of its threads may raise.
 
     Attributes:
         array: All counts, zero before each detection, Warp array of int64.

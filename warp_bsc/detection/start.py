@@ -29,7 +29,7 @@ def checked_device(device: wp.DeviceLike) -> wp.Device:
 
     Raises:
         TypeError: If it is neither a device nor the name of one.
-        ValueError: If there is no such device.
+        ValueError: If the device does not exist.
     """
     if device is not None:
         check_instance(device, "device", (str, wp.Device), "a Warp device or its name")
@@ -43,7 +43,7 @@ def find_device(name: str | None) -> wp.Device:
     """Returns the Warp device of a name, Warp's preferred one for None.
 
     Raises:
-        ValueError: If there is no such device.
+        ValueError: If the device does not exist.
     """
     start_warp()
     if name is None:

@@ -1,28 +1,29 @@
-"""What an earlier replay of a scene has found, and what is new since."""
+"""Compares a replay with an earlier one of the scene: which collisions, intersections and proximities are new."""
 
 import json
 import os
 from collections import defaultdict
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple
 
 import orjson
 
 from .._atomic_file import naming
 from .earlier import describe_difference
+from .hit_records import is_tail_line, read_head, read_tail
 from .summary import Summary
 
 __all__ = ["Baseline", "NewFinding"]
 
-_WITHOUT_EFFECT = {
-    "intersections",
-    "strict",
-    "allow_missing",
-    "validate",
-}  # on what is compared; the first is looked at by itself
+Event = Literal["collides", "crosses", "is inside", "is near"]
+"""What two meshes may do in a replay."""
+
+_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate"}
+"""The options that do not change what is compared; ``intersections`` is checked by itself."""
 
 
 class NewFinding(NamedTuple):
-    """What two meshes do in an interval, or at a time, in which they did not do it in an earlier replay.
+    """An interval, or a time, in which two meshes do something that they did not do then in an earlier replay.
 
     Attributes:
         what: ``"collides"``, ``"crosses"``, ``"is inside"`` or ``"is near"``.
@@ -31,7 +32,7 @@ class NewFinding(NamedTuple):
         end: End of the interval, or the time.
     """
 
-    what: str
+    what: Event
     meshes: tuple[str, str]
     start: float
     end: float
@@ -40,28 +41,28 @@ class NewFinding(NamedTuple):
 class Baseline:
     """The times at which meshes collided, intersected and were near each other in an earlier replay."""
 
-    def __init__(self, path: str | os.PathLike, *, method: str, min_distance: float | None, options: dict[str, Any]):
+    def __init__(self, path: str | os.PathLike, *, method: str, clearance: float | None, options: dict[str, Any]):
         """Reads the JSON file of an earlier replay.
 
         Args:
             path: The file.
             method: Method of detection of the replays that will be compared with it.
-            min_distance: As of :class:`Summary`, of these.
-            options: All other options of these, as of :func:`~warp_bsc.replay.hit_files.replay_facts`.
+            clearance: Their clearance, as of :class:`Summary`.
+            options: Their other options, as of :func:`~warp_bsc.replay.hit_files.replay_facts`.
 
         Raises:
             OSError: If it cannot be read.
-            ValueError: If it is not such a file, or its replay was stopped, had other options, or did not look for
-                intersections or distances as large.
+            ValueError: If it is not the file of a complete replay with the same options, with intersections if these
+                are compared, and with at least the same clearance.
         """
         self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
-            what: defaultdict(list) for what in ("collides", "crosses", "is inside", "is near")
+            event: defaultdict(list) for event in ("collides", "crosses", "is inside", "is near")
         }
         try:
             with naming(path):
                 found = _read(path)
-            distance, is_complete = found["min_distance"], found["complete"]
-            had = {"method": found["method"], **found["options"]}
+            own_clearance, is_complete = found["clearance"], found["complete"]
+            earlier = {"method": found["method"], **found["options"]}
             for span in found["collision_spans"]:
                 self._add("collides", span)
             for span in found["intersections"]:
@@ -74,22 +75,23 @@ class Baseline:
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
-            raise ValueError(f"{path}: its replay was stopped, and does not say what there is later")
-        if options["intersections"] and not had["intersections"]:
-            raise ValueError(f"{path}: its replay had --no-intersections, and does not say what crossed")
-        if min_distance is not None and (distance is None or distance < min_distance):
-            own = "no --min-distance" if distance is None else f"--min-distance {distance:g}"
-            raise ValueError(f"{path}: its replay had {own}, and does not say what was near at {min_distance:g}")
-        wanted = json.loads(json.dumps({"method": method, **options}))
-        for name in wanted:
-            if name not in _WITHOUT_EFFECT and had.get(name) != wanted[name]:
-                difference = describe_difference(name, had, wanted)
-                raise ValueError(f"{path}: its replay was another one, and cannot be compared: {difference}")
+            raise ValueError(f"{path}: its replay was stopped; the baseline must be complete")
+        if options["intersections"] and not earlier["intersections"]:
+            raise ValueError(f"intersections: {path} lists none, as its replay did not look for them")
+        if clearance is not None and own_clearance is None:
+            raise ValueError(f"clearance: {path} lists no proximities, as its replay had no clearance")
+        if clearance is not None and own_clearance < clearance:
+            raise ValueError(f"clearance: {path} lists proximities up to {own_clearance:g}, less than {clearance:g}")
+        now = json.loads(json.dumps({"method": method, **options}))
+        for name in now:
+            if name not in _WITHOUT_EFFECT and earlier.get(name) != now[name]:
+                difference = describe_difference(name, earlier, now)
+                raise ValueError(f"{path}: written with other options; cannot compare: {difference}")
 
     def new_in(self, summary: Summary) -> list[NewFinding]:
         """Returns what meshes do in a replay and did not do in the earlier one at that time.
 
-        Meshes that crossed at a time, or of which one was inside the other, count as near each other then.
+        Meshes that crossed at a time, or one of which was inside the other, count as near each other then.
         """
         new = [
             NewFinding("collides", meshes, interval.start, interval.end)
@@ -106,29 +108,31 @@ class Baseline:
             new += self._new_at(sample.time, "is inside", sample.inside)
         for sample in summary.proximities:
             near = [nearest.meshes for nearest in sample.nearest]
-            new += self._new_at(sample.time, "is near", near, ("is near", "crosses", "is inside"))
+            new += self._new_at(sample.time, "is near", near, ("crosses", "is inside"))
         return new
 
-    def _add(self, what: str, span: dict) -> None:
-        self._spans[what][tuple(sorted(span["meshes"]))].append((span["since"], span["until"]))
+    def _add(self, event: Event, span: dict) -> None:
+        self._spans[event][tuple(sorted(span["meshes"]))].append((span["since"], span["until"]))
 
-    def _new_at(self, time, what, pairs, before=()) -> list[NewFinding]:
-        """Returns what pairs of meshes do at a time at which they did nothing of ``before``, default: the same."""
+    def _new_at(
+        self, time: float, event: Event, pairs: Iterable[tuple[str, str]], including: tuple[Event, ...] = ()
+    ) -> list[NewFinding]:
+        """Returns the pairs of meshes of an event at a time at which there was neither it nor one that includes it."""
         return [
-            NewFinding(what, meshes, time, time)
+            NewFinding(event, meshes, time, time)
             for meshes in pairs
             if not any(
                 since <= time <= until
-                for other in before or (what,)
-                for since, until in self._spans[other][tuple(sorted(meshes))]
+                for earlier in (event, *including)
+                for since, until in self._spans[earlier][tuple(sorted(meshes))]
             )
         ]
 
 
-def _read(path) -> dict:
-    """Returns the members before and after the intervals. The file that a replay writes has them in its ends."""
+def _read(path: str | os.PathLike) -> dict[str, Any]:
+    """Returns the facts and the sums of a JSON file, from its first and last line if a replay has written it."""
     with open(path, "rb") as file:
-        first = file.readline().rstrip()
+        first = file.readline()
         size = file.seek(0, os.SEEK_END)
         length = 1 << 16
         while True:
@@ -137,7 +141,7 @@ def _read(path) -> dict:
             if len(lines) > 1 or length >= size:
                 break
             length *= 2
-        if lines and lines[-1].startswith(b'"complete":'):
-            return orjson.loads(first + b"]}") | orjson.loads(b"{" + lines[-1])
+        if lines and is_tail_line(lines[-1]):
+            return read_head(first) | read_tail(lines[-1])
         file.seek(0)  # another program has written the same content
         return orjson.loads(file.read())

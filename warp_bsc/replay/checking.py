@@ -1,13 +1,13 @@
-"""Checks the intervals of a scene one after another, in one process, a few at a time.
+"""Checks the intervals of a scene in one process, as a pipeline of three stages.
 
-One interval is read while the one before is detected, and on a CPU the one before that is named.
+While the results of one interval are named, the next one is detected (on a CPU) and the one after it is read.
 """
 
 import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from ..detection.detector import CollisionDetector
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import Proximities, ProximityFinder
+from ..detection.settings import Method
 from ..detection.start import is_cpu
 from ..usd.interval import Interval
 from ..usd.scene import Scene
@@ -36,37 +37,37 @@ _Found = TypeVar("_Found")
 
 @dataclass(frozen=True)
 class Checks:
-    """What is looked for in every interval, and how.
+    """The checks of every interval, and how they are done.
 
     Attributes:
-        selection: Which pairs of meshes count.
+        selection: The pairs of meshes that are checked.
         method: Method of detection.
         device: Name of the Warp device; None for Warp's default.
-        intersections: Whether to find the intersections at each time, and what is inside what.
-        min_distance: Distance up to which elements are near each other, None to look for none.
-        validate_most: Number of hits, and of other pairs, that the exact checker decides again; None for all.
+        intersections: Whether to find the intersections at each time, and the meshes inside others.
+        clearance: Distance up to which proximities are found at each time; None finds none.
+        validate: Number of hits, and of other pairs, that the exact checker decides again, or "all".
     """
 
     selection: Selection
-    method: str
+    method: Method
     device: str | None
     intersections: bool
-    min_distance: float | None
-    validate_most: int | None
+    clearance: float | None
+    validate: int | Literal["all"]
 
 
 class IntervalChecker:
-    """Checks intervals of a scene. Buffers and trees stay from one to the next."""
+    """Checks intervals of a scene. Consecutive intervals of a segment share buffers and trees."""
 
     def __init__(self, scene: Scene, checks: Checks, worker: str = ""):
-        """Takes the scene, what to look for, and the name of this process for :class:`Work`."""
+        """Makes a checker of a scene; ``worker`` is the name of this process for :class:`Work`."""
         self.scene = scene
         self._checks = checks
         self._worker = worker
         self._of_segment: tuple[_SegmentDetector, _SegmentNamer] | None = None
 
     def check(self, first: int, stop: int, seconds: float = math.inf) -> Iterator[IntervalResult]:
-        """Finds the collisions in some intervals, in order. Threads read, and detect on a CPU, the next ones meanwhile.
+        """Yields the results of some intervals, in order. Threads meanwhile read the next ones, and detect on a CPU.
 
         Args:
             first: Number of the first interval.
@@ -85,7 +86,7 @@ class IntervalChecker:
             yield replace(result, work=replace(work, checking=work.checking + time.perf_counter() - started))
 
     def selection_without_initial(self) -> Selection:
-        """Returns the selection that also ignores what crosses, and that something is inside, at the first time."""
+        """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
         interval = self.scene.interval(0)
         detector, namer = self._at(interval)
         found = detector.find_intersections(interval.x0, interval.start)
@@ -99,7 +100,7 @@ class IntervalChecker:
         )
 
     def _detect(self, first: int, stop: int, deadline: float) -> Iterator[tuple[Work, "_SegmentNamer", "_Detection"]]:
-        """Yields what is detected in some intervals, and what names it, with the work until then."""
+        """Yields the work on some intervals, the namers of their segments, and what is detected in them."""
         for reading, interval in read_ahead(_timed(self.scene.intervals(first, stop), deadline)):
             started = time.perf_counter()
             detector, namer = self._at(interval)
@@ -116,15 +117,15 @@ class IntervalChecker:
 
 @dataclass(frozen=True)
 class _Detection:
-    """What is detected in an interval.
+    """The collisions, intersections and proximities that are detected in an interval.
 
     Attributes:
         interval: The interval.
         collisions: Collisions of meshes.
         of_strands: Collisions of curves and points; None without any.
-        intersections: Intersections at the start and at the end; None if they are not looked for.
-        proximities: Proximities at the start and at the end; None if they are not looked for.
-        detector: The detector of the collisions of meshes, if the exact checker is to decide some again.
+        intersections: Intersections at the start and at the end; None if they are not checked.
+        proximities: Proximities at the start and at the end; None if they are not checked.
+        detector: The detector of the collisions of meshes if they are validated, else None.
     """
 
     interval: Interval
@@ -137,14 +138,14 @@ class _Detection:
 
 @dataclass(frozen=True)
 class _At(Generic[_Found]):
-    """What has been found at a time, for the interval that starts there."""
+    """Intersections or proximities of one time, kept for the interval that starts then."""
 
     time: float
     x: np.ndarray
     found: _Found
 
     def is_at(self, x: np.ndarray, time: float) -> bool:
-        """Whether these are the time and the positions."""
+        """Returns whether they are of a time and of positions."""
         return self.time == time and (self.x is x or np.array_equal(self.x, x))
 
 
@@ -153,19 +154,19 @@ class _SegmentDetector:
 
     Attributes:
         mesh: The segment's meshes.
-        strands: What detects its curves and points; None without any.
+        strands: Detects the collisions of its curves and points; None without any.
     """
 
     def __init__(self, segment: Segment, is_still: bool, checks: Checks):
         self._is_still = is_still
-        self._is_validated = checks.validate_most != 0
+        self._is_validated = checks.validate != 0
         self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
         self._detector = CollisionDetector(self.mesh, method=checks.method)
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
         self._finder = self._detector.intersection_finder() if checks.intersections else None
         self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
-        distance = checks.min_distance
-        self._proximity_finder = None if distance is None else ProximityFinder(self.mesh, distance)
+        clearance = checks.clearance
+        self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
         self._proximities: _At[Proximities] | None = None
 
     @property
@@ -174,7 +175,7 @@ class _SegmentDetector:
         return self.mesh.device.alias
 
     def detect(self, interval: Interval) -> _Detection:
-        """Returns what is detected in an interval."""
+        """Returns the detected collisions, intersections and proximities of an interval."""
         detector = self._detector
         start = self.find_intersections(interval.x0, interval.start) if self._finder else None
         if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
@@ -183,7 +184,6 @@ class _SegmentDetector:
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1)
-        assert isinstance(collisions, Collisions)  # nothing is captured here
         of_strands = self.strands.detect(interval) if self.strands and not self._is_still else None
         intersections = None
         if start:
@@ -191,20 +191,20 @@ class _SegmentDetector:
             intersections = start, self.find_intersections(interval.x1, interval.end, motion)
         proximities = None
         if self._proximity_finder:
-            near = self._find_near(interval.x0, interval.start)
-            proximities = near, self._find_near(interval.x1, interval.end)
+            at_start = self._find_proximities(interval.x0, interval.start)
+            proximities = at_start, self._find_proximities(interval.x1, interval.end)
         return _Detection(
             interval, collisions, of_strands, intersections, proximities, detector if self._is_validated else None
         )
 
     def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
-        """Returns the intersections at a time, those found last if these are the ones.
+        """Returns the intersections at a time; those found last, if they are of that time.
 
         Args:
             x: Positions at that time, shape [vertex_count, 3].
             time: Time code.
-            collisions: Those of the motion that has just been detected, from the positions of the intersections found
-                last to these; None if there is none.
+            collisions: Those of the motion to these positions from the positions of the intersections found last, if
+                it has just been detected; else None.
         """
         last = self._intersections
         if last is None or not last.is_at(x, time):
@@ -219,8 +219,8 @@ class _SegmentDetector:
             self._intersections = last = _At(time, x, (of_meshes, found))
         return last.found[1]
 
-    def _find_near(self, x: np.ndarray, time: float) -> Proximities:
-        """Returns the proximities at a time, those found last if these are the ones."""
+    def _find_proximities(self, x: np.ndarray, time: float) -> Proximities:
+        """Returns the proximities at a time; those found last, if they are of that time."""
         if self._proximities is None or not self._proximities.is_at(x, time):
             assert self._proximity_finder
             self._proximities = _At(time, x, self._proximity_finder.find(x))
@@ -228,7 +228,7 @@ class _SegmentDetector:
 
 
 class _SegmentNamer:
-    """Names what is detected in the intervals of one segment, on the host."""
+    """Names the detected pairs of the intervals of one segment by prims and elements, on the host."""
 
     def __init__(self, segment: Segment, detector: _SegmentDetector, checks: Checks):
         self.segment = segment
@@ -250,7 +250,7 @@ class _SegmentNamer:
             intersections = named, self.name_intersections(end, interval.x1, interval.end)
         if detection.proximities:
             start, end = detection.proximities
-            proximities = self._name_near(start, interval.start), self._name_near(end, interval.end)
+            proximities = self._name_proximities(start, interval.start), self._name_proximities(end, interval.end)
         contacts = find_contacts(interval, self._mesh, collisions, selection)
         certified, stats = collisions.certified, collisions.stats
         if detection.of_strands:
@@ -267,7 +267,7 @@ class _SegmentNamer:
                 collisions,
                 interval.x0,
                 interval.x1,
-                most=self._checks.validate_most,
+                most=None if self._checks.validate == "all" else self._checks.validate,
                 seed=interval.index,
                 counted=contacts.counted,
             )
@@ -282,7 +282,7 @@ class _SegmentNamer:
         return IntervalResult(summary, contacts, intersections, proximities, None)
 
     def name_intersections(self, found: Intersections, x: np.ndarray, time: float) -> SceneIntersections:
-        """Returns intersections with what is inside meshes at the same time, those named last if these are the ones.
+        """Returns the named intersections of a time, with the parts inside meshes; those named last, if the same.
 
         Args:
             found: The intersections.
@@ -293,11 +293,11 @@ class _SegmentNamer:
             assert self._containment
             selection, meshes = self._checks.selection, self.segment.meshes
 
-            def are_wanted(pairs: np.ndarray) -> np.ndarray:
+            def are_checked(pairs: np.ndarray) -> np.ndarray:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
                 return selection.counted_pairs(meshes, pairs) & ~ignored
 
-            inside = self._containment.find(x, found, are_wanted)
+            inside = self._containment.find(x, found, are_checked)
             mesh = self._strand_mesh or self._mesh
             self._intersections = (
                 found,
@@ -305,8 +305,8 @@ class _SegmentNamer:
             )
         return self._intersections[1]
 
-    def _name_near(self, found: Proximities, time: float) -> SceneProximities:
-        """Returns proximities, those named last if these are the ones."""
+    def _name_proximities(self, found: Proximities, time: float) -> SceneProximities:
+        """Returns the named proximities of a time; those named last, if the same."""
         if self._proximities is None or self._proximities[0] is not found:
             named = name_proximities(self.segment, self._mesh, found, time, self._checks.selection)
             self._proximities = found, named
@@ -337,23 +337,21 @@ class _StrandChecker:
 
     @property
     def bodies(self) -> np.ndarray:
-        """Number of the scene's mesh that each face is in, then of the curves that each edge without faces is in."""
+        """Number of the scene's mesh that each face belongs to, then of the one that each free edge belongs to."""
         ends = self.mesh.edges[self.mesh.free_edges].astype(np.int64)
         return np.concatenate([self._segment.face_meshes, self._segment.locate_edges(ends)[0]])
 
     def detect(self, interval: Interval) -> Collisions:
         """Returns the collisions of curves and points in an interval."""
-        collisions = self._detector.detect(interval.x0, interval.x1)
-        assert isinstance(collisions, Collisions)  # nothing is captured here
-        return collisions
+        return self._detector.detect(interval.x0, interval.x1)
 
     def with_intersections(self, found: Intersections, x: np.ndarray, *, is_end: bool) -> Intersections:
-        """Returns intersections of the meshes with those of curves after them, edges as in :attr:`mesh`.
+        """Returns intersections of meshes followed by those of curves, with the edges numbered as in :attr:`mesh`.
 
         Args:
             found: Intersections of the meshes alone.
             x: Positions, shape [vertex_count, 3].
-            is_end: Whether a motion that ends there has just been detected.
+            is_end: Whether a motion that ends at these positions has just been detected.
         """
         assert self._finder
         more = self._finder.find(x, is_end=is_end)
@@ -362,7 +360,7 @@ class _StrandChecker:
 
 
 def _timed(intervals: Iterable[Interval], deadline: float) -> Iterator[tuple[float, Interval]]:
-    """Yields intervals, of which the first is read in any case, with the time to read each [s] until a deadline."""
+    """Yields intervals, at least one, with the time to read each [s], until a deadline."""
     started = time.perf_counter()
     for interval in intervals:
         yield time.perf_counter() - started, interval

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 import math
 import os
 import time
@@ -13,11 +12,19 @@ from typing import Any, TypeVar
 import numpy as np
 import orjson
 
-from .. import __version__
+from .._version import __version__
 from ..detection.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
+from .hit_records import (
+    head_line,
+    intersection_kinds,
+    intersection_phases,
+    interval_line,
+    mesh_pairs_to_list,
+    tail_line,
+)
 from .outputs import RecordFile
-from .results import IntersectionSummary, IntervalResult
+from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
@@ -30,16 +37,16 @@ _SAVE_SECONDS = 20.0
 
 
 def replay_facts(
-    scene: Scene, *, method: str, device: str, min_distance: float | None, options: dict[str, Any]
+    scene: Scene, *, method: str, device: str, clearance: float | None, options: dict[str, Any]
 ) -> dict[str, Any]:
-    """Returns facts of a replay that hold from its start: what is checked, and how.
+    """Returns the facts of a replay that are known at its start: its scene, method and options.
 
     Args:
         scene: The scene.
         method: Method of detection.
         device: Name of the Warp device.
-        min_distance: As of :class:`Summary`.
-        options: All other options that the results depend on.
+        clearance: As of :class:`Summary`.
+        options: The other options that the results depend on.
     """
     return {
         "version": __version__,
@@ -50,7 +57,7 @@ def replay_facts(
         ],
         "method": method,
         "device": device,
-        "min_distance": min_distance,
+        "clearance": clearance,
         "options": options,
         "time_codes_per_second": scene.time_codes_per_second,
         "meters_per_unit": scene.meters_per_unit,
@@ -64,23 +71,23 @@ def replay_facts(
 class HitsJson(RecordFile):
     """A JSON file: facts of the replay, every interval with its contacts and intersections, then the sums.
 
-    An interval lists what intersects, is inside and is near at its start, and where the next interval may start
-    elsewhere, or there is none, at its end as well. Every interval is in a line of its own.
+    An interval lists the intersections, parts inside others and proximities at its start; if the next interval may
+    start elsewhere, or there is none, those at its end as well. :mod:`~warp_bsc.replay.hit_records` has the lines.
 
-    The file holds no measured times, so that it is the same whoever has found the results.
-    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it, and what is left of it at
-    :func:`~warp_bsc._atomic_file.unfinished_path` if the process is killed.
+    The file holds no measured times, so that it is the same for any number of processes.
+    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it, or the part of it that a killed process leaves at
+    :func:`~warp_bsc._atomic_file.unfinished_path`.
     """
 
     def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], has_strands: bool, earlier_count: int = 0):
         """Opens the file.
 
         Args:
-            path: The file's place.
+            path: The file.
             facts: What :func:`replay_facts` returns.
             has_strands: Whether the scene has curves or points.
-            earlier_count: Number of intervals in the file of an earlier replay, which this one must not replace as long
-                as it has fewer.
+            earlier_count: Number of intervals in the file of an earlier replay, which this one does not replace before
+                it has as many.
 
         Raises:
             OSError: If it cannot be written.
@@ -92,7 +99,7 @@ class HitsJson(RecordFile):
         self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
 
     def add(self, result: IntervalResult) -> None:
-        """Appends an interval, and saves the file at the first interval, and then every some seconds."""
+        """Appends an interval; saves the file at the first one, and then every 20 seconds."""
         super().add(result)
         if self.file.is_stream or self.record_count < self._earlier_count:
             return
@@ -102,48 +109,12 @@ class HitsJson(RecordFile):
 
     def head(self) -> str:
         """Returns the text before the first interval."""
-        return json.dumps(self._facts)[:-1] + ', "intervals": ['
+        return head_line(self._facts)
 
     def record(self, result: IntervalResult) -> Iterator[str | bytes]:
         """Yields the text of an interval with all of its contacts."""
-        interval, contacts = result.summary, result.contacts
-        is_joined = contacts.interval.is_joined
-        fields = {
-            "index": interval.index,
-            "start": interval.start,
-            "end": interval.end,
-            "pairs_tested": interval.pairs_tested,
-            "hits": interval.hits,
-            **{f"{kind}_hits": getattr(interval, f"{kind}_hits") for kind in self._kinds},
-            "earliest": asdict(interval.earliest) if interval.earliest else None,
-            "mesh_pairs": _mesh_pairs_to_list(interval.mesh_pairs.items()),
-            "ignored": _mesh_pairs_to_list(interval.ignored.items()),
-            "certified": interval.certified,
-            "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in self._kinds},
-            "validation": asdict(interval.validation) if interval.validation else None,
-        }
-        if interval.intersections:
-            start, end = interval.intersections
-            fields["separate_hits"] = interval.separate_hits
-            fields["phases"] = dict(zip(PHASES, interval.phases or (), strict=True))
-            fields["intersections"] = {"start": _numbers(start), "end": _numbers(end)}
-        if interval.proximities:
-            fields["proximities"] = dict(zip(("start", "end"), map(asdict, interval.proximities), strict=True))
-        yield ("," if self.record_count else "") + "\n" + json.dumps(fields, allow_nan=False)[:-1]
-        yield from _list("contacts", contacts, _contact_rows)
-        if result.intersections:
-            start, end = result.intersections
-            yield from _list("edges_through_faces", start, _intersection_rows, start.edge_rows)
-            yield from _list("inside", start, _intersection_rows, start.inside_rows)
-            if not is_joined:
-                yield from _list("edges_through_faces_at_end", end, _intersection_rows, end.edge_rows)
-                yield from _list("inside_at_end", end, _intersection_rows, end.inside_rows)
-        if result.proximities:
-            start, end = result.proximities
-            yield from _list("near_pairs", start, _proximity_rows)
-            if not is_joined:
-                yield from _list("near_pairs_at_end", end, _proximity_rows)
-        yield "}"
+        yield ("," if self.record_count else "") + "\n"
+        yield from interval_line(result, self._kinds)
 
     def tail(self, summary: Summary) -> str:
         """Returns the text after the last interval."""
@@ -156,24 +127,24 @@ class HitsJson(RecordFile):
             "hits": summary.hits,
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
-            "mesh_pairs": _mesh_pairs_to_list(summary.mesh_pairs),
+            "mesh_pairs": mesh_pairs_to_list(summary.mesh_pairs),
             "collision_spans": [asdict(span) for span in summary.collision_spans],
-            "ignored": _mesh_pairs_to_list(summary.ignored),
+            "ignored": mesh_pairs_to_list(summary.ignored),
             "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
             "proximity_spans": [asdict(span) for span in summary.proximity_spans],
             "nearest": [asdict(nearest) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
-        return "],\n" + json.dumps(sums, allow_nan=False)[1:] + "\n"
+        return tail_line(sums)
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact, intersection and proximity, and a last line with # if some are missing.
+    """A CSV file: a row for each contact, intersection and proximity, and a last line with # if intervals are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
-    start, in the last interval its end too. Parts of a mesh that are inside another have the phase "inside", and the
-    kind "vertex-face": a vertex of the part and a face of the other. The same holds for proximities, which have the
-    phase "near" and a distance.
+    start, in the last interval its end too. A part of a mesh that is inside another mesh has the phase "inside" and the
+    kind "vertex-face": a vertex of the part and a face of the other mesh. Proximities have the phase "near" and a
+    distance, no time of impact and no normal.
     """
 
     _COLUMNS = (
@@ -217,97 +188,10 @@ class HitsCsv(RecordFile):
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)
 
 
-def _list(
-    name: str, pairs: _Pairs, to_rows: Callable[[_Pairs, slice], list[dict]], which: slice = slice(None)
-) -> Iterator[str | bytes]:
-    """Yields a member of a JSON object: the list of all pairs, or of some rows of them."""
-    yield f', "{name}": ['
-    for number, rows in enumerate(pairs.chunks(which)):
-        yield (b"," if number else b"") + orjson.dumps(to_rows(pairs, rows))[1:-1]
-    yield "]"
-
-
-def _contact_rows(contacts: SceneContacts, rows: slice) -> list[dict]:
-    """Returns the fields of some contacts."""
-    fields = {
-        "kind": [KINDS[kind] for kind in contacts.kind[rows].tolist()],
-        **_names(contacts, rows),
-        "time": contacts.time[rows].tolist(),
-        "toi": contacts.toi[rows].tolist(),
-        "position": contacts.position[rows].tolist(),
-        "normal": contacts.normal[rows].tolist(),
-    }
-    if contacts.phase is not None and contacts.separate is not None:
-        phases, separate = contacts.phase[rows].tolist(), contacts.separate[rows].tolist()
-        fields["phase"] = [PHASES[phase] if phase >= 0 else None for phase in phases]
-        fields["separate"] = [one if phase >= 0 else None for phase, one in zip(phases, separate, strict=True)]
-    return _to_rows(fields)
-
-
-def _intersection_rows(intersections: SceneIntersections, rows: slice) -> list[dict]:
-    """Returns the fields of some intersections."""
-    kinds, phases = _intersection_texts(intersections, rows)
-    return _to_rows(
-        {
-            "kind": kinds,
-            **_names(intersections, rows),
-            "time": [intersections.time] * len(kinds),
-            "position": intersections.position[rows].tolist(),
-            "phase": phases,
-        }
-    )
-
-
-def _intersection_texts(intersections: SceneIntersections, rows: slice) -> tuple[list[str], list[str]]:
-    """Returns the kinds and phases of some intersections."""
-    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
-    insides = [row >= edges for row in range(*rows.indices(len(intersections)))]
-    kinds = ["vertex-face" if inside else "edge-face" for inside in insides]
-    phases = [
-        "inside" if inside else "crosses" if passes else "touches"
-        for inside, passes in zip(insides, crosses, strict=True)
-    ]
-    return kinds, phases
-
-
-def _proximity_rows(proximities: SceneProximities, rows: slice) -> list[dict]:
-    """Returns the fields of some proximities."""
-    kinds = proximities.kind[rows].tolist()
-    return _to_rows(
-        {
-            "kind": [KINDS[kind] for kind in kinds],
-            **_names(proximities, rows),
-            "time": [proximities.time] * len(kinds),
-            "position": proximities.position[rows].tolist(),
-            "phase": ["near"] * len(kinds),
-            "distance": proximities.distance[rows].tolist(),
-        }
-    )
-
-
-def _names(pairs: ScenePairs, rows: slice) -> dict[str, list]:
-    """Returns names of meshes, paths of prims, names of elements and their indices for some pairs.
-
-    ``triangle`` is which of the triangles of its polygon the face is, from 0; None for two edges.
-    """
-    return {
-        "meshes": pairs.mesh_names(rows),
-        "prims": pairs.mesh_paths(rows),
-        "elements": pairs.element_names(rows),
-        "indices": pairs.element_indices(rows),
-        "triangle": pairs.triangles(rows),
-    }
-
-
-def _to_rows(fields: dict[str, list]) -> list[dict]:
-    """Returns columns as rows."""
-    return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
-
-
 def _csv_rows(
     where: str, pairs: _Pairs, to_columns: Callable[[_Pairs, slice], tuple[list[str], list[str], list[str]]]
 ) -> Iterator[str]:
-    """Yields rows of a CSV file, whose texts are made column by column: many times faster than value by value.
+    """Yields rows of a CSV file. Their texts are made column by column, many times faster than value by value.
 
     Args:
         where: Text of the columns of the interval.
@@ -346,7 +230,7 @@ def _contact_columns(contacts: SceneContacts, rows: slice) -> tuple[list[str], l
 
 def _intersection_columns(intersections: SceneIntersections, rows: slice) -> tuple[list[str], list[str], list[str]]:
     """Returns texts of some intersections, as :func:`_csv_rows` takes them."""
-    kinds, phases = _intersection_texts(intersections, rows)
+    kinds, phases = intersection_kinds(intersections, rows), intersection_phases(intersections, rows)
     measures = _at_rest_to_csv(intersections.time, intersections.position[rows])
     return kinds, measures, [f"{phase},," for phase in phases]
 
@@ -360,7 +244,7 @@ def _proximity_columns(proximities: SceneProximities, rows: slice) -> tuple[list
 
 def _at_rest_to_csv(time: float, position: np.ndarray) -> list[str]:
     """Returns the columns from the time to the normal of pairs without a time of impact and a normal."""
-    return [f"{time},,{place},,," for place in _numbers_to_csv(position)]
+    return [f"{time},,{point},,," for point in _numbers_to_csv(position)]
 
 
 def _numbers_to_csv(*columns: np.ndarray) -> list[str]:
@@ -376,17 +260,3 @@ def _csv_text(*values: str) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow(values)
     return text.getvalue()
-
-
-def _numbers(found: IntersectionSummary) -> dict:
-    """Returns the numbers of the intersections at one time."""
-    pairs = [
-        {"meshes": meshes, "crossings": crossings, "touches": touches}
-        for meshes, (crossings, touches) in found.mesh_pairs.items()
-    ]
-    inside = [{"meshes": meshes, "parts": parts} for meshes, parts in found.inside.items()]
-    return asdict(found) | {"mesh_pairs": pairs, "inside": inside}
-
-
-def _mesh_pairs_to_list(mesh_pairs) -> list[dict]:
-    return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]

@@ -1,9 +1,9 @@
 """Writes a page that shows the collisions of a replay interval by interval, in one file that needs no network.
 
-The page's parts are in the folder ``page``. Every interval is in the page as a block of compressed arrays, which the
-page's script unpacks when the interval is shown. Text from the scene's file enters the page as JSON, in which no markup
-can begin, and the page's script sets it as text. The content security policy of the page blocks everything else: other
-scripts, handlers in attributes, addresses.
+The folder ``page`` contains the page's parts. Every interval is a block of compressed arrays, which the page's script
+unpacks when the interval is shown. Text from the scene's file enters the page as JSON, in which no markup can begin,
+and the script inserts it as text. The page's content security policy blocks everything else: other scripts, handlers
+in attributes, addresses.
 """
 
 import base64
@@ -31,8 +31,8 @@ from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["ReportPage"]
 
-_ALL_FACES = 1_500_000  # in the views of all intervals together, which limits those of an interval ...
-_FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... to a number from the first to the second of these
+_ALL_FACES = 1_500_000  # in the views of all intervals together; divided by their number, the limit of an interval ...
+_FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... within these bounds
 _ALL_ROWS = 600_000  # in the table, likewise; the time to open the page grows with them
 _FEWEST_ROWS, _MOST_ROWS = 100, 50_000
 _VIEW_BYTES = 64 << 20  # of all views together
@@ -40,7 +40,7 @@ _SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 _MAX_PAIRS = 10_000  # of meshes
 _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
-_CROSSES, _TOUCHES, _INSIDE, _NEAR = range(4, 8)  # kinds of rows, after those of collisions: see data.js
+_CROSSES, _TOUCHES, _INSIDE, _PROXIMITY = range(4, 8)  # kinds of rows, after those of collisions: see data.js
 _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
 
 _AtRest = SceneIntersections | SceneProximities
@@ -53,7 +53,7 @@ class ReportPage(RecordFile):
         """Opens the file.
 
         Args:
-            path: The file's place.
+            path: The file.
             scene: The scene.
 
         Raises:
@@ -73,7 +73,7 @@ class ReportPage(RecordFile):
             "style": style,
             "script": script,
         }
-        # Text, name, text, name, ...: a text that is filled in may have braces of its own.
+        # Text, name, text, name, ...: the filled-in texts may contain braces.
         parts = (folder / "page.html").read_text(encoding="utf-8").replace("{{", "}}").split("}}")
         filled = [fields.get(part, part) if index % 2 else part for index, part in enumerate(parts)]
         blocks, data = filled.index("blocks"), filled.index("data")
@@ -86,10 +86,9 @@ class ReportPage(RecordFile):
         self._moves: list[bool] = []  # whether each moves
         self._faces: tuple[Any, int] | None = None  # the segment whose faces are all in the page, and their block
         self._center: np.ndarray | None = None  # of all positions in the page
-        self._rows: list[
-            tuple[int, int, int]
-        ] = []  # by interval: collisions, intersections and proximities at its start
-        self._last: list[tuple[str, _AtRest]] = []  # what is at the end of the last complete interval
+        # Numbers of rows by interval: collisions, and intersections and proximities at its start.
+        self._rows: list[tuple[int, int, int]] = []
+        self._last: list[tuple[str, _AtRest]] = []  # intersections and proximities at the end of the last interval
         self._without_view = 0
         self._some_strands = 0  # number of views without all curves and points
 
@@ -98,7 +97,7 @@ class ReportPage(RecordFile):
         return self._before
 
     def record(self, result: IntervalResult) -> Iterator[str]:
-        """Yields the blocks of an interval: collisions, what intersects and is near at its start, and the view."""
+        """Yields the blocks of an interval: collisions, intersections and proximities at its start, and the view."""
         interval, contacts = result.contacts.interval, result.contacts
         index = interval.index
         if self._center is None:
@@ -116,9 +115,9 @@ class ReportPage(RecordFile):
         rest_rows, text = self._at_rest("rest", index, at_rest[0], numbers) if at_rest else (0, "")
         near_rows, more = self._at_rest("near", index, near[0], numbers) if near else (0, "")
         yield text + more
-        places = [contacts.position, *(found.position for found in (*at_rest, *near))]
-        if index == 0 or sum(map(len, places)):
-            yield from self._view(result, np.concatenate(places), numbers)
+        positions = [contacts.position, *(found.position for found in (*at_rest, *near))]
+        if index == 0 or sum(map(len, positions)):
+            yield from self._view(result, np.concatenate(positions), numbers)
         self._rows[index:] = [(len(rows), rest_rows, near_rows)]
         self._last = [(name, found[1]) for name, found in (("rest", at_rest), ("near", near)) if found]
 
@@ -158,14 +157,14 @@ class ReportPage(RecordFile):
         return dict(zip(_COLUMNS, columns, strict=True)) | {"position": self._placed(pairs.position[rows])}
 
     def _at_rest(self, name: str, index: int, found: _AtRest, numbers: np.ndarray) -> tuple[int, str]:
-        """Returns the number of rows and the block of what intersects, or is near, at one time; no block for none."""
+        """Returns the number of rows and the block of intersections or proximities at one time; no block for none."""
         if not len(found):
             return 0, ""
         rows = _choose_rows(found, self._most_rows)
         arrays = self._pairs(found, rows, numbers)
         facts = {"of": len(found)}
         if isinstance(found, SceneProximities):
-            arrays |= {"kind": np.full(len(rows), _NEAR), "distance": found.distance[rows]}
+            arrays |= {"kind": np.full(len(rows), _PROXIMITY), "distance": found.distance[rows]}
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
             curves = found.cuts.points
@@ -177,10 +176,10 @@ class ReportPage(RecordFile):
             facts["curves"] = len(curves)
         return len(rows), _block(f"{name}-{index}", facts, arrays)
 
-    def _view(self, result: IntervalResult, places: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
-        """Yields the blocks of the triangles that move in an interval: all, or those around the given places.
+    def _view(self, result: IntervalResult, positions: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
+        """Yields the blocks of the triangles that move in an interval: all, or those around the given positions.
 
-        Edges of curves, and points, are among them, at most as many of each as triangles.
+        Edges of curves, and points, are included, each up to the largest number of triangles.
         """
         interval, segment = result.contacts.interval, result.contacts.segment
         if not len(segment.faces) and not segment.has_strands:
@@ -189,7 +188,7 @@ class ReportPage(RecordFile):
             self._without_view += 1
             return
         lit = result.contacts.colliding_faces
-        shown = choose_faces(interval.x0[segment.faces[:, 0]], places, lit, self._most_faces)
+        shown = choose_faces(interval.x0[segment.faces[:, 0]], positions, lit, self._most_faces)
         texts = []
         self._some_strands += max(len(segment.free_edges), len(segment.points)) > self._most_faces
         if len(shown) == len(segment.faces) and self._faces and self._faces[0] is segment:
@@ -198,8 +197,8 @@ class ReportPage(RecordFile):
             elements = [segment.faces[shown]]
             if segment.has_strands:
                 elements += [own[_spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
-            vertices, places = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
-            parts = np.split(places, np.cumsum([own.size for own in elements])[:-1])
+            vertices, corners = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
+            parts = np.split(corners, np.cumsum([own.size for own in elements])[:-1])
             number = interval.index
             arrays: dict[str, np.ndarray] = dict(zip(("faces", "edges", "points"), parts, strict=False))
             arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
@@ -216,22 +215,22 @@ class ReportPage(RecordFile):
         yield from texts
 
     def _placed(self, positions: np.ndarray) -> np.ndarray:
-        """Returns positions from the page's center on, in single precision."""
+        """Returns positions relative to the page's center, in single precision."""
         assert self._center is not None  # since the first interval
         return (positions.astype(np.float64) - self._center).astype(np.float32)
 
     def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
-        """Returns sentences on all that is not in the page."""
+        """Returns sentences on what the page omits."""
         notes = []
-        if summary.min_distance is not None and summary.scene.has_strands:
+        if summary.clearance is not None and summary.scene.has_strands:
             notes.append("Distances of curves and points are not checked, only their collisions.")
         most = f"an interval has at most {self._most_rows:,} rows, spread evenly, with at least one for each two meshes"
         rest = sum(at.crossings + at.touches + sum(at.inside.values()) for at in summary.intersections)
         near = sum(at.pairs for at in summary.proximities)
-        names = "collisions", "intersections at rest", "near pairs"
+        names = "collisions", "intersections at rest", "proximities"
         for name, found, shown in zip(names, (summary.hits, rest, near), zip(*rows, strict=True), strict=True):
             if sum(shown) < found:
-                notes.append(f"The table has {sum(shown):,} of {found:,} {name}: {most}. --json and --csv have all.")
+                notes.append(f"The table has {sum(shown):,} of {found:,} {name}: {most}. JSON and CSV files have all.")
         if self._some_strands:
             notes.append(f"{self._some_strands:,} views in 3D have only some of the curves or points, spread evenly.")
         if self._without_view:
@@ -260,9 +259,9 @@ def _data(summary: Summary) -> dict:
         tiles.append((f"{first.time:.6g}", "time code of the first"))
     if looked:
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
-    if summary.min_distance is not None:
+    if summary.clearance is not None:
         nearest = summary.nearest
-        tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.min_distance:g}", "least distance"))
+        tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.clearance:g}", "smallest distance"))
     tiles += [
         (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
         (f"{scene.face_count:,}", "triangles"),
@@ -308,18 +307,18 @@ def _data(summary: Summary) -> dict:
     if found := summary.validation:
         wrong = len(found.disagreements)
         text = (
-            f"{found.hits:,} collisions and {found.others:,} other pairs were asked again of the exact checker: "
+            f"The exact checker decided {found.hits:,} collisions and {found.others:,} other pairs again: "
             f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
-            f"{found.certified:,} of all {found.answers:,} answers."
+            f"{found.certified:,} of all {found.decided:,} pairs."
         )
         data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
     return data
 
 
 def _pairs_of_meshes(summary: Summary) -> list[dict]:
-    """Returns the meshes that collide, intersect or are near: names, collisions, and when they do so.
+    """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
 
-    Each has at most :data:`_MAX_ROWS` spans of time of each kind; ``more`` numbers count the others.
+    A pair has at most :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others.
     """
     hits = {tuple(sorted(meshes)): count for meshes, count in summary.mesh_pairs}
     spans: dict[tuple[str, ...], tuple[tuple[str, str], list, list, list]] = {}
@@ -352,12 +351,12 @@ def _pairs_of_meshes(summary: Summary) -> list[dict]:
 
 
 def _spread(count: int, most: int) -> np.ndarray:
-    """Returns the numbers below a count, or ``most`` of them, evenly."""
+    """Returns the numbers below a count, or ``most`` of them, spread evenly."""
     return np.linspace(0, count - 1, min(count, most)).astype(int)
 
 
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
-    """Returns which pairs are in the page: all, or ``most`` spread evenly with the first of each two meshes."""
+    """Returns the rows of the pairs in the page: all, or ``most``, spread evenly, with the first of each two meshes."""
     if len(pairs) <= most:
         return np.arange(len(pairs))
     firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
@@ -368,9 +367,9 @@ def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
 def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:
     """Returns arrays as an element that the page's script unpacks by its name.
 
-    The content is the header, JSON, and the arrays in 32 bits, the first bytes of all numbers before the second ones,
-    which makes them easier to compress; all of it in base64, and compressed unless it is small: browsers take a
-    millisecond to unpack anything.
+    The content is a JSON header and the arrays in 32 bits, with the first bytes of all numbers before the second ones,
+    which compress better; all of it in base64. It is compressed unless it is small, as each unpacking takes a browser
+    a millisecond.
     """
     columns = {}
     for key, array in arrays.items():

@@ -3,14 +3,14 @@
 import contextlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from .._arguments import check_instance, checked_choice, checked_distance, checked_flag, checked_integer, given
-from ..detection.settings import METHODS
+from ..detection.settings import METHODS, Method
 from ..usd.scene import Scene
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
-from .workers import Cluster, LocalWorkers, check_in_workers, selection_without_initial_in_workers
+from .workers import Cluster, LocalWorkers, check_in_workers, checked_address, selection_without_initial_in_workers
 
 __all__ = ["replay"]
 
@@ -18,22 +18,21 @@ __all__ = ["replay"]
 def replay(
     scene: Scene,
     *,
-    method: str = "exact",
+    method: Method = "exact",
     device: Any = None,
     intersections: bool = True,
     ignore_initial: bool = False,
-    min_distance: float | None = None,
-    validate_most: int | None = 0,
+    clearance: float | None = None,
+    validate: int | Literal["all"] = 0,
     earlier: Iterable[IntervalResult] = (),
-    workers: int = 1,
-    scheduler: str | None = None,
+    workers: int | str = 1,
 ) -> Iterator[IntervalResult]:
     """Finds the collisions in every interval between two consecutive times of a scene, one interval at a time.
 
     Meshes that never move are obstacles: contacts between these are not counted, nor are contacts of a mesh with itself
-    if only its transform moves it. Vertices are taken to move straight from the start of an interval to its end. The
-    edges that pass through faces at the times themselves, and the meshes that are wholly inside others, are found as
-    well, between obstacles too; among the edges are those of curves::
+    if only its transform moves it. Vertices move straight from the start of an interval to its end. At the times
+    themselves, replay also finds the edges (of meshes and of curves) that pass through faces, and the meshes that are
+    wholly inside others, obstacles included::
 
         import warp_bsc as bsc
 
@@ -49,59 +48,72 @@ def replay(
             print(start.crossings, start.position[start.crosses], start.cuts.points, end.mesh_names(end.inside_rows))
 
     Args:
-        scene: The scene; its selection says which pairs count.
+        scene: The scene; its selection defines the pairs that are checked.
         method: ``"float"``, ``"conservative"`` or ``"exact"``, for collisions; intersections are always exact.
         device: Warp device or its name; default: Warp's default.
         intersections: Whether to find the intersections at each time, and the meshes that are wholly inside others.
         ignore_initial: Whether to ignore all pairs of meshes that cross at the first time, and meshes that cross
-            themselves then: their collisions and intersections are only counted. Of a mesh that is inside another then,
-            it is ignored that it is inside that one, nothing else.
-        min_distance: Distance up to which elements are found to be near each other at each time, in the scene's unit of
-            length, at least 2^-1021: a vertex and a face, or two edges, that share no vertex and that no edge joins. No
-            such pair is missing, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`; but nothing is found
-            between the times, and where an edge passes through a face, both may be far from each other's borders: these
-            are intersections. None to look for none.
-        validate_most: Number of hits, and of other pairs, of each interval that the exact checker decides again; None
-            for all.
-        earlier: Results of the first intervals, in order, that an earlier replay has found: they are yielded, and the
-            replay goes on after them. They are taken after what crosses at first has been found.
-        workers: Number of processes on this machine that check intervals; 1 for this process alone. Each uses its share
-            of the cores, or where ``device`` is ``"cuda"`` or None, one GPU. A program that uses more than one must
-            have ``if __name__ == "__main__":`` around its statements, as all with :mod:`multiprocessing`.
-        scheduler: Address of the scheduler of a Dask cluster, such as ``"tcp://head:8786"``, whose workers check the
-            intervals instead; they open the scene by the same path. It needs ``pip install 'warp-bsc[cluster]'``.
+            themselves then: their collisions and intersections are only counted. For a mesh that is inside another
+            then, only its being inside that mesh is ignored.
+        clearance: Distance up to which proximities are found at each time, in the scene's unit of length, at least
+            2^-1021; None finds none. A proximity is a vertex and a face, or two edges, that share no vertex and that no
+            edge joins. All of them are found, see :meth:`~warp_bsc.detection.proximities.ProximityFinder.find`, but
+            only at the times, not between them. An edge that passes through a face, far from the borders of both, is an
+            intersection and no proximity.
+        validate: Number of hits, and of other pairs, of each interval that the exact checker decides again, chosen at
+            random; ``"all"`` decides all of them.
+        earlier: Results of the first intervals, in order, that an earlier replay has found. They are yielded first,
+            after the initial intersections have been found, and the replay resumes after them.
+        workers: Number of processes on this machine that check intervals, 1 for this process alone; or the address of
+            the scheduler of a Dask cluster, such as ``"tcp://head:8786"``, whose workers check them. Each process uses
+            its share of the cores or, if ``device`` is ``"cuda"`` or None, one GPU. With more than one process, a
+            program must have ``if __name__ == "__main__":`` around its statements, as :mod:`multiprocessing` requires.
+            The workers of a cluster open the scene by the same path, and need ``pip install 'warp-bsc[cluster]'``.
 
     Yields:
-        IntervalResult: The collisions of one interval, the same whoever finds them, in order. Only what the caller
-        keeps stays in memory; from other processes, at most two chunks of at most 16 intervals for each wait. The next
-        intervals are read, and on a CPU one is detected, meanwhile.
+        IntervalResult: The collisions of one interval, in order, the same for any number of workers. Only the results
+        that the caller keeps stay in memory, and from other processes at most two chunks of 16 intervals for each.
+        Meanwhile the next intervals are read, and on a CPU one of them is detected.
 
     Raises:
-        TypeError: If an argument has another type, at the call, as for all errors of arguments.
-        ValueError: If the positions at some time are broken, there is no such method, initial intersections are to be
-            ignored and none are to be found, or a number is out of range.
-        OSError: If no scheduler answers, or if workers die again and again while they check the same intervals.
+        TypeError: If an argument has another type; all errors in arguments are raised at the call.
+        ValueError: If the positions at some time are broken, a choice or an address is unknown, a number is out of
+            range, or initial intersections are ignored but intersections are not found.
+        OSError: If the scheduler cannot be reached, or if worker after worker dies while it checks the same intervals.
         ModuleNotFoundError: If Dask is needed and not installed.
     """
     check_instance(scene, "scene", Scene, "a Scene")
     if not isinstance(device, str | None) and not hasattr(device, "alias"):
         raise TypeError(f"device must be a Warp device or its name, not {given(device)}")
     if checked_flag(ignore_initial, "ignore_initial") and not checked_flag(intersections, "intersections"):
-        raise ValueError("ignore_initial: what crosses at first can be ignored only if intersections are found")
+        raise ValueError("ignore_initial: needs intersections=True, as initial intersections are ignored if found")
     check_instance(earlier, "earlier", Iterable, "results of a replay")
-    if scheduler is not None:
-        check_instance(scheduler, "scheduler", str, "the address of a scheduler")
-    if checked_integer(workers, "workers", 1) > 1 and scheduler is not None:
-        raise ValueError("workers, scheduler: either processes on this machine, or those of a cluster")
+    checked_choice(method, "method", METHODS)
     checks = Checks(
         selection=scene.selection,
-        method=checked_choice(method, "method", METHODS),
+        method=method,
         device=None if device is None else str(device),
         intersections=checked_flag(intersections, "intersections"),
-        min_distance=None if min_distance is None else checked_distance(min_distance, "min_distance", zero=False),
-        validate_most=None if validate_most is None else checked_integer(validate_most, "validate_most"),
+        clearance=None if clearance is None else checked_distance(clearance, "clearance", zero=False),
+        validate=_checked_validate(validate),
     )
-    return _replay(scene, checks, bool(ignore_initial), earlier, workers, scheduler)
+    return _replay(scene, checks, bool(ignore_initial), earlier, _checked_workers(workers))
+
+
+def _checked_validate(validate: Any) -> int | Literal["all"]:
+    """Returns a number of pairs, or "all"; raises a TypeError or a ValueError for other values."""
+    if isinstance(validate, str):
+        if validate != "all":
+            raise ValueError(f'validate must be "all" or an integer, not {given(validate)}')
+        return "all"
+    return checked_integer(validate, "validate")
+
+
+def _checked_workers(workers: Any) -> int | str:
+    """Returns a number of processes, or the address of a scheduler; raises a TypeError or a ValueError otherwise."""
+    if isinstance(workers, str):
+        return checked_address(workers)
+    return checked_integer(workers, "workers", 1)
 
 
 def _replay(
@@ -109,14 +121,13 @@ def _replay(
     checks: Checks,
     ignore_initial: bool,
     earlier: Iterable[IntervalResult],
-    workers: int,
-    scheduler: str | None,
+    workers: int | str,
 ) -> Iterator[IntervalResult]:
     """Yields the results of :func:`replay`, whose arguments have been checked."""
     with contextlib.ExitStack() as stack:
         processes = None
-        if scheduler is not None or workers > 1:
-            processes = LocalWorkers(workers) if scheduler is None else Cluster(scheduler)
+        if workers != 1:
+            processes = Cluster(workers) if isinstance(workers, str) else LocalWorkers(workers)
             stack.enter_context(contextlib.closing(processes))
         if ignore_initial:
             if processes:

@@ -1,4 +1,4 @@
-"""The interface of all files that a replay writes, and the base of those that are a list of records."""
+"""The interface of all files that a replay writes, and the base class of files that are lists of records."""
 
 import os
 from abc import ABC, abstractmethod
@@ -18,7 +18,7 @@ class ReplayOutput(Protocol):
     """A file to which the intervals of a replay are written.
 
     Attributes:
-        file: The file, which appears when the output is finished.
+        file: The file, which appears at its path when the output is finished.
     """
 
     file: OutputFile
@@ -32,7 +32,7 @@ class ReplayOutput(Protocol):
         ...
 
     def finish(self, summary: Summary) -> None:
-        """Puts the file in its place.
+        """Completes the file and moves it to its path.
 
         Args:
             summary: The whole replay. The last of its intervals may be missing in this file.
@@ -47,14 +47,14 @@ class ReplayOutput(Protocol):
         ...
 
     def discard(self) -> None:
-        """Removes everything temporary, and the file unless it is finished."""
+        """Removes all temporary files; a finished file stays."""
         ...
 
 
 class RecordFile(ABC):
-    """A text file of a head, one record for each interval, and a tail: a :class:`ReplayOutput` for such formats.
+    """A :class:`ReplayOutput` for text files of a head, one record for each interval, and a tail.
 
-    Every record is in the file as a whole or not at all.
+    The finished file contains only whole records.
 
     Attributes:
         file: The file.
@@ -79,7 +79,7 @@ class RecordFile(ABC):
 
     @abstractmethod
     def tail(self, summary: Summary) -> str:
-        """Returns the text after the last record, given a summary of the intervals that are in the file."""
+        """Returns the text after the last record, given a summary of the intervals in the file."""
 
     @property
     def record_count(self) -> int:
@@ -93,8 +93,8 @@ class RecordFile(ABC):
         self._append(self.record(result))
 
     def finish(self, summary: Summary) -> None:
-        """Appends the tail and puts the file in its place."""
-        # An interruption or a full disk may have cut what was written last.
+        """Appends the tail and moves the file to its path."""
+        # An interruption or a full disk may have cut the last record.
         del self._ends[len(summary.intervals) + 1 :]
         self.file.truncate(self._ends[-1] if self._ends else 0)
         if not self._ends:
@@ -121,5 +121,5 @@ class RecordFile(ABC):
 
 
 def without_last_eighth(items: list[_Item]) -> list[_Item]:
-    """Returns the items without the last eighth of them, at least without the last one."""
+    """Returns all items except the last eighth of them, at least the last one."""
     return items[: len(items) - max(1, len(items) // 8)]

@@ -1,4 +1,4 @@
-"""What a replay finds in one interval, and the numbers of it."""
+"""The result of a replay in one interval, in full and in numbers."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -49,16 +49,16 @@ class Contact:
 
 @dataclass(frozen=True)
 class IntersectionSummary:
-    """The edges that meet faces at one time of a scene, and the parts of meshes that are inside others, in numbers.
+    """The intersections at one time of a scene, in numbers: edges that meet faces, and parts inside other meshes.
 
     Attributes:
         time: Time code.
         crossings: Number of edges that pass through faces: pairs of an edge and a face.
         touches: Number of edges that only touch faces.
-        mesh_pairs: Both numbers for each two meshes of which an edge meets a face, by their names, in order; a mesh
-            that intersects itself is there twice.
-        inside: Number of connected parts of a mesh that are wholly inside another, by the name of the mesh and that of
-            the other.
+        mesh_pairs: Both numbers by the names of the two meshes, in the scene's order; twice the same name for a mesh
+            that intersects itself.
+        inside: Number of connected parts of a mesh that are wholly inside another mesh, by the name of the inner mesh
+            and that of the outer one.
     """
 
     time: float
@@ -75,7 +75,7 @@ class IntersectionSummary:
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest two elements of two meshes at one time, or of a mesh and itself, in words.
+    """The nearest two elements of two meshes, or of a mesh and itself, at one time, in words.
 
     Attributes:
         meshes: Names of the two meshes.
@@ -83,7 +83,7 @@ class Nearest:
         time: Time code.
         distance: Distance of the elements, in the scene's unit of length.
         position: Point halfway between their closest points, in world space.
-        pairs: Number of pairs of elements of the two meshes that are near at that time.
+        pairs: Number of proximities of the two meshes at that time.
     """
 
     meshes: tuple[str, str]
@@ -96,12 +96,12 @@ class Nearest:
 
 @dataclass(frozen=True)
 class ProximitySummary:
-    """The pairs of elements that are near each other at one time of a scene, in numbers.
+    """The proximities at one time of a scene, in numbers.
 
     Attributes:
         time: Time code.
         pairs: Number of pairs.
-        nearest: The nearest elements of each two meshes that are near each other, the nearest first.
+        nearest: The nearest elements of each two meshes with a proximity, by ascending distance.
     """
 
     time: float
@@ -122,20 +122,21 @@ class IntervalSummary:
         vertex_edge_hits: Number of pairs of a point and an edge of a curve that collide.
         vertex_vertex_hits: Number of pairs of points that collide.
         toi_counts: Number of pairs by their time of impact, in equal parts of the interval.
-        mesh_pairs: Number of pairs that collide for each two meshes, by their names, in order; a mesh that collides
-            with itself is there twice.
+        mesh_pairs: Number of pairs that collide by the names of their two meshes, in the scene's order; twice the same
+            name for a mesh that collides with itself.
         earliest: The earliest contact, None if there is none.
-        certified: Whether floating point or exact arithmetic has shown that no collision is missing, for vertices that
-            move straight from the start to the end.
+        certified: Whether floating point or exact arithmetic has certified that no collision is missing, for vertices
+            that move straight from the start to the end.
         stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
-        validation: The comparison with the exact checker, None if none was asked for.
-        intersections: The intersections at the start and at the end; None if they were not looked for. The end is the
+        validation: The comparison with the exact checker, None without validation.
+        intersections: The intersections at the start and at the end; None if they were not checked. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
-        separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None as above.
-        ignored: Number of pairs that collide and are ignored, by the names of their meshes, in order.
-        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None as above.
-        proximities: The proximities at the start and at the end, as ``intersections``; None if they were not looked
-            for.
+        separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None if
+            intersections were not checked.
+        ignored: Number of pairs that collide and are ignored, by the names of their two meshes, in the scene's order.
+        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None if
+            intersections were not checked.
+        proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
     """
 
     index: int
@@ -187,10 +188,10 @@ class Work:
     """A measurement of the work for one interval.
 
     Attributes:
-        worker: The process that did it; empty for the one that writes the results.
+        worker: Name of the process; empty for the one that writes the results.
         device: Name of the Warp device that it used.
         reading: Time to read the scene's samples [s]; another interval may be checked meanwhile.
-        checking: Time to find everything in them [s].
+        checking: Time to check them [s].
     """
 
     worker: str
@@ -204,12 +205,12 @@ class IntervalResult:
     """The collisions between two consecutive times of a scene.
 
     Attributes:
-        summary: The numbers, which are small and can be kept for all intervals.
+        summary: The numbers, small enough to be kept for all intervals.
         contacts: Every pair that collides, and the positions of all vertices.
         intersections: Every edge that meets a face, at the start of the interval and at its end; None if they were not
-            looked for. Where nothing jumps, those at the end are the next interval's at its start, the same object.
-        proximities: The pairs of elements that are near each other, at both times, as ``intersections``.
-        work: Who has found this in which time; None if it was found earlier.
+            checked. Where nothing jumps, those at the end are the same object as the next interval's at its start.
+        proximities: The proximities at both times, as ``intersections``; None without a clearance.
+        work: The process and its times; None for a result of an earlier replay.
     """
 
     summary: IntervalSummary
@@ -228,7 +229,7 @@ def summarize(
     stats: DetectionStats,
     validation: Validation | None,
 ) -> IntervalSummary:
-    """Returns the numbers of an interval, given what was found in it; arguments are those of the results."""
+    """Returns the numbers of an interval; the arguments are attributes of its result and its summary."""
     interval, earliest = contacts.interval, None
     if len(contacts):
         first = int(np.argmin(contacts.toi))
@@ -243,10 +244,10 @@ def summarize(
     if intersections:
         start, end = map(summarize_intersections, intersections)
         at_rest = start, end
-    near = None
+    proximity_summaries = None
     if proximities:
         start, end = map(_summarize_proximities, proximities)
-        near = start, end
+        proximity_summaries = start, end
     phases = None
     if contacts.phase is not None:
         phases = tuple(np.bincount(contacts.phase[contacts.phase >= 0], minlength=len(PHASES)).tolist())
@@ -270,7 +271,7 @@ def summarize(
         ignored=contacts.ignored,
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
         phases=phases,
-        proximities=near,
+        proximities=proximity_summaries,
     )
 
 
@@ -293,8 +294,8 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     order = np.argsort(found.distance, kind="stable")
     _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
     nearest = []
-    for place in np.argsort(firsts).tolist():
-        row = int(order[firsts[place]])
+    for group in np.argsort(firsts).tolist():
+        row = int(order[firsts[group]])
         rows = slice(row, row + 1)
         x, y, z = found.position[row].tolist()
         nearest.append(
@@ -304,7 +305,7 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
                 found.time,
                 float(found.distance[row]),
                 (x, y, z),
-                int(numbers[place]),
+                int(numbers[group]),
             )
         )
     return ProximitySummary(found.time, len(found), tuple(nearest))

@@ -1,4 +1,4 @@
-"""Names the collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
+"""The collisions of one interval in terms of the scene: prims, their own elements, points in world space."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,15 +15,15 @@ from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, co
 __all__ = ["PHASES", "SceneContacts", "compare_contacts", "find_contacts", "find_strand_contacts", "join_contacts"]
 
 PHASES = ("passes", "enters", "leaves", "stays")
-"""Whether the surfaces at two elements cross at the end of the interval, plus twice whether they do at its start.
+"""The phases of a contact, by 1 if the surfaces at its elements cross at the interval's end, plus 2 if at its start.
 
-Surfaces that cross at neither only touch in the interval, or pass through each other and out again.
+Surfaces that cross at neither time touch within the interval, or pass through each other and out again.
 """
 
 
 @dataclass(frozen=True)
 class SceneContacts(ScenePairs):
-    """The pairs that collide in one interval, where and when: arrays with a row for each pair.
+    """The pairs that collide in one interval, with positions and times: arrays with a row for each pair.
 
     Attributes:
         interval: The interval.
@@ -31,14 +31,14 @@ class SceneContacts(ScenePairs):
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
-        counted: Which of the pairs that the detector found are among these, vertex-face before edge-edge, bool.
-        ignored: Number of pairs that collide and are to be ignored, by the names of their meshes, in order.
-        separate: Whether the two meshes did not intersect at the start of the interval, nor touch, shape [n]; for a
-            mesh with itself, whether no part of it did. None if intersections were not looked for. False where
-            ``phase`` is -1.
-        phase: Index in :data:`PHASES`, shape [n]. The surface at an element is all faces that have a vertex of it, that
-            of a curve all its edges that do. None if intersections were not looked for. -1 for two curves, and for
-            pairs with a point, which do not cross at rest.
+        counted: Whether each pair that the detector found is one of these, vertex-face before edge-edge, bool.
+        ignored: Number of colliding pairs that are ignored, by the names of their two meshes, in the scene's order.
+        separate: Whether the two meshes neither intersected nor touched at the start of the interval, shape [n]; for a
+            mesh with itself, whether no two parts of it did. False where ``phase`` is -1. None if intersections were
+            not checked.
+        phase: Index in :data:`PHASES`, shape [n]. The surface at an element consists of all faces with a vertex of it;
+            for a curve, of all its edges with one. -1 for two curves, and for pairs with a point, which cannot cross at
+            rest. None if intersections were not checked.
     """
 
     interval: Interval = field(repr=False)
@@ -70,18 +70,18 @@ def find_contacts(
     collisions: Collisions,
     selection: Selection,
 ) -> SceneContacts:
-    """Names the pairs that a detection found and that count.
+    """Names the detected pairs that are checked by prims and elements.
 
     Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
     itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
     T-junctions or in coplanar faces, would collide by rounding alone. (If a transform turns by half a circle from one
-    sample to the next, or scales by zero, the straight ways of the vertices meet although the mesh does not.)
+    sample to the next, or scales by zero, the straight paths of the vertices meet although the mesh does not.)
 
     Args:
         interval: The interval.
         mesh: The detector's mesh, made of the interval's segment.
         collisions: Collisions of that mesh in the interval.
-        selection: Which pairs of meshes count.
+        selection: The pairs of meshes that are checked.
     """
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
@@ -139,17 +139,17 @@ def find_contacts(
 def find_strand_contacts(
     interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
 ) -> SceneContacts:
-    """Names the pairs with an element of curves or points that a detection found and that count.
+    """Names the detected pairs with curves or points that are checked by prims and elements.
 
     Excluded are the pairs that :func:`find_contacts` excludes, and edges of one curve that are near along it, as thick
     curves always touch themselves there.
 
     Args:
         interval: The interval.
-        mesh: The mesh of the detection, made of the interval's segment with its curves and points. It leaves out pairs
-            of which faces have both elements.
+        mesh: The mesh of the detection, made of the interval's segment with its curves and points, in which pairs of
+            two elements of faces are excluded.
         collisions: Collisions of that mesh in the interval.
-        selection: Which pairs of meshes count.
+        selection: The pairs of meshes that are checked.
     """
     segment, x0, x1 = interval.segment, interval.x0, interval.x1
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)
@@ -207,7 +207,7 @@ def find_strand_contacts(
 
 
 def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContacts:
-    """Returns the contacts of one interval and others of it after them; ``counted`` is that of the first ones."""
+    """Returns the contacts of one interval followed by others of it; ``counted`` is that of the first ones."""
     names = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position", "toi", "time", "normal")
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
     ignored = {
@@ -218,7 +218,7 @@ def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContac
 
 
 def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: SceneIntersections) -> SceneContacts:
-    """Returns contacts with the fields that come from the intersections at the start and at the end of the interval."""
+    """Returns contacts with ``separate`` and ``phase``, given the intersections at the interval's start and end."""
     separate, phase = np.zeros(len(contacts), dtype=bool), np.full(len(contacts), -1)
     segment = contacts.segment
     (rows,) = np.nonzero(_may_cross(contacts)) if len(contacts) else (np.zeros(0, dtype=np.int64),)
@@ -237,13 +237,13 @@ def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: Sc
         for weight, intersections in ((2, start), (1, end)):
             if len(tangled := intersections.tangled_vertices):
                 keys = intersections.pair_keys(pairs).reshape(6, -1)
-                places = np.searchsorted(tangled, keys)
-                phase[rows] += weight * (tangled[np.minimum(places, len(tangled) - 1)] == keys).any(axis=0)
+                found = np.searchsorted(tangled, keys)
+                phase[rows] += weight * (tangled[np.minimum(found, len(tangled) - 1)] == keys).any(axis=0)
     return replace(contacts, separate=separate, phase=phase)
 
 
 def _may_cross(contacts: SceneContacts) -> np.ndarray:
-    """Returns which pairs are of a surface and another or a curve, whose elements can cross at rest, shape [n]."""
+    """Returns whether each pair is of a surface and a surface or curve, which can cross at rest, bool, shape [n]."""
     segment = contacts.segment
     if not segment.has_strands:
         return np.ones(len(contacts), dtype=bool)

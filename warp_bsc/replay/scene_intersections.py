@@ -1,4 +1,4 @@
-"""What intersects at one time of a scene: edges that meet faces, curves of cut surfaces, and parts inside others."""
+"""The intersections at one time of a scene: edges that meet faces, cut curves, and parts inside other meshes."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,7 +17,7 @@ __all__ = ["Cuts", "SceneIntersections", "name_intersections"]
 
 
 class Cuts(NamedTuple):
-    """The segments in which two triangles meet each other, each once: together the curves where surfaces cut.
+    """The segments in which two triangles meet: together, the curves in which surfaces cut each other.
 
     Attributes:
         points: Their ends, in world space and the scene's unit of length, shape [m, 2, 3].
@@ -32,15 +32,15 @@ class Cuts(NamedTuple):
 
 @dataclass(frozen=True)
 class SceneIntersections(ScenePairs):
-    """What intersects at one time of a scene.
+    """The intersections at one time of a scene.
 
-    First come the edges that meet faces: the first element is the edge, the second the face. The others are the
-    connected parts of meshes that are wholly inside other meshes: the first element is a vertex of the part, where the
-    position is, the second a face of the outer mesh.
+    The first rows are the edges that meet faces: the first element is the edge, the second the face. The other rows are
+    the connected parts of meshes that are wholly inside other meshes: the first element is a vertex of the part, which
+    is also the position, the second a face of the outer mesh.
 
     Attributes:
         time: Time code.
-        crosses: Whether it is an edge that passes through the face; other edges only touch theirs. Bool, shape [n].
+        crosses: Whether an edge passes through the face, bool, shape [n]; edges that do not, touch it.
         x: Positions of all vertices at that time, shape [vertex_count, 3].
     """
 
@@ -81,8 +81,8 @@ class SceneIntersections(ScenePairs):
     def cuts(self) -> Cuts:
         """The segments in which triangles cut each other, computed in floating point from the exact pairs.
 
-        Two triangles of which an edge passes through the other meet in a segment. Its ends are where edges of one meet
-        the other, or the corner that both share.
+        If an edge of one triangle passes through another triangle, they meet in a segment. It ends where edges of one
+        meet the other, or in a corner that they share.
         """
         segment = self.segment
         if not self.crossings:
@@ -105,9 +105,9 @@ class SceneIntersections(ScenePairs):
 
     @cached_property
     def tangled_vertices(self) -> np.ndarray:
-        """The pairs of vertices of which a face, or edge of a curve, of one crosses a face of the other.
+        """The pairs of a vertex of an element and a vertex of a face that cross, where elements are faces and edges.
 
-        They are numbers as of :meth:`pair_keys`, ascending.
+        They are given by their numbers in :meth:`pair_keys`, ascending. The edges are those of curves.
         """
         rows, sides = self.segment.faces_of_edges(self.vertices[self.crosses, 0])
         others = np.concatenate([self.faces[self.crosses, 1][rows], self.faces[self.of_curves, 1]])
@@ -117,7 +117,7 @@ class SceneIntersections(ScenePairs):
         return np.unique(self.pair_keys(pairs))
 
     def pair_keys(self, vertices: np.ndarray) -> np.ndarray:
-        """Returns a number for each pair of vertices, whatever their order, for shape [n, 2]."""
+        """Returns a number for each pair of vertices, shape [n], the same for both orders, given shape [n, 2]."""
         first, second = vertices.astype(np.int64).T
         return np.minimum(first, second) * self.segment.vertex_count + np.maximum(first, second)
 
@@ -131,20 +131,20 @@ def name_intersections(
     time: float,
     selection: Selection,
 ) -> SceneIntersections:
-    """Names the intersections that count.
+    """Names the intersections that are checked by prims and elements.
 
     Excluded are edges and faces that the selection excludes or ignores, and those of a mesh with itself if only its
-    transform moves it: where its parts touch, rounding of its positions makes them cross. Meshes that never move are
-    checked.
+    transform moves it: where its parts touch, rounding of its positions would make them cross. Meshes that never move
+    are checked.
 
     Args:
         segment: The segment.
         mesh: The detector's mesh, made of the segment.
         found: Its intersections.
-        inside: What is inside what, of the pairs that count.
+        inside: The parts inside other meshes, of the pairs that are checked.
         x: Positions of the segment's vertices, shape [vertex_count, 3].
         time: Time code.
-        selection: Which pairs of meshes count.
+        selection: The pairs of meshes that are checked.
     """
     if not len(found.pairs) + len(inside.bodies):
         return SceneIntersections(segment, **NO_PAIRS, time=time, crosses=found.crosses, x=x)
@@ -173,7 +173,7 @@ def name_intersections(
 
 
 def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the arrays of :class:`SceneIntersections` for what is inside what."""
+    """Returns the arrays of :class:`SceneIntersections` for parts inside other meshes."""
     count = len(inside.bodies)
     nothing = np.full(count, -1)
     points = segment.find_points(inside.bodies[:, 0], inside.vertices)
@@ -190,7 +190,10 @@ def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[s
 
 
 def _meeting_points(edges: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Returns where edges, shape [n, 2, 3], meet faces, shape [n, 3, 3]; halfway along the part of one in its face."""
+    """Returns the points, shape [n, 3], in which edges, shape [n, 2, 3], meet faces, shape [n, 3, 3].
+
+    For an edge in the plane of its face, that is the middle of its part in the face.
+    """
     (p, q), (a, b, c) = edges.transpose(1, 0, 2), faces.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
 
@@ -213,7 +216,7 @@ def _meeting_points(edges: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _farthest(keys: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns for each key, ascending, two of its points that are far apart, shape [m, 2, 3]: both if there are two."""
+    """Returns two distant points of each key, ascending, shape [m, 2, 3]; both points of a key that has two."""
     order = np.argsort(keys, kind="stable")
     keys, points = keys[order], points[order]
     _, starts, groups = np.unique(keys, return_index=True, return_inverse=True)

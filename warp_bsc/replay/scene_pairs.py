@@ -21,13 +21,13 @@ __all__ = [
 ]
 
 KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
-"""Labels of the kinds of pair that collide or are near, by their numbers; the last two are of points and curves."""
+"""Labels of the kinds of pair in collisions and proximities, by their numbers; the last two have points or curves."""
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
-"""The kinds of element. A diagonal is an edge between two triangles of one polygon, which the prim does not have."""
+"""The kinds of element. A diagonal is an edge between two triangles of one polygon; the prim has no such edge."""
 
 ELEMENT_WORDS = ("vertex", "face", "edge", "diagonal")
-"""The words for them."""
+"""The words for the kinds of element, by their numbers."""
 
 NO_PAIRS = {
     "elements": np.zeros((0, 2), dtype=np.int64),
@@ -37,10 +37,10 @@ NO_PAIRS = {
     "faces": np.zeros((0, 2), dtype=np.int64),
     "position": np.zeros((0, 3)),
 }
-"""The arrays of :class:`ScenePairs` without pairs. Most intervals have none, and naming these would take half of the
-fixed time of an interval."""
+"""The arrays of :class:`ScenePairs` without pairs. Most intervals have none; naming nothing would take half of their
+time."""
 
-_CHUNK = 256  # so that Python's garbage collector seldom meets the objects that a text is made of
+_CHUNK = 256  # rows; more at a time would make Python's garbage collector scan their texts often
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ScenePairs:
         vertices: Vertices of the segment at the two elements, shape [n, 2, 2]: the vertex and -1 for a vertex, both
             ends for an edge or a diagonal, -1 twice for a face.
         faces: Face of the segment for a face, else -1, shape [n, 2].
-        position: Points at which the two meet, in world space and the scene's unit of length, shape [n, 3].
+        position: Points in which the two meet, in world space and the scene's unit of length, shape [n, 3].
     """
 
     segment: Segment = field(repr=False)
@@ -72,7 +72,7 @@ class ScenePairs:
         return len(self.meshes)
 
     def chunks(self, rows: slice = slice(None)) -> list[slice]:
-        """Returns rows, default all, as slices of limited length: their text takes many times their memory."""
+        """Returns rows, default all, as slices of limited length, as their text takes many times their memory."""
         first, stop, _ = rows.indices(len(self))
         return [slice(start, min(start + _CHUNK, stop)) for start in range(first, stop, _CHUNK)]
 
@@ -109,25 +109,25 @@ class ScenePairs:
         return list(zip(*sides, strict=True))
 
     def triangles(self, rows: slice) -> list[int | None]:
-        """Returns which triangle of its polygon the face of some pairs is, from 0; None where no element is a face."""
+        """Returns the number of each pair's face among the triangles of its polygon, from 0; None without a face."""
         faces = self.faces[rows].max(axis=1)
-        places: list[int | None] = [None] * len(faces)
+        triangles: list[int | None] = [None] * len(faces)
         (of_faces,) = np.nonzero(faces >= 0)
-        for row, place in zip(
-            of_faces.tolist(), self.segment.places_in_polygons(faces[of_faces]).tolist(), strict=True
+        for row, triangle in zip(
+            of_faces.tolist(), self.segment.triangles_in_polygons(faces[of_faces]).tolist(), strict=True
         ):
-            places[row] = place
-        return places
+            triangles[row] = triangle
+        return triangles
 
     def _of_meshes(self, attribute, rows) -> list[tuple[str, str]]:
         """Returns an attribute of the two meshes of some pairs; pairs of the same meshes share them."""
         meshes = self.segment.meshes
-        keys, places = np.unique(self.meshes[rows] @ np.array([len(meshes), 1]), return_inverse=True)
+        keys, numbers = np.unique(self.meshes[rows] @ np.array([len(meshes), 1]), return_inverse=True)
         both = [tuple(getattr(meshes[mesh], attribute) for mesh in divmod(key, len(meshes))) for key in keys.tolist()]
-        return [both[place] for place in places.tolist()]
+        return [both[number] for number in numbers.tolist()]
 
     def mesh_keys(self) -> np.ndarray:
-        """Returns a number for the two meshes of each pair, whatever their order, shape [n]."""
+        """Returns a number for the two meshes of each pair, the same for both orders, shape [n]."""
         first, second = np.sort(self.meshes, axis=1).T
         return first * len(self.segment.meshes) + second
 
@@ -135,12 +135,12 @@ class ScenePairs:
 def count_by_meshes(
     segment: Segment, meshes: np.ndarray, weights: np.ndarray | None = None
 ) -> dict[tuple[str, str], tuple[int, ...]]:
-    """Returns the number of pairs for each two meshes, by their names, in order.
+    """Returns the number of pairs by the names of their two meshes, in the scene's order.
 
     Args:
         segment: The segment.
         meshes: The two meshes of each pair, indices in ``segment.meshes``, shape [n, 2].
-        weights: What is added up instead of the number 1, bool or integers, shape [n, k].
+        weights: Values to be added up instead of 1 for each pair, bool or integers, shape [n, k].
     """
     if not len(meshes):
         return {}
@@ -162,7 +162,7 @@ def name_elements(
     ends: np.ndarray,
     points: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Names pairs kind by kind: all arrays of :class:`ScenePairs` but positions, and the kind.
+    """Returns the arrays of :class:`ScenePairs` except the positions, and the kinds, for pairs given kind by kind.
 
     Args:
         segment: The segment.
@@ -207,7 +207,7 @@ def name_elements(
 
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Returns which pairs, as of :func:`name_elements`, are of a mesh with itself that only its transform moves."""
+    """Returns whether each pair, as of :func:`name_elements`, is of one mesh that only its transform moves, bool."""
     rows, meshes = segment.meshes_at_edges(ends[:, 1])
     of_edges = segment.are_stiff(ends[rows, 0], meshes)
     edges = np.zeros(len(ends), dtype=bool)

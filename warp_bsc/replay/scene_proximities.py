@@ -1,4 +1,4 @@
-"""The pairs of elements that are near each other at one time of a scene."""
+"""The proximities at one time of a scene: pairs of elements up to the clearance apart."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ __all__ = ["SceneProximities", "name_proximities"]
 
 @dataclass(frozen=True)
 class SceneProximities(ScenePairs):
-    """The pairs of elements that are near each other at one time of a scene; positions are halfway between both.
+    """The proximities at one time of a scene; positions are halfway between the closest points of the two elements.
 
     Attributes:
         time: Time code.
@@ -31,17 +31,17 @@ class SceneProximities(ScenePairs):
 def name_proximities(
     segment: Segment, mesh: CollisionMesh, found: Proximities, time: float, selection: Selection
 ) -> SceneProximities:
-    """Names the proximities that count.
+    """Names the proximities that are checked by prims and elements.
 
     Excluded are pairs that the selection excludes or ignores, and pairs of a mesh with itself if only its transform
     moves it. Meshes that never move are checked.
 
     Args:
         segment: The segment.
-        mesh: The mesh of the segment in which they were found.
+        mesh: The mesh of the segment.
         found: The proximities.
         time: Time code.
-        selection: Which pairs of meshes count.
+        selection: The pairs of meshes that are checked.
     """
     if not len(found.distance):
         none = np.zeros(0, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""A whole replay in numbers, as every table and file gives it at the end."""
+"""A whole replay in numbers, as tables and files show them at the end."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ class ValidationSummary:
     Attributes:
         hits: Number of reported collisions that the checker decided.
         others: Number of unreported pairs with overlapping swept boxes that the checker decided.
-        answers: Number of pairs that the detector decided.
+        decided: Number of pairs that the detector decided.
         certified: Number of these that floating point certified.
         false_hits: Number of reported pairs of method "conservative" that do not collide, as that method permits.
         disagreements: The pairs that the checker decides differently, a sentence with the interval each.
@@ -28,7 +28,7 @@ class ValidationSummary:
 
     hits: int
     others: int
-    answers: int
+    decided: int
     certified: int
     false_hits: int
     disagreements: tuple[str, ...]
@@ -53,21 +53,21 @@ class CollisionSpan:
 
 @dataclass(frozen=True)
 class IntersectionSpan:
-    """Consecutive times of a scene at all of which two meshes intersect, a mesh itself, or one is inside another.
+    """Consecutive times at all of which two meshes intersect, a mesh intersects itself, or one is inside another.
 
     Attributes:
         meshes: Names of the two; the one that is inside first.
         since: The first of the times, as a time code.
         until: The last of the times.
-        is_open: Whether no time after the last one was checked, so that the intersection may go on.
+        is_open: Whether the last time is the last that was checked, so that the intersection may continue.
         inside: Whether parts of the first mesh are wholly inside the second; otherwise edges of one meet faces of the
             other.
-        becomes: What the meshes do instead at the time after the last one, "inside" or "crosses"; empty if nothing.
+        becomes: The state of the meshes at the next time, "inside" or "crosses"; empty if they do not intersect then.
         first: Number of parts that are inside, or of edges that pass through faces or touch them, at the first time.
-        last: The same at the last time.
-        most: The same at the time at which there are the most.
-        most_at: That time.
-        crossings: The most edges that pass through faces at one time; 0 if the meshes only touch, or are inside.
+        last: That number at the last time.
+        most: The largest of these numbers at all times.
+        most_at: The first time with that number.
+        crossings: Largest number of edges that pass through faces at a time; 0 if the meshes only touch, or are inside.
     """
 
     meshes: tuple[str, str]
@@ -84,9 +84,9 @@ class IntersectionSpan:
 
     @property
     def trend(self) -> str:
-        """What becomes of the intersection.
+        """How the intersection develops.
 
-        If it ends, "heals", or "then inside" or "then crosses"; else "grows", "shrinks" or "stays" by the numbers.
+        "heals", "then inside" or "then crosses" if it ends; else "grows", "shrinks" or "stays", by its numbers.
         """
         if not self.is_open:
             return f"then {self.becomes}" if self.becomes else "heals"
@@ -101,8 +101,8 @@ class ProximitySpan:
         meshes: Names of the two, sorted.
         since: The first of the times, as a time code.
         until: The last of the times.
-        distance: The least distance, in the scene's unit of length.
-        nearest_at: The first time at which they have it.
+        distance: Their smallest distance at these times, in the scene's unit of length.
+        nearest_at: The first time with that distance.
     """
 
     meshes: tuple[str, str]
@@ -121,9 +121,8 @@ class Summary:
         method: Method of detection.
         device: Name of the Warp device.
         intervals: The finished intervals, in order.
-        stopped: Why the replay ended before the scene did; empty if it did not.
-        min_distance: Distance up to which elements are near each other, in the scene's unit of length; None if
-            proximities were not looked for.
+        stopped: Reason why the replay ended before the scene; empty if it is complete.
+        clearance: Distance up to which proximities were found, in the scene's unit of length; None without them.
     """
 
     scene: Scene
@@ -131,7 +130,7 @@ class Summary:
     device: str
     intervals: list[IntervalSummary]
     stopped: str = ""
-    min_distance: float | None = None
+    clearance: float | None = None
 
     @property
     def is_complete(self) -> bool:
@@ -173,7 +172,7 @@ class Summary:
 
     @cached_property
     def collision_spans(self) -> list[CollisionSpan]:
-        """Which meshes collide from when to when, in order of time; then those with the most hits first."""
+        """The times over which two meshes collide, by their start, then by descending number of hits."""
         spans, running = [], {}
         for interval in self.intervals:
             for meshes in [meshes for meshes in running if meshes not in interval.mesh_pairs]:
@@ -185,15 +184,15 @@ class Summary:
 
     @cached_property
     def intersections(self) -> list[IntersectionSummary]:
-        """The intersections at all times of the finished intervals, in order; empty if they were not looked for."""
+        """The intersections at all times of the finished intervals, in order; empty if none were searched."""
         found = [interval.intersections for interval in self.intervals if interval.intersections]
         return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
 
     @cached_property
     def intersection_spans(self) -> list[IntersectionSpan]:
-        """Which meshes intersect since when and until when, in order of time.
+        """The times over which two meshes intersect, by their start.
 
-        Of the same time, edges in faces come before parts inside; then those with the most come first.
+        For the same start, edges in faces come before parts inside, then larger numbers before smaller ones.
         """
         spans: list[IntersectionSpan] = []
         running: dict[tuple[bool, tuple[str, str]], list[tuple[float, int, int]]] = {}
@@ -215,13 +214,13 @@ class Summary:
 
     @cached_property
     def proximities(self) -> list[ProximitySummary]:
-        """The proximities at all times of the finished intervals, in order; empty if they were not looked for."""
+        """The proximities at all times of the finished intervals, in order; empty if none were searched."""
         found = [interval.proximities for interval in self.intervals if interval.proximities]
         return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
 
     @cached_property
     def proximity_spans(self) -> list[ProximitySpan]:
-        """Which meshes are near each other since when and until when, in order of time; then the nearest first."""
+        """The times over which two meshes are near each other, by their start, then by ascending distance."""
         spans, running = [], {}
         for sample in self.proximities:
             found = {(min(near.meshes), max(near.meshes)): near.distance for near in sample.nearest}
@@ -236,17 +235,17 @@ class Summary:
 
     @cached_property
     def nearest(self) -> list[Nearest]:
-        """The nearest elements of each two meshes over all times, the first time if several, the nearest first."""
-        least: dict[tuple[str, ...], Nearest] = {}
+        """The nearest elements of each two meshes over all times (the first time if tied), by ascending distance."""
+        smallest: dict[tuple[str, ...], Nearest] = {}
         for nearest in (nearest for sample in self.proximities for nearest in sample.nearest):
-            before = least.setdefault(tuple(sorted(nearest.meshes)), nearest)
+            before = smallest.setdefault(tuple(sorted(nearest.meshes)), nearest)
             if nearest.distance < before.distance:
-                least[tuple(sorted(nearest.meshes))] = nearest
-        return sorted(least.values(), key=lambda nearest: nearest.distance)
+                smallest[tuple(sorted(nearest.meshes))] = nearest
+        return sorted(smallest.values(), key=lambda nearest: nearest.distance)
 
     @property
     def certified(self) -> bool:
-        """Whether no collision of vertices that move straight is missing in the finished intervals."""
+        """Whether the finished intervals contain every collision of vertices that move straight."""
         return all(interval.certified for interval in self.intervals)
 
     @cached_property
@@ -273,14 +272,14 @@ class Summary:
 
     @property
     def validation(self) -> ValidationSummary | None:
-        """The comparison with the exact checker, None if none was asked for."""
+        """The comparison with the exact checker, None without validation."""
         found = [(interval, interval.validation) for interval in self.intervals if interval.validation]
         if not found:
             return None
         return ValidationSummary(
             hits=sum(validation.hits for _, validation in found),
             others=sum(validation.others for _, validation in found),
-            answers=sum(validation.answers for _, validation in found),
+            decided=sum(validation.decided for _, validation in found),
             certified=sum(validation.certified for _, validation in found),
             false_hits=sum(validation.false_hits for _, validation in found),
             disagreements=tuple(
@@ -292,23 +291,23 @@ class Summary:
 
     @property
     def motion(self) -> str:
-        """A sentence on the motion that is assumed between samples."""
+        """The motion that is assumed between samples, in words."""
         if self.scene.is_still:
             return "Nothing moves: there are no collisions, only intersections at rest."
-        sentence = "Motion between time samples is taken to be linear."
+        text = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
-            sentence += (
-                f" {which} moved by transforms or skeletons, which need not be: what turns is sampled at every whole "
-                "time code too, unless --frames has a step; --subdivide N samples finer."
+            text += (
+                f" {which} moved by transforms or skeletons, which need not be linear: turning meshes are sampled at "
+                "every whole time code too, unless the frames have a step; subdividing the intervals samples finer."
             )
-        return sentence
+        return text
 
     def first(self, count: int) -> "Summary":
         """Returns the summary of the first intervals alone."""
         if count == len(self.intervals):
             return self
-        return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "no room for more")
+        return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "the disk is full")
 
 
 def _span(inside, meshes, samples, is_open, becomes) -> IntersectionSpan:

@@ -1,4 +1,4 @@
-"""Reads and detects ahead, and writes behind, one item each, in threads."""
+"""Iterators that work one item ahead, and calls that run one item behind, in threads."""
 
 import contextvars
 from collections.abc import Callable, Iterable, Iterator
@@ -11,12 +11,12 @@ _Item = TypeVar("_Item")
 
 
 def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
-    """Yields items, the next of which is made in another thread meanwhile, in the context of this one.
+    """Yields items, and meanwhile makes the next one in another thread, in this thread's context.
 
-    Closing waits for that one.
+    Closing the iterator waits for the next item.
 
     Raises:
-        Exception: What making an item raises, when it is that one's turn.
+        Exception: The error of making an item, when that item is next.
     """
     iterator = iter(items)
     context = contextvars.copy_context()
@@ -35,28 +35,28 @@ def read_ahead(items: Iterable[_Item]) -> Iterator[_Item]:
 
 
 class WriteBehind(Generic[_Item]):
-    """Calls a function with one item after another, in order, in another thread; at most one item waits."""
+    """Calls a function with items in order in another thread, with at most one item waiting."""
 
     def __init__(self, write: Callable[[_Item], None]):
-        """Starts without an item; leaving the context waits for the last call."""
+        """Makes a queue without items for calls of ``write``."""
         self._write = write
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="write-behind")
         self._pending: Future[None] | None = None
 
     def put(self, item: _Item) -> None:
-        """Hands over an item when the one before is written.
+        """Waits until the previous item is written, and hands over the next one.
 
         Raises:
-            Exception: What the call with the item before has raised.
+            Exception: The error of the call with the previous item.
         """
         self.wait()
         self._pending = self._pool.submit(self._write, item)
 
     def wait(self) -> None:
-        """Waits until every item is written. An interruption leaves the wait, not the call.
+        """Waits until every item is written. An interruption ends the wait, not the call.
 
         Raises:
-            Exception: What the last call has raised, once.
+            Exception: The error of the last call, once.
         """
         if self._pending:
             self._pending.exception()

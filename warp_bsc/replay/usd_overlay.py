@@ -1,4 +1,4 @@
-"""Writes a USD layer over the scene that shows its collisions in usdview and any other program that reads USD."""
+"""Writes a USD layer over the scene that shows its collisions in usdview and other programs that read USD."""
 
 import os
 import secrets
@@ -11,7 +11,7 @@ import numpy as np
 
 from .._atomic_file import OutputFile
 from ..usd.layer import just_before, layer_metadata, unused_path
-from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, write_binary_layer, write_text_layer
+from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, PrimKind, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from .outputs import without_last_eighth
@@ -34,11 +34,11 @@ COLORS = {
     "Inside": (0.1, 0.5, 1.0),
     "Near": (0.1, 0.85, 0.4),
 }
-"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut, places where
-curves pass through faces, vertices of parts that are inside others, places between what is near."""
+"""Emitted colours by prim: polygons that collide, contact points by kind, curves along which surfaces cut, points where
+curves pass through faces, vertices of parts that are inside others, middles of proximities."""
 
 LIFT = 2e-4
-"""Distance of the coloured polygons to those of the scene, as a share of the size of its moving meshes."""
+"""Distance of the coloured polygons from those of the scene, as a share of the size of its moving meshes."""
 
 SHOWN_BY = (
     "Its prims are guides, which programs hide at first: usdview shows them by Display, Display Purposes, Guide; "
@@ -50,15 +50,15 @@ _MARKER_SIZE = 0.006  # diameter of the marker at a contact point, as a share of
 _CURVE_WIDTH = 0.0015  # width of the curves, too
 
 _EXTENT = {"extent": "float3[]"}
-_PLACES = _EXTENT | {"positions": "point3f[]", "protoIndices": "int[]"}
+_MARKERS = _EXTENT | {"positions": "point3f[]", "protoIndices": "int[]"}
 _ELEMENTS = {
     "primvars:primA": "int[]",
     "primvars:primB": "int[]",
     "primvars:elementA": "int2[]",
     "primvars:elementB": "int2[]",
 }
-_CONTACTS = _PLACES | {"primvars:toi": "float[]"} | _ELEMENTS
-_PARTS: dict[str, tuple[str, dict[str, str]]] = {
+_CONTACTS = _MARKERS | {"primvars:toi": "float[]"} | _ELEMENTS
+_PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
     "Polygons": (
         "Mesh",
         _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},
@@ -72,53 +72,52 @@ _PARTS: dict[str, tuple[str, dict[str, str]]] = {
         _EXTENT
         | {"points": "point3f[]", "curveVertexCounts": "int[]", "primvars:primA": "int[]", "primvars:primB": "int[]"},
     ),
-    "CurveIntersections": ("PointInstancer", _PLACES | _ELEMENTS),
-    "Inside": ("PointInstancer", _PLACES | _ELEMENTS),
-    "Near": ("PointInstancer", _PLACES | {"primvars:distance": "float[]"} | _ELEMENTS),
+    "CurveIntersections": ("PointInstancer", _MARKERS | _ELEMENTS),
+    "Inside": ("PointInstancer", _MARKERS | _ELEMENTS),
+    "Near": ("PointInstancer", _MARKERS | {"primvars:distance": "float[]"} | _ELEMENTS),
 }
 """Prims of the layer: their types, and the types of their attributes that have time samples."""
 
 _ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "CurveIntersections", "Inside", "Near"
-"""The prims that a layer has only if they are ever there."""
+"""The prims that a layer contains only if they are not empty at all times."""
 
 
 class Overlay:
-    """A layer whose sublayer is the scene, so that opening the layer shows both. The scene's own prims stay untouched.
+    """A layer whose sublayer is the scene, so that opening the layer shows both. It does not change the scene's prims.
 
-    Below ``/Collisions`` are
+    The prims below ``/Collisions`` are
 
     - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
-      are lifted by :data:`LIFT` to both sides, move with the scene, and are there from the start of the interval to its
+      are lifted by :data:`LIFT` to both sides, move with the scene, and exist from the start of the interval to its
       end;
-    - ``VertexFace`` and ``EdgeEdge``, and if there are any, ``VertexEdge`` and ``VertexVertex``, which have curves and
-      points, markers at the contact points of these kinds, from the start of their interval to
-      its end. Each is an instance with the primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the
-      attribute ``prims`` of ``/Collisions``, which has their names; ``elementA`` and ``elementB``, the two elements in
-      the prims' own numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of
-      an edge;
+    - ``VertexFace`` and ``EdgeEdge``, and if curves or points collide ``VertexEdge`` and ``VertexVertex``: markers at
+      the contact points of these kinds, from the start of their interval to its end. Each is an instance with the
+      primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the attribute ``prims`` of
+      ``/Collisions``, which lists their names; ``elementA`` and ``elementB``, the two elements in the prims' own
+      numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of an edge;
     - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
-      next. Each segment in which two triangles meet is a curve of its own, with ``primA`` and ``primB``. Elements that
-      only touch make no curve;
-    - ``CurveIntersections``, if there is any, markers where edges of the scene's own curves pass through faces;
-    - ``Inside``, if there is any, markers at a vertex of each part of a mesh that is wholly inside another mesh, which
-      hides them until it is hidden itself;
-    - ``Near``, if there is any, markers halfway between what is at most the minimum distance apart, with the primvar
-      ``distance``. All three are there from a time of the scene to the next, with the primvars of contact points but
-      ``toi``.
+      next. Each segment in which two triangles meet is a curve, with ``primA`` and ``primB``. Elements that only touch
+      have no curve;
+    - ``CurveIntersections``, markers where edges of the scene's own curves pass through faces;
+    - ``Inside``, markers at a vertex of each part of a mesh that is wholly inside another mesh. They are visible when
+      the outer mesh is hidden;
+    - ``Near``, markers halfway between the two elements of each proximity, with the primvar ``distance``.
 
-    All of them emit light of their own colour by a material of their own, which no material of the scene hides. Contact
-    points are instances of a mesh, as Blender binds no materials to USD's own points; it shows the curves grey, as it
-    binds none to USD's curves either.
+    The last three are missing where there are none. They exist from a time of the scene to the next, and have the
+    primvars of contact points except ``toi``.
 
-    Their purpose is guide, so that no render of the layer contains them by accident, and a replay of the layer does not
-    take them for a part of the scene. Programs hide guides until they are asked for them; :data:`SHOWN_BY` says how,
-    which the layer's documentation and the command line repeat.
+    Each prim emits light of its own colour by its own material, which overrides the materials of the scene. Contact
+    points are instances of a mesh, as Blender does not bind materials to USD's points; Blender shows the curves grey,
+    as it does not bind materials to these either.
 
-    A name that ends in ``.usda`` gives a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
-    smaller. USD interpolates between samples, so all that shall not move gets an empty sample just before the next.
+    Their purpose is guide, so that renders and replays of the layer exclude them. Programs hide guides by default;
+    :data:`SHOWN_BY`, which the layer's documentation and the command line repeat, explains how to show them.
 
-    USD's own layers hold their whole content in memory. This one keeps its samples in a temporary file, the spool, and
-    sorts them by attribute at the end, a few megabytes at a time. It does not read the scene then, whose file may have
+    A name that ends in ``.usda`` makes a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
+    smaller. USD interpolates between samples; values that must not move have an empty sample just before the next one.
+
+    USD's own layers hold their whole content in memory. This one writes its samples to a temporary file, the spool, and
+    sorts them by attribute at the end, a few megabytes at a time. It does not read the scene again, whose file may have
     become unreadable.
 
     Attributes:
@@ -129,7 +128,7 @@ class Overlay:
         """Opens the file.
 
         Args:
-            path: The file's place, a ``.usda``, ``.usdc`` or ``.usd`` file.
+            path: The file, with a name that ends in ``.usda``, ``.usdc`` or ``.usd``.
             scene: The scene.
 
         Raises:
@@ -138,13 +137,13 @@ class Overlay:
         """
         suffix = Path(path).suffix
         if suffix not in (".usda", ".usdc", ".usd"):
-            raise ValueError(f"{path}: the overlay is a layer of USD, its name must end in .usda, .usdc or .usd")
+            raise ValueError(f"{path}: the name of an overlay, a layer of USD, must end in .usda, .usdc or .usd")
         self._is_text = suffix == ".usda"
         self._scene = scene
         self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
-        self._ends = []  # where each complete interval ends in the spool
+        self._ends = []  # offset in the spool at the end of each complete interval
         self._last: IntervalResult | None = None  # the last complete interval
-        self._prims: dict[str, int] = {}  # number of each mesh that is named, by its name
+        self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
@@ -153,7 +152,7 @@ class Overlay:
         self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
 
     def add(self, result: IntervalResult) -> None:
-        """Adds the contacts of an interval, and the intersections at its start."""
+        """Adds the contacts of an interval, and the intersections and proximities at its start."""
         contacts = result.contacts
         interval = contacts.interval
         self._sample("Polygons", interval.start, *self._find_polygons(contacts))
@@ -166,7 +165,7 @@ class Overlay:
         self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
-        """Writes the layer and puts it in its place."""
+        """Writes the layer and moves it to its path."""
         del self._ends[len(summary.intervals) :]
         summary = summary.first(len(self._ends))
         end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
@@ -220,7 +219,7 @@ class Overlay:
         return arrays, (just_before(contacts.interval.end), stop)
 
     def _lift(self, x, corners) -> np.ndarray:
-        """Returns the points of triangles moved along their normals, all to the one side and then all to the other."""
+        """Returns the points of triangles moved along their normals, first to one side, then to the other."""
         x = x.astype(np.float64)
         a, b, c = np.moveaxis(x[corners], 1, 0)
         across = np.repeat(np.cross(b - a, c - a), 3, axis=0)
@@ -230,7 +229,7 @@ class Overlay:
         return np.concatenate([x + step, x - step])
 
     def _find_at_rest(self, result: IntervalResult, end: int) -> dict[str, dict[str, np.ndarray] | None]:
-        """Returns the samples of what intersects and is near at the start of an interval, 0, or at its end, 1."""
+        """Returns the samples of intersections and proximities at the start of an interval, 0, or at its end, 1."""
         samples = {}
         if result.intersections:
             found = result.intersections[end]
@@ -246,7 +245,7 @@ class Overlay:
         return samples
 
     def _find_points(self, pairs: ScenePairs, rows: np.ndarray, values: dict[str, np.ndarray]):
-        """Returns some pairs as points with some values of each pair, None if there are none."""
+        """Returns some pairs as points with their values, None without pairs."""
         if not len(rows):
             return None
         prims, indices = self._number_prims(pairs.segment, pairs.meshes[rows]), pairs.indices[rows]
@@ -262,7 +261,7 @@ class Overlay:
         }
 
     def _find_curves(self, found: SceneIntersections):
-        """Returns the segments in which triangles meet as curves, None if there are none."""
+        """Returns the segments in which triangles meet as curves, None without any."""
         cuts = found.cuts
         if not len(cuts.points):
             return None
@@ -277,17 +276,17 @@ class Overlay:
 
     def _number_prims(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
         """Returns numbers of meshes of a segment that hold for the whole layer."""
-        used, places = np.unique(meshes, return_inverse=True)
+        used, rows = np.unique(meshes, return_inverse=True)
         names = [segment.meshes[mesh].name for mesh in used]
-        return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[places].reshape(-1, 2)
+        return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[rows].reshape(-1, 2)
 
     def _sample(self, name, time, arrays, moved=None, interval=None):
-        """Adds a sample of a prim's attributes to the spool, unless it would repeat an empty one.
+        """Adds a sample of a prim's attributes to the spool, except an empty one after an empty one.
 
         Args:
             name: The prim.
             time: Time code.
-            arrays: Values by attribute, None if there is nothing at that time.
+            arrays: Values by attribute, None for an empty sample.
             moved: A time just before the next sample, and the points at that time.
             interval: Number of the interval that the sample belongs to; default: the one that is added.
         """
@@ -296,24 +295,26 @@ class Overlay:
             return
         types = _PARTS[name][1]
         self._spool.seek(0, os.SEEK_END)
-        places = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
+        stored = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
         after = (moved[0], self._store(types["points"], moved[1])) if moved else None
-        samples.append(_Sample(len(self._ends) if interval is None else interval, time, places, after))
+        samples.append(_Sample(len(self._ends) if interval is None else interval, time, stored, after))
 
-    def _store(self, value_type, array) -> "_Place":
+    def _store(self, value_type, array) -> "_Stored":
+        """Appends an array to the spool."""
         data = np.ascontiguousarray(array, dtype=SHAPES[value_type][0])
-        place = _Place(self._spool.tell(), data.nbytes)
+        stored = _Stored(self._spool.tell(), data.nbytes)
         rest = memoryview(data.tobytes())
         while rest:
             rest = rest[self._spool.write(rest) :]
-        return place
+        return stored
 
-    def _load(self, value_type, place) -> np.ndarray:
+    def _load(self, value_type, stored) -> np.ndarray:
+        """Reads an array from the spool."""
         dtype, width = SHAPES[value_type]
-        self._spool.seek(place.offset)
-        data = self._spool.read(place.size)
-        if len(data) != place.size:
-            raise RuntimeError("the spool of the overlay is cut off")
+        self._spool.seek(stored.offset)
+        data = self._spool.read(stored.size)
+        if len(data) != stored.size:
+            raise RuntimeError("the spool of the overlay is truncated")
         return np.frombuffer(data, dtype).reshape((-1, width) if width > 1 else -1)
 
     def _complete(self, name: str) -> "list[_Sample]":
@@ -323,19 +324,19 @@ class Overlay:
     def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
         """Yields the time samples of an attribute up to the end of the last interval, in order."""
         value_type = _PARTS[name][1][attribute]
-        empty = self._load(value_type, _Place(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
+        empty = self._load(value_type, _Stored(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
         samples = self._complete(name)
         for index, sample in enumerate(samples):
             if sample.is_empty:
                 yield sample.time, empty
                 continue
-            value = self._load(value_type, sample.places[attribute])
+            value = self._load(value_type, sample.arrays[attribute])
             yield sample.time, value
             is_last = index + 1 == len(samples)
             following = end if is_last else samples[index + 1].time
             if attribute == "points" and sample.moved:
                 yield sample.moved[0], self._load(value_type, sample.moved[1])
-            # USD interpolates if both have values, and would show points on the way from one contact to another.
+            # Between two values USD interpolates, which would show points on the way from one contact to another.
             elif value_type.startswith(("float", "point")) and (before := just_before(following)) > sample.time:
                 yield before, value if attribute == "extent" else empty
             if is_last and end > sample.time:
@@ -367,8 +368,8 @@ class Overlay:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """The place of an array in the spool: offset and size in bytes."""
+class _Stored:
+    """An array in the spool, by its offset and size [bytes]."""
 
     offset: int
     size: int
@@ -381,19 +382,19 @@ class _Sample:
     Attributes:
         interval: Number of the interval.
         time: Time code.
-        places: The places of its arrays, by attribute.
-        moved: A time just before the next sample, and the place of the points at that time, if they move.
+        arrays: Its arrays, by attribute; none for an empty sample.
+        moved: A time just before the next sample, and the points at that time, if they move.
     """
 
     interval: int
     time: float
-    places: dict[str, _Place]
-    moved: tuple[float, _Place] | None
+    arrays: dict[str, _Stored]
+    moved: tuple[float, _Stored] | None
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing at that time."""
-        return not self.places
+        """Whether the prim is empty at that time."""
+        return not self.arrays
 
 
 def _box(points, margin=0.0) -> np.ndarray:
@@ -402,7 +403,7 @@ def _box(points, margin=0.0) -> np.ndarray:
 
 
 def _bounds(scene) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the bounding box of the moving meshes at first, or of all meshes if none moves yet."""
+    """Returns the bounding box of the moving meshes at the start, or of all meshes if none moves."""
     interval = scene.interval(0)
     segment, x = interval.segment, interval.x0
     meshes, _ = segment.locate_vertices(np.arange(segment.vertex_count))

@@ -1,7 +1,7 @@
 """A rule of OpenUSD's validation framework: meshes neither collide between time samples nor intersect at them.
 
-Programs that run the framework find the rule by the plugin in the folder ``plugin`` beside this module, which OpenUSD
-loads if the environment variable ``PXR_PLUGINPATH_NAME`` names it. In Python, importing this module is enough::
+Programs that run the framework find the rule if the environment variable ``PXR_PLUGINPATH_NAME`` names the folder
+``plugin`` beside this module. In Python, importing this module registers it::
 
     from pxr import Usd, UsdValidation
     import warp_bsc.replay.usd_validation as rules
@@ -20,29 +20,30 @@ import sys
 
 from pxr import Plug, Usd, UsdValidation
 
-from ..usd.scene import FrameRange, Scene
+from ..usd.frames import FrameRange
+from ..usd.scene import Scene
 from .intervals import replay
 from .summary import Summary
 
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
 NAME = f"{__name__}:Collisions"
-"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for what is not checked; its
-warning is ``Inside``, for a mesh that is wholly inside another, which may be meant."""
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for parts that are not checked;
+its warning is ``Inside``, for a mesh that is wholly inside another, perhaps intentionally."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
 
 
 def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange) -> list[UsdValidation.ValidationError]:
-    """Returns an error for each time in which two meshes collide or cross, and a warning where one is inside another.
+    """Returns an error for each span of time in which two meshes collide or cross, a warning if one is inside another.
 
-    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Changes in the
-    session layer are not seen.
+    The file of the stage's root layer is replayed by method ``"exact"`` on Warp's default device. Unsaved changes, as
+    in the session layer, are not checked.
 
     Args:
         stage: The stage.
-        time_range: Which times to check.
+        time_range: The times to check.
     """
     times = time_range.GetInterval()
     if times.IsEmpty():  # the default time alone, at which nothing moves

@@ -12,7 +12,7 @@ from ..detection.query_points import query_points
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 
 _CHUNK = 1 << 18  # pairs in memory at a time
-_FEWEST = 1 << 14  # pairs that the checker decides at a time, if there are as many: a call of it takes long
+_FEWEST = 1 << 14  # fewest pairs in a call of the checker, as long as there are more: each call has a fixed cost
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -23,7 +23,7 @@ class Validation:
     Attributes:
         hits: Number of reported collisions that the checker decided.
         others: Number of unreported pairs with overlapping swept boxes that the checker decided.
-        answers: Number of pairs that the detector decided.
+        decided: Number of pairs that the detector decided.
         certified: Number of these that floating point certified.
         disagreements: The pairs that the checker decides differently, a sentence each.
         false_hits: Number of reported pairs of method "conservative" that do not collide, as that method permits.
@@ -31,7 +31,7 @@ class Validation:
 
     hits: int
     others: int
-    answers: int
+    decided: int
     certified: int
     disagreements: tuple[str, ...]
     false_hits: int
@@ -49,8 +49,8 @@ def validate(
 ) -> Validation:
     """Compares a detection with the exact checker.
 
-    Reported pairs must collide, at the reported time. Unreported pairs whose swept boxes overlap must not collide; a
-    grid that shares nothing with the detector finds them.
+    Reported pairs must collide, at the reported time. Unreported pairs whose swept boxes overlap must not collide; they
+    are found by a grid that shares no code with the detector.
 
     Args:
         detector: The detector.
@@ -59,7 +59,7 @@ def validate(
         x1: Positions at the end, shape [vertex_count, 3].
         most: Number of reported pairs, and of others, that the checker decides, chosen at random; None for all.
         seed: Seed of the random choice.
-        counted: Which of the reported pairs may be chosen, vertex-face before edge-edge, bool; default: all.
+        counted: Whether each reported pair may be chosen, vertex-face before edge-edge, bool; default: all.
     """
     mesh = detector.mesh
     random = np.random.default_rng(seed)
@@ -95,12 +95,12 @@ def validate(
             disagreements += [f"{name} {pair} collides and was not reported" for pair in pairs[collides].tolist()]
 
     counts = collisions.stats.vertex_face, collisions.stats.edge_edge
-    answers = sum(count.candidates for count in counts)
+    decided = sum(count.candidates for count in counts)
     return Validation(
         hits=decided_hits,
         others=decided_others,
-        answers=answers,
-        certified=answers - sum(count.unsure for count in counts),
+        decided=decided,
+        certified=decided - sum(count.unsure for count in counts),
         disagreements=tuple(disagreements),
         false_hits=false_hits,
     )
@@ -129,12 +129,12 @@ def overlapping_boxes(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Finds all pairs of boxes that overlap or touch, a chunk at a time.
 
-    Boxes are grouped by size. For two groups, each box is put into a grid by its lowest corner; the cells are as large
-    as the larger boxes, so that overlapping boxes are in the same cell or in neighbours.
+    Boxes are grouped by size. For two groups, a grid assigns each box to the cell of its lowest corner; cells are as
+    large as the larger boxes, so that overlapping boxes are in the same cell or in neighbouring ones.
 
     Args:
         first: Lowest and highest corners of the boxes, two arrays of shape [n, 3].
-        second: The same of the others, of shape [m, 3].
+        second: Those of the other boxes, shape [m, 3].
 
     Yields:
         Indices of the first and of the second boxes, each shape [k].
@@ -158,10 +158,10 @@ def overlapping_boxes(
             order = np.argsort(keys, kind="stable")
             keys = keys[order]
             for step in _NEIGHBOURS:
-                wanted = _cell_keys(cells_a + step)
-                begin, end = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
-                for rows, places in _expand(begin, end):
-                    i, j = a[rows], b[order[places]]
+                neighbours = _cell_keys(cells_a + step)
+                begin, end = np.searchsorted(keys, neighbours), np.searchsorted(keys, neighbours, side="right")
+                for rows, columns in _expand(begin, end):
+                    i, j = a[rows], b[order[columns]]
                     for axis in range(3):
                         overlap = first[0][i, axis] <= second[1][j, axis]
                         overlap &= second[0][j, axis] <= first[1][i, axis]
@@ -174,7 +174,7 @@ def _cell_keys(cells):
 
 
 def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields rows and the places from begin to end of each, about a chunk at a time."""
+    """Yields rows and all indices from begin to end of each, about a chunk at a time."""
     (rows,) = np.nonzero(end > begin)
     counts = (end - begin)[rows]
     totals = np.cumsum(counts)
@@ -184,8 +184,8 @@ def _expand(begin, end) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         stop = max(at + 1, int(np.searchsorted(totals, before + _CHUNK, side="right")))
         some = counts[at:stop]
         starts = np.cumsum(some) - some
-        places = np.arange(some.sum()) - np.repeat(starts - begin[rows[at:stop]], some)
-        yield np.repeat(rows[at:stop], some), places
+        columns = np.arange(some.sum()) - np.repeat(starts - begin[rows[at:stop]], some)
+        yield np.repeat(rows[at:stop], some), columns
         at = stop
 
 

@@ -1,59 +1,49 @@
 """Checks the intervals of a scene in several processes, on this machine or on a Dask cluster.
 
-The intervals are cut into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
-results pickled, with numbers in the place of segments, which the receiving process has as well. Results are yielded in
-order, whichever worker is the first. The chunks of a worker that dies are checked again by another.
+The intervals are divided into chunks. A worker opens the scene by its path, checks a chunk at a time, and returns the
+pickled results, with numbers for segments, which the receiving process has as well. Results are yielded in the order of
+the intervals. Chunks of a worker that dies are checked again by another one.
 
-A mesh that turns out to be broken is left out from then on. Workers that check later intervals meanwhile do not know
-that yet: their results are dropped, and the chunks are checked again.
+A mesh found to be broken is left out from then on. Results of later intervals that workers have computed with it are
+dropped, and their chunks are checked again.
 """
 
 import contextlib
-import io
 import itertools
 import logging
 import multiprocessing
-import os
-import pickle
 import signal
-import socket
 import threading
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 from typing import Any, Protocol
 
-from .. import __version__
-from ..detection.launch import cores
-from ..detection.start import find_device, gpu_count
-from ..usd.interval import ReadingNotes
+from .._arguments import given
 from ..usd.scene import Scene
-from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .checking import Checks, IntervalChecker
+from .checking import Checks
 from .results import IntervalResult
+from .worker import check_chunk, find_selection_without_initial, name_device, pack, serve, unpack
 
 __all__ = [
     "Cluster",
     "LocalWorkers",
     "Workers",
     "check_in_workers",
+    "checked_address",
     "device_of_cluster",
-    "device_of_worker",
     "selection_without_initial_in_workers",
 ]
 
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
-_MOST_INTERVALS = 16  # in a chunk; the first of a chunk costs reading and checking a time more
-_CHUNK_SECONDS = 15.0  # after which a chunk ends: two wait for each worker, and what is not written yet can be lost
-_CHUNKS_EACH = 4  # the fewest for each worker, so that all end at about the same time
+_MOST_INTERVALS = 16  # in a chunk; each chunk reads and checks one time more than it has intervals
+_CHUNKS_EACH = 4  # fewest chunks for each worker, so that all workers end at about the same time
 _CONNECT_SECONDS = 10.0
 
 
@@ -61,8 +51,8 @@ class Workers(Protocol):
     """Processes to which functions can be submitted.
 
     Attributes:
-        died: The error that a future of :meth:`submit` has if the process that called the function has died.
-        attempts: How often a function is to be submitted if its process dies.
+        died: The error of a future of :meth:`submit` whose process has died.
+        attempts: Number of times that a function is submitted before its processes' deaths are an error.
     """
 
     died: type[Exception]
@@ -70,7 +60,7 @@ class Workers(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of processes at the moment, at least 1."""
+        """Current number of processes, at least 1."""
         ...
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -78,26 +68,26 @@ class Workers(Protocol):
         ...
 
     def result(self, future: Any) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
         ...
 
     def close(self) -> None:
-        """Ends the work at once, finished or not."""
+        """Ends the processes' work at once, without waiting for it."""
         ...
 
 
 class LocalWorkers:
-    """Processes on this machine, which end when this one ends, however it does.
+    """Processes on this machine, which end when this one ends, even if it is killed.
 
-    Each has a pipe of its own and a thread here that waits for it. (The pool of Python's ``concurrent.futures`` has one
-    pipe for all results: it waits for ever if a process is killed while it writes there.)
+    Each has its own pipe, and a thread in this process that waits at it. (The pool of Python's ``concurrent.futures``
+    has one pipe for all results, and hangs if a process is killed while it writes to it.)
     """
 
     died: type[Exception] = ChildProcessError
     attempts = 3
 
     def __init__(self, count: int):
-        """Starts no process yet: they start when they get work.
+        """Makes the pool; a process starts at its first call.
 
         Args:
             count: Number of processes, at least 1.
@@ -114,7 +104,7 @@ class LocalWorkers:
         return self._threads.submit(self._call, function, arguments)
 
     def result(self, future: Future) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
         return future.result()
 
     def close(self) -> None:
@@ -153,7 +143,7 @@ class LocalWorkers:
         """Starts a process and returns the connection to it."""
         context = multiprocessing.get_context("spawn")  # Warp's threads do not survive a fork
         connection, other = context.Pipe()
-        process = context.Process(target=_serve, args=(other, number, self.count), daemon=True)
+        process = context.Process(target=serve, args=(other, number, self.count), daemon=True)
         process.start()
         other.close()  # so that the connection ends when the process does
         self._processes[number] = process
@@ -165,7 +155,7 @@ class LocalWorkers:
 class Cluster:
     """The workers of a running Dask cluster."""
 
-    attempts = 1  # Dask makes several itself
+    attempts = 1  # Dask itself repeats a call whose worker dies
 
     def __init__(self, address: str):
         """Connects to the cluster.
@@ -175,28 +165,28 @@ class Cluster:
 
         Raises:
             ModuleNotFoundError: If Dask is not installed.
-            OSError: If there is no scheduler.
+            OSError: If the scheduler cannot be reached.
         """
         try:
             from distributed import Client, KilledWorker  # noqa: PLC0415 (optional)
             from distributed.comm.core import CommClosedError  # noqa: PLC0415
         except ModuleNotFoundError as error:
-            raise ModuleNotFoundError("a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
+            raise ModuleNotFoundError("workers: a cluster needs Dask: pip install 'warp-bsc[cluster]'") from error
         self.died: type[Exception] = KilledWorker
         self._address = address
         self._disconnected = CancelledError, CommClosedError
-        # What it writes on standard error when the scheduler is lost is raised here as well.
+        # The loss of the scheduler, which it logs on standard error, is raised here as an error.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         try:
             self._client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise OSError(f"{address}: no scheduler of a Dask cluster answers: {error}") from error
+            raise OSError(f"workers: {address}: cannot reach the scheduler of a Dask cluster: {error}") from error
 
     @property
     def count(self) -> int:
-        """Number of workers at the moment, at least 1."""
-        with self._connected(Exception):  # of several types, and nothing else is done here
-            threads: Any = self._client.nthreads()  # by worker; a coroutine for asynchronous clients only
+        """Current number of workers, at least 1."""
+        with self._connected(Exception):  # of several types; the block has no other errors
+            threads: Any = self._client.nthreads()  # by worker; a coroutine only for asynchronous clients
         return max(1, len(threads))
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -205,12 +195,12 @@ class Cluster:
             return self._client.submit(function, *arguments, pure=False)
 
     def result(self, future: Any) -> Any:
-        """Returns the result of such a future when it is there, or raises what the function has raised."""
-        with self._connected(*self._disconnected):  # no future is cancelled of which a result is wanted
+        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
+        with self._connected(*self._disconnected):  # a lost scheduler cancels its futures
             return future.result()
 
     def close(self) -> None:
-        """Disconnects from the cluster, which drops the work that is waiting."""
+        """Disconnects from the cluster, which drops its waiting calls."""
         self._client.close()
 
     @contextlib.contextmanager
@@ -219,15 +209,15 @@ class Cluster:
         try:
             yield
         except errors as error:
-            raise ConnectionError(f"{self._address}: the scheduler of the Dask cluster answers no more") from error
+            raise ConnectionError(f"workers: {self._address}: lost the scheduler of the Dask cluster") from error
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:
-    """Returns what :meth:`~warp_bsc.replay.checking.IntervalChecker.selection_without_initial` does, in a worker.
+    """Returns the result of ``IntervalChecker.selection_without_initial`` in a worker.
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
-    call = _Call("checked the first time", _find_selection_without_initial, (_pack(scene, checks),))
+    call = _Call("checked the first time", find_selection_without_initial, (pack(scene, checks),))
     (selection,) = _in_order(workers, deque([call]))
     return selection
 
@@ -237,31 +227,43 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
 
     Args:
         scene: The scene. All intervals before the first have been read.
-        checks: What to look for.
+        checks: The checks.
         workers: The processes.
         first: Number of the first interval.
 
     Raises:
         ChildProcessError: If worker after worker dies while it checks the same intervals.
-        Exception: What checking raises, after all results before.
+        Exception: Errors of checking an interval, after the results of all intervals before it.
     """
-    job = _pack(scene, checks)
+    job = pack(scene, checks)
     calls = deque(
-        _Call(_name_chunk(scene, start, stop), _check_chunk, (job, start, stop))
+        _Call(_name_chunk(scene, start, stop), check_chunk, (job, start, stop))
         for start, stop in _cut(scene, first, workers.count)
     )
     for found in _in_order(workers, calls):
         left_out = len(scene.left_out)
-        for result in _unpack(scene, found):
+        for result in unpack(scene, found):
             yield result
             first = result.summary.index + 1
         if len(scene.left_out) > left_out:
-            job = _pack(scene, checks)
+            job = pack(scene, checks)
             for call in calls:
                 call.withdraw()
                 call.arguments = (job, *call.arguments[1:])
-        if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk took long
-            calls.appendleft(_Call(_name_chunk(scene, first, stop), _check_chunk, (job, first, stop)))
+        if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk has ended early
+            calls.appendleft(_Call(_name_chunk(scene, first, stop), check_chunk, (job, first, stop)))
+
+
+def checked_address(address: str) -> str:
+    """Returns the address of a scheduler, the argument ``workers``.
+
+    Raises:
+        ValueError: If it is not an address such as ``"tcp://head:8786"``.
+    """
+    protocol, separator, host = address.partition("://")
+    if not (protocol and separator and host):
+        raise ValueError(f'workers must be an integer or an address such as "tcp://head:8786", not {given(address)}')
+    return address
 
 
 def device_of_cluster(address: str, name: str | None) -> str:
@@ -269,7 +271,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
 
     Args:
         address: As of :class:`Cluster`.
-        name: The device that is wanted, None for Warp's default.
+        name: Name of the requested device, None for Warp's default.
 
     Raises:
         ModuleNotFoundError: As of :class:`Cluster`.
@@ -278,56 +280,46 @@ def device_of_cluster(address: str, name: str | None) -> str:
     """
     cluster = Cluster(address)
     try:
-        return cluster.result(cluster.submit(_name_device, name))
+        return cluster.result(cluster.submit(name_device, name))
     finally:
         cluster.close()
 
 
-def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
-    """Returns the device that a worker on this machine uses: one GPU each, in turns, where no certain one is named.
-
-    Workers share GPUs if there are more of them.
-
-    Args:
-        name: The device that is wanted, None for Warp's default.
-        number: Number of the worker, from 0.
-        gpu_count: Number of GPUs of the machine.
-    """
-    return f"cuda:{number % gpu_count}" if gpu_count and name in (None, "cuda") else name
-
-
 @dataclass
 class _Call:
-    """A call that is to be made in a worker, and its future once it is submitted.
+    """A call of a function in a worker.
 
     Attributes:
-        what: What is done meanwhile, in words.
+        activity: What the worker does, in words, such as "checked time 0 to 8".
         function: The function.
         arguments: Its arguments.
-        future: Future of its result.
-        deaths: How many workers have died that made it.
+        future: Future of its result, None before it is submitted.
+        deaths: Number of workers that have died in this call.
     """
 
-    what: str
+    activity: str
     function: Callable[..., Any]
     arguments: tuple
     future: Any = None
     deaths: int = 0
 
     def withdraw(self) -> None:
-        """Forgets the future."""
+        """Cancels the call, so that it can be submitted again."""
         if self.future:
             self.future.cancel()
             self.future = None
 
 
 def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
-    """Makes calls in workers and yields their results in order; again where a worker dies.
+    """Makes calls in workers and yields their results in order. A call whose worker dies is made again.
 
     Args:
         workers: The workers.
-        calls: The calls, which are removed when their result is there. Between two results, those that remain may be
-            withdrawn and changed, and others put before them.
+        calls: The calls; each is removed when its result is there. Between two results, the caller may withdraw and
+            change the remaining ones, and add others before them.
+
+    Raises:
+        ChildProcessError: If worker after worker dies in the same call.
     """
     while calls:
         for call in islice(calls, 2 * workers.count):
@@ -339,14 +331,14 @@ def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
             call.future = None
             call.deaths += 1
             if call.deaths == workers.attempts:
-                raise ChildProcessError(f"worker after worker died while it {call.what}: out of memory?") from error
+                raise ChildProcessError(f"worker after worker died while it {call.activity}: out of memory?") from error
             continue
         calls.popleft()
         yield result
 
 
 def _name_chunk(scene: Scene, first: int, stop: int) -> str:
-    """Returns what is done to a chunk, in words."""
+    """Returns in words what is done with a chunk."""
     return f"checked time {scene.times[first]:g} to {scene.times[stop]:g}"
 
 
@@ -357,159 +349,3 @@ def _cut(scene: Scene, first: int, worker_count: int) -> Iterator[tuple[int, int
     size = max(1, min(for_all, _MOST_INTERVALS, _CHUNK_BYTES // position_bytes))
     for start in range(first, len(scene), size):
         yield start, min(start + size, len(scene))
-
-
-# In the worker ---------------------------------------------------------------------------------------------------
-
-_ONE_CHUNK = threading.Lock()
-"""Held while a chunk is checked: a worker of Dask has several threads."""
-
-_local: tuple[int, int] | None = None
-"""Number of this worker and number of all workers on this machine, None in a worker of Dask."""
-
-_opened: tuple[bytes, IntervalChecker] | None = None
-"""What this worker has checked last, and the checker."""
-
-
-def _serve(connection: Connection, number: int, count: int) -> None:
-    """Calls the functions that come through a connection until it is closed: the program of a local worker."""
-    global _local  # noqa: PLW0603 (one for the process)
-    _local = number, count
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is sent to all processes; the first one ends the others
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    with contextlib.suppress(EOFError):
-        while True:
-            function, arguments = connection.recv()
-            try:
-                answer = function(*arguments), None
-            except Exception as error:
-                answer = None, _portable(error)
-            connection.send(answer)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent
-    parent.join()
-    os._exit(1)
-
-
-def _check_chunk(job: bytes, first: int, stop: int) -> bytes:
-    """Checks intervals and returns what :func:`_unpack` yields: the results, and the error that stopped them.
-
-    The last intervals are missing, but not the first one, if all take too long.
-    """
-    global _opened  # noqa: PLW0603
-    stream = io.BytesIO()
-    pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
-    with _ONE_CHUNK:
-        checker = None
-        try:
-            checker = _open(job)
-            with cores(_core_count()):
-                for result in checker.check(first, stop, _CHUNK_SECONDS):
-                    checker.scene.files.check()
-                    pickler.index = result.summary.index
-                    pickler.dump((pickler.index, result.contacts.interval.notes))
-                    pickler.dump(result)
-        except Exception as raised:
-            _opened = None
-            pickler.dump((first, checker.scene.take_notes() if checker else ReadingNotes()))
-            pickler.dump(_portable(raised))
-        pickler.dump(None)
-    return stream.getvalue()
-
-
-def _find_selection_without_initial(job: bytes) -> Selection:
-    """Returns the selection that also ignores what crosses or is inside at the first time."""
-    try:
-        with _ONE_CHUNK, cores(_core_count()):
-            return _open(job).selection_without_initial()
-    except Exception as error:
-        raise _portable(error) from None
-
-
-def _name_device(name: str | None) -> str:
-    """Returns the name of the device that this worker uses."""
-    return find_device(name).alias
-
-
-def _open(job: bytes) -> IntervalChecker:
-    """Returns the checker of a job, the last one if it is the same."""
-    global _opened  # noqa: PLW0603
-    if _opened is None or _opened[0] != job:
-        _opened = None  # before the next scene is opened, to free memory
-        stream = io.BytesIO(job)
-        version = pickle.load(stream)
-        if version != __version__:
-            raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
-        scene, checks = pickle.load(stream)
-        device = checks.device
-        if _local:
-            device = device_of_worker(device, _local[0], gpu_count())
-        checks = replace(checks, device=find_device(device).alias)
-        _opened = job, IntervalChecker(scene, checks, _worker_name())
-    return _opened[1]
-
-
-def _core_count() -> int:
-    """Returns the number of cores for this worker: its share of the machine, or the threads that Dask gives it."""
-    if _local:
-        return max(1, (os.cpu_count() or 1) // _local[1])
-    from distributed import get_worker  # noqa: PLC0415 (optional)
-
-    return get_worker().state.nthreads
-
-
-def _worker_name() -> str:
-    return f"{socket.gethostname()}:{os.getpid()}"
-
-
-def _portable(error: Exception) -> Exception:
-    """Returns an error with the same message that can be sent to another process."""
-    if isinstance(error, OSError):
-        return OSError(error.errno, error.strerror, error.filename) if error.strerror else OSError(str(error))
-    if isinstance(error, ValueError):
-        return ValueError(str(error))
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    place = f"{Path(frame.filename).name}:{frame.lineno}"
-    return RuntimeError(f"{type(error).__name__}: {error} (in worker {_worker_name()}, {place})")
-
-
-# What they exchange ----------------------------------------------------------------------------------------------
-
-
-def _pack(scene: Scene, checks: Checks) -> bytes:
-    """Returns what a worker opens, as bytes that are the same for the same content."""
-    return pickle.dumps(__version__) + pickle.dumps((scene, checks))
-
-
-class _Pickler(pickle.Pickler):
-    """Writes the number of an interval in the place of its segment."""
-
-    index = 0
-
-    def persistent_id(self, obj: Any) -> int | None:
-        return self.index if isinstance(obj, Segment) else None
-
-
-class _Unpickler(pickle.Unpickler):
-    """Reads the segments of a scene in the place of numbers of intervals."""
-
-    def __init__(self, stream: io.BytesIO, scene: Scene):
-        super().__init__(stream)
-        self._scene = scene
-
-    def persistent_load(self, pid: int) -> Segment:
-        return self._scene.segment(pid)
-
-
-def _unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
-    """Yields the results of a chunk, raises what stopped it, and notes in the scene what reading it has revealed."""
-    unpickler = _Unpickler(io.BytesIO(found), scene)  # it remembers what consecutive intervals share
-    while notes := unpickler.load():
-        scene.note(*notes)
-        result = unpickler.load()
-        if isinstance(result, Exception):
-            raise result
-        yield result

@@ -9,6 +9,7 @@ from newton.solvers import SolverBase
 
 from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
+from .layer.contact_layer import ContactLayer
 from .solver_ccd import SolverCCD
 
 
@@ -60,9 +61,13 @@ class CapturedSteps:
         self._lock = Occupied("CapturedSteps")
         self._steps, self._solver, self._device = steps, solver, solver.model.device
         self._report = solver.report if isinstance(solver, SolverCCD) else None
+        layer = solver.solver if isinstance(solver, SolverCCD) else solver
+        self._layer = layer if isinstance(layer, ContactLayer) else None
         self._state = list(state)
         if self._report is not None:
-            self._state.append(self._report._totals_values)
+            self._state.append(self._report.total_values)
+        if self._layer is not None:
+            self._state.append(self._layer.skipped)
         self._saved: list[Any] = [  # each of the type of its state
             wp.clone(x) if isinstance(x, wp.array) else solver.model.state() for x in self._state
         ]
@@ -89,7 +94,7 @@ class CapturedSteps:
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
-        if self._report is None:
+        if self._report is None and self._layer is None:
             wp.capture_launch(self._graph)
             return True
         for saved, x in zip(self._saved, self._state, strict=True):
@@ -105,5 +110,6 @@ class CapturedSteps:
 
     def _count_lost(self):
         """Returns the steps so far for which the buffers of a graph may have been too small."""
-        assert self._report is not None
-        return self._report.undetected_steps + self._report.lost_gradients + self._report.layerless_steps
+        report, layer = self._report, self._layer
+        lost = 0 if layer is None else layer.skipped_steps
+        return lost if report is None else lost + report.totals.undetected_steps + report.gradients.lost_steps

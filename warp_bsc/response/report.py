@@ -1,6 +1,7 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -15,10 +16,10 @@ from .state.workspace import Workspace
 
 @wp.struct
 class StepTotals:
-    """Totals over all steps so far; each field is an array of one element."""
+    """Totals over all steps so far on the device, see :class:`Totals`; each field is an array of one element."""
 
     steps: wp.array[wp.int64]
-    coupled_steps: wp.array[wp.int64]
+    substepped_steps: wp.array[wp.int64]
     uncertified_steps: wp.array[wp.int64]
     undetected_steps: wp.array[wp.int64]
     truncated_steps: wp.array[wp.int64]
@@ -26,13 +27,57 @@ class StepTotals:
     not_finite_steps: wp.array[wp.int64]
     remaining: wp.array[wp.int64]
     excluded: wp.array[wp.int64]
-    layerless_steps: wp.array[wp.int64]  # whose contact layer pushed nothing
-    grazing: wp.array[wp.int64]  # contacts whose gradients are clamped
-    lost_gradients: wp.array[wp.int64]  # steps with an incomplete record
+    grazing: wp.array[wp.int64]
+    lost_gradients: wp.array[wp.int64]
+
+
+@dataclass(frozen=True)
+class Totals:
+    """Totals over all steps so far.
+
+    Attributes:
+        steps: Steps.
+        substepped_steps: Steps that were taken in substeps, see :mod:`.substeps.substeps`.
+        uncertified_steps: Steps that were not certified.
+        undetected_steps: Steps that froze all vertices because their detection was incomplete, see
+            :attr:`SolverReport.undetected`.
+        truncated_steps: Steps in which a path was truncated.
+        frozen_steps: Steps in which a vertex or a body was frozen.
+        not_finite_steps: Steps with positions or velocities of particles that were not finite.
+        remaining: Sum of :attr:`SolverReport.remaining`: contacts that were passed, in steps not certified.
+        excluded: Sum of :attr:`SolverReport.excluded`; a pair counts in each step in which it has a contact.
+    """
+
+    steps: int
+    substepped_steps: int
+    uncertified_steps: int
+    undetected_steps: int
+    truncated_steps: int
+    frozen_steps: int
+    not_finite_steps: int
+    remaining: int
+    excluded: int
+
+
+@dataclass(frozen=True)
+class GradientTotals:
+    """Totals over all steps on a tape so far.
+
+    Attributes:
+        grazing: Contacts whose gradients are clamped. The derivatives of features that slide along each other, or have
+            no plane, are unbounded; finite ones replace them, see :mod:`warp_bsc.kernels.gradients`.
+        lost_steps: Steps in a CUDA graph whose record did not fit in its buffers. Gradients through such a step are
+            NaN, see :class:`.captured_steps.CapturedSteps`.
+    """
+
+    grazing: int
+    lost_steps: int
 
 
 class SolverReport:
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
+
+    :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
 
     Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver predicted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
@@ -46,19 +91,16 @@ class SolverReport:
         self,
         motion: ModelMotion,
         work: Workspace,
-        substeps: wp.array[int],
         *,
         responds: bool = True,
-        lifts: bool = False,
     ):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
-        self._substeps = substeps
         self._motion, self._work, self._responds = motion, work, responds
-        self.speed_limit_lifted = lifts
-        self._totals_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
-        self._totals = views_of(StepTotals, self._totals_values)
-        self._start: float | wp.Event | None = None  # of the last step, in seconds, or an event on a GPU
-        self._end: float | wp.Event | None = None
+        self.speed_limit_lifted = False
+        self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
+        self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
+        self.device_totals = views_of(StepTotals, self.total_values)
+        self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
 
     @property
     def certified(self) -> bool:
@@ -217,108 +259,50 @@ class SolverReport:
     def milliseconds(self) -> float | None:
         """Time of the last step that was not captured [ms]; None if there was none.
 
-        Without the inner solver, but for its substeps in a coupled step.
+        Without the inner solver, except for its substeps.
         """
-        if self._start is None:
+        if self.span is None:
             return None
-        assert self._end is not None
-        if isinstance(self._start, wp.Event):
-            return wp.get_event_elapsed_time(self._start, self._end)
-        return 1e3 * (self._end - self._start)
-
-    @property
-    def steps(self) -> int:
-        """Steps taken so far."""
-        return _read(self._totals.steps)
-
-    @property
-    def coupled_steps(self) -> int:
-        """Steps so far that were taken in substeps, see :mod:`.coupling`."""
-        return _read(self._totals.coupled_steps)
+        start, end = self.span
+        return wp.get_event_elapsed_time(start, end) if isinstance(start, wp.Event) else 1e3 * (end - start)
 
     @property
     def substeps(self) -> int:
         """Substeps of the last step, the most of all worlds; 0 if it was not taken in substeps."""
-        return _read(self._substeps)
+        return _read(self.last_substeps)
 
     @property
-    def uncertified_steps(self) -> int:
-        """Steps so far that were not certified."""
-        return _read(self._totals.uncertified_steps)
+    def totals(self) -> Totals:
+        """Totals over all steps so far, as of this access."""
+        return Totals(*self._read_totals()[:-2])
 
     @property
-    def layerless_steps(self) -> int:
-        """Steps so far whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
+    def gradients(self) -> GradientTotals:
+        """Totals over all steps on a tape so far, as of this access."""
+        return GradientTotals(*self._read_totals()[-2:])
 
-        Contacts then act where they hit, and results are not continuous.
-        """
-        return _read(self._totals.layerless_steps)
-
-    @property
-    def undetected_steps(self) -> int:
-        """Steps so far that froze all vertices because their detection was incomplete, see :attr:`undetected`."""
-        return _read(self._totals.undetected_steps)
-
-    @property
-    def not_finite_steps(self) -> int:
-        """Steps so far with positions or velocities of particles that were not finite, see :attr:`not_finite`."""
-        return _read(self._totals.not_finite_steps)
-
-    @property
-    def total_remaining(self) -> int:
-        """Sum of :attr:`remaining` over the steps so far: contacts that were passed, in steps not certified."""
-        return _read(self._totals.remaining)
-
-    @property
-    def total_excluded(self) -> int:
-        """Sum of :attr:`excluded` over the steps so far; a pair counts in each step in which it has a contact."""
-        return _read(self._totals.excluded)
-
-    @property
-    def truncated_steps(self) -> int:
-        """Steps so far in which a path was truncated."""
-        return _read(self._totals.truncated_steps)
-
-    @property
-    def frozen_steps(self) -> int:
-        """Steps so far in which a vertex was frozen."""
-        return _read(self._totals.frozen_steps)
-
-    @property
-    def grazing(self) -> int:
-        """Contacts so far, in steps on a tape, whose gradients are clamped.
-
-        The derivatives of features that slide along each other, or have no plane, are unbounded; finite ones replace
-        them, see :mod:`warp_bsc.kernels.gradients`.
-        """
-        return _read(self._totals.grazing)
-
-    @property
-    def lost_gradients(self) -> int:
-        """Steps so far on a tape, in a CUDA graph, whose record did not fit in its buffers.
-
-        Gradients through such a step are NaN: see :class:`.captured_steps.CapturedSteps`.
-        """
-        return _read(self._totals.lost_gradients)
+    def _read_totals(self):
+        return list(map(int, self.total_values.numpy()))
 
     def __str__(self) -> str:
         """Returns the steps so far, in one line, and what crosses at the start of the last."""
+        totals, gradients = self.totals, self.gradients
         line = (
-            f"{self.steps} steps, {self.truncated_steps} with truncation, {self.frozen_steps} with vertices "
-            f"frozen, {self.uncertified_steps} not certified"
+            f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
+            f"vertices, {totals.uncertified_steps} not certified"
         )
-        if self.coupled_steps:
-            line += f", {self.coupled_steps} coupled"
+        if totals.substepped_steps:
+            line += f", {totals.substepped_steps} in substeps"
         if self.speed_limit_lifted:
             line += ", without VBD's speed limit"
         if self.crossings:
             line += f", {self.crossings} crossings at the start"
-        if self.total_remaining or self.total_excluded:
-            line += f"; contacts: {self.total_remaining} remained, {self.total_excluded} excluded"
-        if self.not_finite_steps:
-            line += f", {self.not_finite_steps} steps with positions that are not finite"
-        if self.grazing or self.lost_gradients:
-            line += f"; gradients: {self.grazing} grazing contacts, {self.lost_gradients} steps lost"
+        if totals.remaining or totals.excluded:
+            line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
+        if totals.not_finite_steps:
+            line += f", {totals.not_finite_steps} steps with positions that are not finite"
+        if gradients.grazing or gradients.lost_steps:
+            line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
         return line
 
     @property

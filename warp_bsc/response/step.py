@@ -74,6 +74,14 @@ def add_proximities(work: Workspace) -> None:
     wp.capture_if(work.status.loop.active, proximities.add_proximities, work=work)
 
 
+def prepare(work: Workspace, motion: ModelMotion) -> None:
+    """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
+    resolve(work, motion, 1.0)
+    for values in work.status_values:
+        values.zero_()
+    work.vertices.outcome.zero_()
+
+
 def inspect(work: Workspace, motion: ModelMotion) -> Resolution:
     """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
 

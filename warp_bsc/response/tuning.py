@@ -78,6 +78,8 @@ PLANE_DEPTH = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 
 # contact layer
+LAYER_THICKNESS = 0.25, 0.45
+"""Default thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
 PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""

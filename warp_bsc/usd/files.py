@@ -1,4 +1,4 @@
-"""Tracks the files that a USD stage is read from: they must not be overwritten or change during a replay."""
+"""Tracks the files of a USD stage, which must not be overwritten or change during a replay."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -16,7 +16,7 @@ class SceneFiles:
     """The files of all layers that a stage has opened so far, value clips included."""
 
     def __init__(self, stage: "Usd.Stage"):
-        """Records the versions of all files opened so far."""
+        """Records the versions of all files that a stage has opened so far."""
         self._stage = stage
         self._stamps = {}
         self._find()
@@ -28,7 +28,7 @@ class SceneFiles:
         return any(os.path.exists(file) and os.path.samefile(path, file) for file in files[1:])
 
     def check(self) -> None:
-        """Checks that no file has changed: crate files are read piece by piece, and two versions would be mixed.
+        """Checks that no file has changed, as crate files are read in parts, which would be of two versions.
 
         Raises:
             ValueError: If a file has changed since this object first saw it.
@@ -44,7 +44,7 @@ class SceneFiles:
         return {path: (size, changed) for path, (_, size, changed) in self._stamps.items()}
 
     def differing(self, versions: dict[str, tuple[int, int]]) -> str | None:
-        """Returns the path of a file that has another version than given, None if there is none."""
+        """Returns the path of a file whose version differs from the given one, None if there is none."""
         own = self.versions()
         return next((path for path in own if versions.get(path, own[path]) != own[path]), None)
 
@@ -58,7 +58,7 @@ class SceneFiles:
 
 
 def _stamp(path):
-    """Returns a value that differs between versions of a file, None if there is no such file."""
+    """Returns a value that differs between versions of a file, None if the file does not exist."""
     try:
         status = os.stat(path)
     except OSError:

@@ -1,4 +1,4 @@
-"""Finds and places the instances of point instancers. Imports pxr, which is slow: import this where it is used."""
+"""The instances of point instancers and their transforms. Imports pxr, which is slow: import this where used."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from .stage import LeftOut, UnreadableError, may_jump, reading, sample_times
+from .samples import may_jump, sample_times
+from .unreadable import LeftOut, UnreadableError, reading
 
 __all__ = [
     "Instance",
@@ -24,12 +25,12 @@ __all__ = [
     "visibility_times",
 ]
 
-# Prototypes are often kept under a class or an over, so that they are not drawn where they stand.
+# Prototypes are often below a class or an over, so that they are not drawn themselves.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 
 
 class Instance:
-    """An instance of a prototype: a place where the prims of the prototype stand.
+    """An instance of a prototype, which a point instancer places.
 
     Attributes:
         instancer: The point instancer, the same object for all of its instances.
@@ -39,7 +40,14 @@ class Instance:
     """
 
     def __init__(self, instancer: "Instancer", index: int, prototype: int, root: Usd.Prim):
-        """Takes the instancer, and the numbers of the instance and of its prototype."""
+        """Makes an instance.
+
+        Args:
+            instancer: The point instancer.
+            index: Number of the instance.
+            prototype: Number of its prototype.
+            root: The prototype's topmost prim.
+        """
         self.instancer = instancer
         self.index = index
         self._prototype = prototype
@@ -47,7 +55,7 @@ class Instance:
         self.root = root
 
     def name_of(self, path: Sdf.Path) -> str:
-        """Returns the name in this instance of a prim of the prototype, given its path."""
+        """Returns the name that a prim of the prototype has in this instance, given its path."""
         return f"{self.name}/{path.MakeRelativePath(self.root.GetPath().GetParentPath())}"
 
     def prims(self) -> Iterator[Usd.Prim]:
@@ -55,34 +63,34 @@ class Instance:
         return iter(Usd.PrimRange(self.root, _PROTOTYPES))
 
     def are_present(self, times: tuple[Usd.TimeCode, ...]) -> np.ndarray:
-        """Returns at which times the instance is there and visible, bool."""
+        """Returns whether the instance exists and is visible at each time, bool."""
         return self.instancer.prototypes(times)[:, self.index] == self._prototype
 
     def transform(self, prim: Usd.Prim, time: Usd.TimeCode) -> np.ndarray | None:
-        """Returns the matrix that takes points of a prim of the prototype, as rows, to world space, shape [4, 4].
+        """Returns the matrix that transforms points of a prim of the prototype, as rows, to world space, shape [4, 4].
 
-        None where the instance is not there, or the lengths of the instancer's arrays differ.
+        None if the instance does not exist, or the lengths of the instancer's arrays differ.
         """
         transforms, are_there = self.instancer.transforms(prim, self.root, time)
         return transforms[self.index] if are_there[self.index] else None
 
     def contains(self, prim: Usd.Prim) -> bool:
-        """Returns whether an instancer made this instance or one around it: an instancer may not contain itself."""
+        """Returns whether an instancer places this instance or one around it; an instancer must not contain itself."""
         parent = self.instancer.parent
         return self.instancer.prim == prim or (parent is not None and parent.contains(prim))
 
 
 class Instancer:
-    """A point instancer, or one instance of it, and what it has read last.
+    """A point instancer, or one instance of it, with the values that were read last.
 
     Attributes:
         prim: The instancer.
-        parent: The instance that it stands in, None if it stands in the scene.
-        name: Its path, with the number of the instance that it stands in.
+        parent: The instance that contains it, None in the scene itself.
+        name: Its path, with the number of the instance that contains it.
         count: Largest number of instances at any time.
         times: Time codes at which transforms of its instances to the world have a sample.
         break_times: Time codes at which instances may appear or vanish.
-        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
+        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
     """
 
     count: int = 0
@@ -97,7 +105,7 @@ class Instancer:
         self._last_transforms: dict[Sdf.Path, tuple[Usd.TimeCode, tuple[np.ndarray, np.ndarray]]] = {}
         self._last_prototypes: tuple[tuple, np.ndarray] = (), np.zeros((0, 0), dtype=int)
         root = parent.root if parent else None
-        self._masking = () if parent else masking_attributes(prim)  # a parent takes its own into account
+        self._masking = () if parent else masking_attributes(prim)  # a parent considers its own
         self._masking_of: dict[Sdf.Path, tuple[Usd.Attribute, ...]] = {}  # by prim of a prototype
         placing = (
             instancer.GetPositionsAttr(),
@@ -116,7 +124,7 @@ class Instancer:
             self.may_jump |= parent.instancer.may_jump
 
     def transforms(self, prim: Usd.Prim, root: Usd.Prim, time: Usd.TimeCode) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the matrices that take points of a prim of a prototype, as rows, to world space, by all instances.
+        """Returns the matrices that transform points of a prim of a prototype, as rows, to world space, by instance.
 
         Args:
             prim: The prim.
@@ -124,8 +132,8 @@ class Instancer:
             time: Time code.
 
         Returns:
-            Matrices, shape [count, 4, 4], as the file has them, finite or not; and which instances are there, shape
-            [count]: the others have the identity.
+            Matrices, shape [count, 4, 4], finite or not, the identity for instances that do not exist; and whether each
+            instance exists, shape [count].
         """
         last = self._last_transforms.get(prim.GetPath())
         if last and last[0] == time:
@@ -149,7 +157,7 @@ class Instancer:
         return transforms, are_there
 
     def prototypes(self, times: tuple[Usd.TimeCode, ...]) -> np.ndarray:
-        """Returns the prototype of each instance at each time, shape [len(times), count]; -1 where none is visible."""
+        """Returns the prototype of each instance at each time, shape [len(times), count]; -1 if it is not visible."""
         if self._last_prototypes[0] != times:
             prototypes = np.full((len(times), self.count), -1)
             parent = self.parent
@@ -163,7 +171,7 @@ class Instancer:
         return self._last_prototypes[1]
 
     def _read_placed(self, time) -> np.ndarray:
-        """Returns the matrices of the instances in the instancer, shape [n, 4, 4], as far as its lists reach.
+        """Returns the matrices of the instances in the instancer, shape [n, 4, 4], for the length of its shortest list.
 
         ``PointInstancer.ComputeInstanceTransformsAtTime`` cannot evaluate the moment just before a time.
         """
@@ -185,7 +193,10 @@ class Instancer:
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Returns matrices for rows, shape [n, 3, 3], as ``Gf.Matrix4d.SetRotate``; imaginary parts first, shape [n, 4]."""
+    """Returns rotations, for points as rows, shape [n, 3, 3], of quaternions, imaginary parts first, shape [n, 4].
+
+    They equal those of ``Gf.Matrix4d.SetRotate``.
+    """
     x, y, z, w = quaternions.T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (z * x - y * w)),
@@ -198,13 +209,13 @@ def _rotations(quaternions: np.ndarray) -> np.ndarray:
 def find_instances(
     prim: Usd.Prim, parent: Instance | None, file: str | os.PathLike, left_out: LeftOut
 ) -> list[Instance]:
-    """Finds all instances that a point instancer has at some time.
+    """Returns all instances that a point instancer has at some time.
 
     Args:
         prim: The instancer.
-        parent: The instance that it stands in, None if it stands in the scene.
+        parent: The instance that contains it, None in the scene itself.
         file: The file, for messages.
-        left_out: Takes instancers that contain themselves, and instances whose prototype is missing.
+        left_out: Records instancers that contain themselves, and instances whose prototype is missing.
 
     Raises:
         UnreadableError: If these may not be left out.
@@ -220,38 +231,38 @@ def find_instances(
             numbers = schema.GetProtoIndicesAttr()
             times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, numbers.GetTimeSamples())]
             pairs = sorted({pair for time in times for pair in enumerate(numbers.Get(time) or ())})
-            lost = [(index, number) for index, number in pairs if not 0 <= number < len(roots) or not roots[number]]
+            missing = [(index, number) for index, number in pairs if not 0 <= number < len(roots) or not roots[number]]
     except UnreadableError as error:
         left_out.add(error)
         return []
-    if lost:
-        (index, number), more = lost[0], f"; {len(lost) - 1} more" * (len(lost) > 1)
-        error = UnreadableError(f"{where}: instance {index} is of prototype {number}, which is not there{more}")
+    if missing:
+        (index, number), more = missing[0], f"; {len(missing) - 1} more" * (len(missing) > 1)
+        error = UnreadableError(f"{where}: instance {index} is of prototype {number}, which does not exist{more}")
         left_out.add_missing(error, prim)
-    present = sorted({*pairs} - {*lost})
+    present = sorted({*pairs} - {*missing})
     instancer.count = 1 + max((index for index, _ in present), default=-1)
     return [Instance(instancer, index, number, roots[number]) for index, number in present]
 
 
 def transform_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[Usd.Attribute]:
-    """Yields the attributes of the transforms from a prim to the world, or up to a root, its own included."""
+    """Yields the attributes of the transforms from a prim to the world, or up to and including a root."""
     return (op.GetAttr() for op in _transform_ops(prim, root))
 
 
 def masking_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> tuple[Usd.Attribute, ...]:
-    """Returns those of them from which OpenUSD makes a finite matrix although their value is not finite.
+    """Returns those of these attributes whose values may be not finite although OpenUSD's matrix is finite.
 
-    A quaternion that is not a number becomes the identity, and the inverse of an infinite scale 0.
+    OpenUSD turns a quaternion that is not a number into the identity, and the inverse of an infinite scale into 0.
     """
     ops = _transform_ops(prim, root)
     return tuple(op.GetAttr() for op in ops if op.GetOpType() == UsdGeom.XformOp.TypeOrient or op.IsInverseOp())
 
 
 def are_finite(attributes: Iterable[Usd.Attribute], time: Usd.TimeCode) -> bool:
-    """Returns whether the values of attributes of transforms are finite at a time, or missing."""
+    """Returns whether the values of attributes of transforms are finite or missing at a time."""
     for attribute in attributes:
         value = attribute.Get(time)
-        if hasattr(value, "GetImaginary"):  # a quaternion; many are read
+        if hasattr(value, "GetImaginary"):  # a quaternion; this is faster than by NumPy
             finite = math.isfinite(Gf.Quatd(value).GetLength())
         else:
             finite = value is None or bool(np.isfinite(np.array(value, dtype=np.float64)).all())
@@ -272,17 +283,17 @@ def _transform_ops(prim, root) -> Iterator[UsdGeom.XformOp]:
 
 
 def transform_times(prim: Usd.Prim, root: Usd.Prim | None = None) -> set[float]:
-    """Returns the times of the samples of those transforms, where an attribute has two or more."""
+    """Returns the times of the samples of these attributes, for attributes that have two or more."""
     return sample_times(*transform_attributes(prim, root))
 
 
 def visibility_times(prim: Usd.Prim, root: Usd.Prim | None = None) -> set[float]:
-    """Returns the times at which the visibility of a prim, or of one above it up to a root, may change."""
+    """Returns the times at which the visibility of a prim, or of a prim above it up to a root, may change."""
     return sample_times(*(imageable.GetVisibilityAttr() for imageable in _imageables(prim, root)))
 
 
 def is_shown(prim: Usd.Prim, root: Usd.Prim | None, time: Usd.TimeCode) -> bool:
-    """Returns whether a prim and all above it, up to a root or to the top of the scene, are visible at a time."""
+    """Returns whether a prim and all prims above it, up to a root or the top of the scene, are visible at a time."""
     return all(
         imageable.GetVisibilityAttr().Get(time) != UsdGeom.Tokens.invisible for imageable in _imageables(prim, root)
     )

@@ -27,12 +27,12 @@ class LeftOutMesh:
 
 @dataclass(frozen=True)
 class ReadingNotes:
-    """What reading an interval revealed.
+    """The left-out meshes, messages and jumps that reading an interval revealed.
 
     Attributes:
         left_out: The meshes left out from this interval or a later one on.
-        messages: Messages of OpenUSD that it had not given before.
-        jumps: Names of the meshes that do not start where the interval before ended.
+        messages: Messages of OpenUSD that are new.
+        jumps: Names of the meshes that do not start where the previous interval ended.
     """
 
     left_out: tuple[LeftOutMesh, ...] = ()
@@ -48,13 +48,13 @@ class Interval:
         index: Number of the interval, from 0.
         start: Time code at which it starts.
         end: Time code at which it ends.
-        segment: The meshes that are there.
+        segment: The meshes that are present.
         x0: Positions of their vertices at the start, in world space and the scene's unit of length, float32 or float64,
             shape [vertex_count, 3].
-        x1: The same at the end; where a mesh jumps at that time, before the jump.
+        x1: Their positions at the end; where a mesh jumps at that time, those before the jump.
         is_joined: Whether the next interval surely starts where this one ends, with the same meshes. False for the last
             interval, and where a mesh may jump at the end.
-        notes: What reading the interval revealed.
+        notes: The left-out meshes, messages and jumps that reading it revealed.
     """
 
     index: int
@@ -68,7 +68,7 @@ class Interval:
 
     @property
     def jumps(self) -> tuple[str, ...]:
-        """Names of the meshes that do not start where the interval before ended.
+        """Names of the meshes that do not start where the previous interval ended.
 
         Empty unless that interval was the last one read, or intervals are read in order.
         """
@@ -76,7 +76,7 @@ class Interval:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What reading this interval revealed, a sentence each: parts left out, messages of OpenUSD, jumps."""
+        """Sentences on the parts left out, messages of OpenUSD and jumps that reading this interval revealed."""
         return (
             *(left_out_warning(part.reason) for part in self.notes.left_out),
             *map(message_warning, self.notes.messages),
@@ -90,8 +90,8 @@ def left_out_warning(reason: str) -> str:
 
 
 def message_warning(message: str) -> str:
-    """Returns the warning that OpenUSD has said something."""
-    return f"OpenUSD says: {message}"
+    """Returns the warning that contains a message of OpenUSD."""
+    return f"message of OpenUSD: {message}"
 
 
 def jump_warning(name: str, times: Iterable[float]) -> str:
@@ -100,6 +100,6 @@ def jump_warning(name: str, times: Iterable[float]) -> str:
 
 
 def times_in_words(times: Iterable[float]) -> str:
-    """Returns when something happens, given the times, at least one, ascending."""
+    """Returns one or more times, ascending, in words."""
     times = list(times)
     return f"at time {times[0]:g}" if len(times) == 1 else f"{len(times)} times, first at time {times[0]:g}"

@@ -1,4 +1,4 @@
-"""Facts of a scene for a layer over it: metadata, unused paths, and time codes just before others."""
+"""Metadata, unused paths and time codes of a scene, for a layer over it."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -9,16 +9,16 @@ __all__ = ["just_before", "layer_metadata", "unused_path"]
 
 
 def unused_path(scene: Scene, path: str) -> str:
-    """Returns a path at which the scene has no prim: the one given, with underscores appended where it has one."""
+    """Returns a path at which the scene has no prim: a given one, with underscores appended if necessary."""
     while scene.stage.GetPrimAtPath(path):
         path += "_"
     return path
 
 
 def layer_metadata(scene: Scene) -> dict[str, str | float]:
-    """Returns the scene's metadata by name. A stage takes it from its root layer alone, never from sublayers.
+    """Returns the scene's metadata by name, for a layer over it, as a stage reads metadata only from its root layer.
 
-    If the scene has no default prim, its first prim becomes that; if it has no range of time codes, its times do.
+    A missing default prim is replaced by the scene's first prim, a missing range of time codes by that of its times.
     """
     stage = scene.stage
     start, end = scene.times[0], scene.times[-1]
@@ -39,7 +39,7 @@ def layer_metadata(scene: Scene) -> dict[str, str | float]:
 
 
 def just_before(time: float) -> float:
-    """Returns the latest time code before a time that OpenUSD keeps apart from it."""
+    """Returns the latest time code before a time that OpenUSD distinguishes from it."""
     from pxr import Usd  # noqa: PLC0415 (slow)
 
     return time - Usd.TimeCode.SafeStep(max(1e6, abs(time)))

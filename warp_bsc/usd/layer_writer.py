@@ -1,4 +1,4 @@
-"""Writes a layer of shining prims over a scene, whose time samples are never all in memory."""
+"""Writes a layer of light-emitting prims over a scene, without holding all time samples in memory."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
@@ -9,17 +9,20 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["SHAPES", "LayerContent", "LayerPrim", "write_binary_layer", "write_text_layer"]
+__all__ = ["SHAPES", "LayerContent", "LayerPrim", "PrimKind", "write_binary_layer", "write_text_layer"]
+
+PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
+"""The types of prims in a layer."""
 
 SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
 
 _SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
-_TEXT_ROWS = 4096  # rows of an array that are text at once
+_TEXT_ROWS = 4096  # rows of an array that are formatted at a time
 
 
 @dataclass(frozen=True)
@@ -28,14 +31,14 @@ class LayerPrim:
 
     Attributes:
         name: Its name.
-        kind: ``"Mesh"``, ``"PointInstancer"`` or ``"BasisCurves"``. The instances are of an octahedron.
+        kind: ``"Mesh"``, ``"PointInstancer"``, whose instances are octahedra, or ``"BasisCurves"``.
         attributes: Types of its attributes that have time samples, by their names.
         color: The colour of the light that it emits.
         width: Width of the octahedron or of the curves.
     """
 
     name: str
-    kind: str
+    kind: PrimKind
     attributes: dict[str, str]
     color: tuple[float, float, float]
     width: float = 0.0
@@ -43,14 +46,14 @@ class LayerPrim:
 
 @dataclass(frozen=True)
 class LayerContent:
-    """All that a layer holds.
+    """The content of a layer.
 
     Attributes:
         metadata: Metadata of the layer, by name.
         documentation: Text for people.
         custom: Values for programs, by name.
-        sublayer: Path of the layer that it lies over, from its own folder on. It is not read.
-        root: Path of the prim that all prims are below, of purpose guide.
+        sublayer: Path of its sublayer, relative to its own folder. It is not read.
+        root: Path of the prim above all prims, of purpose guide.
         strings: Attributes of that prim, lists of texts, by name.
         prims: The prims.
         samples: Yields the time samples of an attribute in order, given its prim and its name: time codes and arrays of
@@ -68,11 +71,11 @@ class LayerContent:
 
 
 def write_binary_layer(content: LayerContent, path: Path) -> None:
-    """Writes a layer in USD's binary format, which can save samples and drop them from memory.
+    """Writes a layer in USD's binary format, in which saved samples leave the memory.
 
     Args:
         content: The content.
-        path: A file that is not there yet, with any name. After an error it is not there either.
+        path: A file that does not exist, with any name. After an error it does not exist.
 
     Raises:
         OSError: If the file cannot be written.
@@ -112,10 +115,10 @@ def write_text_layer(content: LayerContent, write: Callable[[str], None]) -> Non
     _describe(head, content)
     _define_prims(body, content)
     attributes = list(_attributes(content))
-    for number, (prim, attribute, value_type) in enumerate(attributes):  # a sample at the time of its number
+    for number, (prim, attribute, value_type) in enumerate(attributes):  # a sample whose time is its number
         body.SetTimeSample(f"{content.root}/{prim}.{attribute}", number, _to_vt(value_type, None))
     write(head.ExportToString().rstrip("\n"))
-    # Text, number of the attribute, text, number, ...: no name of a prim has a line break in it.
+    # Text, number of the attribute, text, number, ...: names of prims contain no line breaks.
     parts = re.split(r"\n *(\d+): \[\],\n", body.ExportToString().removeprefix("#usda 1.0"))
     for part, number in zip(parts[::2], [*parts[1::2], None], strict=True):
         write(part + "\n")
@@ -165,7 +168,7 @@ def _define_prims(layer, content):
             UsdGeom.BasisCurves(prim).SetWidthsInterpolation(UsdGeom.Tokens.constant)
         else:
             shown = _define_marker(stage, prim, part.width / 2)
-        # The same colour where a program shows no materials.
+        # The same colour for programs that show no materials.
         UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([part.color])
         material = UsdShade.Material.Define(stage, f"{content.root}/Materials/{part.name}")
         shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
@@ -193,12 +196,12 @@ def _define_marker(stage, instancer, radius):
 
 
 def _attributes(content) -> Iterator[tuple[str, str, str]]:
-    """Yields all attributes with time samples: the names of their prims, their own, and their types."""
+    """Yields the attributes with time samples: names of their prims, their names, and their types."""
     return ((prim.name, name, value_type) for prim in content.prims for name, value_type in prim.attributes.items())
 
 
 def _to_vt(value_type, array):
-    """Returns an array as a value of USD, an empty one for None."""
+    """Returns an array as a value of USD, an empty array for None."""
     from pxr import Vt  # noqa: PLC0415 (slow)
 
     types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
@@ -214,7 +217,7 @@ def _to_text(rows) -> str:
 
 
 def _as_os_error(error) -> Exception:
-    """Returns the system's error in an error of OpenUSD, such as a full disk, or the error itself if there is none."""
+    """Returns the system's error, such as a full disk, in an error of OpenUSD; the error itself without one."""
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         if os.strerror(number) in str(error):
             return OSError(number, os.strerror(number))

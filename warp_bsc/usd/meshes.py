@@ -1,191 +1,37 @@
-"""Finds meshes, curves and points of a USD stage and reads them. Imports pxr, which is slow: import this where used."""
+"""Reads a mesh of a USD stage, or curves or points of a prim. Imports pxr, which is slow: import this where used."""
 
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
 import copy
-import hashlib
 import math
 import os
-from collections import Counter
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel, Vt
+from pxr import Usd, UsdGeom
 
 from .instancers import (
-    Instance,
     are_finite,
-    find_instances,
     is_shown,
     masking_attributes,
     transform_attributes,
     transform_times,
     visibility_times,
 )
-from .selection import Selection
+from .mesh_prims import MeshPrim
+from .samples import as_time_code, may_jump, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
-from .skinning import Skin, find_bindings
-from .stage import LeftOut, UnreadableError, as_time_code, may_jump, reading, sample_times
+from .skinning import Skin
 from .strands import Strands, is_strands
-from .triangulation import triangulate
+from .topology import Topology, is_empty, read_topology
+from .unreadable import UnreadableError, reading
 
-__all__ = ["UsdMesh", "find_meshes"]
+__all__ = ["UsdMesh"]
 
-_BETWEEN = 0.382  # where between two samples a transform is tested for a bend; halfway, two whole turns look like none
+_BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
 _MOST_TIMES = 1_000_000
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
-
-
-def find_meshes(
-    stage: Usd.Stage, file: str | os.PathLike, selection: Selection, left_out: LeftOut
-) -> tuple[list["UsdMesh"], list[str]]:
-    """Returns the selected meshes that are visible at some time, and sentences on the contents that are not checked.
-
-    Args:
-        stage: The stage.
-        file: Its file, for messages.
-        selection: Which meshes are checked.
-        left_out: Takes broken meshes and instances.
-
-    Raises:
-        UnreadableError: If a mesh or a point instancer is broken and may not be left out.
-        ValueError: If a pattern of the selection matches nothing.
-    """
-    finder = _Finder(file, left_out)
-    finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())), None)
-    selection.check_patterns(finder.places)
-
-    meshes, invisible, empty, passed_over, warnings = [], [], [], Counter(), finder.warnings
-    if unmatched := selection.unmatched(finder.places):
-        warnings.append(
-            f"pairs to ignore that match no meshes: {len(unmatched)}, the first is {' '.join(unmatched[0])}"
-        )
-    first_instances: dict[tuple, UsdMesh] = {}
-    for place in finder.places:
-        if not selection.includes(place):
-            continue
-        try:
-            with reading(f"{file}: {place.name}"):
-                if place.purpose not in selection.purposes:
-                    passed_over[place.purpose] += 1
-                    continue
-                if place.instance is None:
-                    mesh = UsdMesh(place, file)
-                elif first := first_instances.get(place.group):
-                    mesh = first.again(place)
-                else:
-                    mesh = first_instances[place.group] = UsdMesh(place, file)
-        except UnreadableError as error:
-            left_out.add(error)
-            continue
-        if mesh.is_empty and _has_clips(place.prim):  # of which a file may be missing
-            left_out.add(UnreadableError(f"{file}: {mesh.name}: its value clips have no faces, edges or points"))
-        elif mesh.is_empty:
-            empty.append(mesh.name)
-        elif not any(mesh.states.values()):
-            invisible.append(mesh.name)
-        elif mesh.is_nowhere:  # here, as instances may be many
-            left_out.add(UnreadableError(f"{file}: {mesh.name}: its transform is not finite"))
-            continue
-        else:
-            meshes.append(mesh)
-        if place.is_bound_in_vain:
-            warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
-    if invisible:
-        warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")
-    if empty:
-        warnings.append(
-            f"prims without faces, edges or points hold nothing to check: {len(empty)}, the first is {empty[0]}"
-        )
-    for purpose, count in sorted(passed_over.items()):
-        warnings.append(f"meshes of purpose {purpose} are not checked: {count}; --purpose {purpose} checks them")
-    if finder.other:
-        warnings.append(f"shapes without polygons are not checked: {_listed(finder.other)}")
-    if strands := Counter(mesh.type_name for mesh in meshes if mesh.is_strands):
-        how = "with half their widths as radii between the times; at the times, curves as lines, points not at all"
-        warnings.append(f"curves and points are checked {how}: {_listed(strands)}")
-    if varying := [mesh for mesh in meshes if mesh.may_thicken]:
-        warnings.append(
-            f"widths or scales that change count as the largest: {len(varying)}, the first {varying[0].name}"
-        )
-    if shapes := Counter(mesh.type_name for mesh in meshes if mesh.is_shape):
-        warnings.append(f"shapes are checked as polyhedra, round ones as inscribed ones: {_listed(shapes)}")
-    return meshes, warnings
-
-
-def _listed(counts) -> str:
-    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
-
-
-class _Place:
-    """A mesh prim, or one instance of it, that has not been read.
-
-    Attributes:
-        prim: The prim.
-        path: Its path.
-        name: The same, with the number of the instance if a point instancer places it.
-        instance: That instance, else None.
-        binding: Its binding, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
-        group: The same for all instances of a prim that one instancer places.
-    """
-
-    def __init__(self, prim, instance: Instance | None, binding: tuple | None):
-        self.prim = prim
-        self.path = str(prim.GetPath())
-        self.name = instance.name_of(prim.GetPath()) if instance else self.path
-        self.instance = instance
-        self.binding = binding
-        self.group = (id(instance.instancer), self.path) if instance else ()
-
-    @cached_property
-    def purpose(self) -> str:
-        return str(UsdGeom.Imageable(self.prim).ComputePurpose())
-
-    @property
-    def is_bound_in_vain(self) -> bool:
-        return self.binding is None and bool(UsdSkel.BindingAPI(self.prim).GetInheritedSkeleton())
-
-
-class _Finder:
-    """Walks a stage, and into the prototypes of point instancers once for each instance."""
-
-    def __init__(self, file, left_out):
-        self._file = file
-        self._left_out = left_out
-        self._bindings = {}
-        self.places = []
-        self.other = Counter()
-        self.warnings = []
-
-    def walk(self, prims, instance):
-        for prim in prims:
-            if prim.IsA(UsdGeom.PointInstancer):
-                # Meshes below are its prototypes: they are not where they stand in the hierarchy.
-                prims.PruneChildren()
-                for inner in find_instances(prim, instance, self._file, self._left_out):
-                    self.walk(inner.prims(), inner)
-            elif prim.IsA(UsdSkel.Root):
-                if not self._find_bindings(prim):
-                    prims.PruneChildren()
-            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim) or is_strands(prim):
-                self.places.append(_Place(prim, instance, self._bindings.get(prim.GetPath())))
-            elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
-                self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
-
-    def _find_bindings(self, root) -> bool:
-        """Returns whether the bindings below a ``SkelRoot`` can be read."""
-        path = root.GetPath()
-        if path not in self._bindings:
-            self._bindings[path] = None
-            try:
-                with reading(f"{self._file}: {path}"):
-                    self._bindings.update(find_bindings(root))
-            except UnreadableError as error:
-                self._left_out.add(error)
-                self._bindings[path] = error
-        return self._bindings[path] is None
 
 
 class UsdMesh:
@@ -193,36 +39,36 @@ class UsdMesh:
 
     Attributes:
         path: The prim's path.
-        name: The same, with the number of the instance if a point instancer places it.
-        group: The same for all instances of a prim that one instancer places; empty if none places it.
+        name: The path, with the number of the instance if a point instancer places it.
+        group: The same value for all instances of a prim that one instancer places; empty without an instancer.
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
         is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`.
-        is_strands: Whether it is no mesh, but :class:`~warp_bsc.usd.strands.Strands`.
+        is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
-        states: Its state at first, with key minus infinity, and from each time on at which that changes: None where it
-            is invisible, not there or empty, else a digest of its topology.
-        turns: Whether a transform or a skeleton moves it, which is not linear between the samples.
-        deforms: Whether anything but its transform moves it.
+        states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
+            absent or empty, else a digest of its topology.
+        turns: Whether a transform or a skeleton moves it, so that it may move nonlinearly between the samples.
+        deforms: Whether anything except its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
         is_empty: Whether it has no faces, and no edges or points, at any time.
-        is_nowhere: Whether its transform is finite at no time.
+        is_nowhere: Whether its transform is not finite at any time.
     """
 
-    def __init__(self, place: _Place, file: str | os.PathLike):
+    def __init__(self, found: MeshPrim, file: str | os.PathLike):
         """Finds the times at which a mesh changes and moves.
 
         Args:
-            place: The prim, or the instance.
+            found: The prim, or the instance.
             file: Its file, for messages.
 
         Raises:
-            UnreadableError: If an attribute has a value that a mesh cannot have.
+            UnreadableError: If the value of an attribute is invalid.
         """
-        prim, instance = place.prim, place.instance
+        prim, instance = found.prim, found.instance
         self._file = file
-        self.path = place.path
+        self.path = found.path
         self.display_name = prim.GetDisplayName()
         self.type_name = str(prim.GetTypeName())
         self.is_shape = is_shape(prim)
@@ -231,15 +77,15 @@ class UsdMesh:
         self.is_strands = self._strands is not None
         shaped = ShapePolygons if self.is_shape else MeshPolygons
         self._polygons: Polygons = self._strands or shaped(prim)
-        self._skin = skin = Skin(*place.binding, where=f"{file}: {self.path}") if place.binding else None
+        self._skin = skin = Skin(*found.binding, where=f"{file}: {self.path}") if found.binding else None
         self._root = instance.root if instance else None
         # Joints move points to the space of their skeleton.
         self._frame = skin.skeleton if skin and skin.skeleton else prim
         self._masking = () if instance else masking_attributes(self._frame)
-        self._where = f"{file}: {place.name}"
+        self._where = f"{file}: {found.name}"
         instancer = instance.instancer if instance else None
         self.group = (id(instancer), self.path) if instancer else ()
-        self._last_points: dict[tuple, np.ndarray] = {}  # shared by all instances, as are the next ones
+        self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
         breaks = visibility_times(prim, self._root) | sample_times(*self._polygons.topology_attributes)
@@ -249,11 +95,11 @@ class UsdMesh:
         self._break_codes = tuple(
             Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
-        has_elements = [not _is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
+        has_elements = [not is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
         self.is_empty = not any(has_elements)
-        # A mesh may be empty for some time, as where a fluid has not begun to flow.
+        # A mesh may be empty for some time, such as a fluid before it flows.
         self._states = [
-            self._topology_digest(code) if has and is_shown(prim, self._root, code) else None
+            self._read_topology(code).digest() if has and is_shown(prim, self._root, code) else None
             for code, has in zip(self._break_codes, has_elements, strict=True)
         ]
         self._deformed_times = frozenset(
@@ -286,20 +132,20 @@ class UsdMesh:
         self._stays: np.ndarray = (first == np.eye(4)).all(axis=(1, 2))
         self._is_finite: np.ndarray = np.isfinite(first).all(axis=(1, 2))
         self._bent: dict[tuple[float, float], np.ndarray] = {}
-        self._place(place)
+        self._set_instance(found)
 
-    def again(self, place: _Place) -> "UsdMesh":
+    def again(self, found: MeshPrim) -> "UsdMesh":
         """Returns another instance of the same prim, placed by the same instancer."""
         mesh = copy.copy(self)
-        mesh._place(place)
+        mesh._set_instance(found)
         return mesh
 
-    def _place(self, place: _Place) -> None:
+    def _set_instance(self, found: MeshPrim) -> None:
         """Sets what differs between instances."""
-        self.name = place.name
+        self.name = found.name
         self._where = f"{self._file}: {self.name}"
-        self._instance = instance = place.instance
-        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that count as that one
+        self._instance = instance = found.instance
+        self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that it stands for
         states = self._states
         if instance:
             present = instance.are_present(self._break_codes)
@@ -324,11 +170,11 @@ class UsdMesh:
         )
 
     def turning_times(self, start: float, end: float) -> set[float]:
-        """Returns the whole time codes between samples at which the mesh is off the straight way between them.
+        """Returns the whole time codes between samples at which the mesh is not on the straight path between them.
 
         Args:
-            start: Only after this time.
-            end: Only before this time.
+            start: Time code after which they are.
+            end: Time code before which they are.
 
         Raises:
             ValueError: If there are more than a million.
@@ -340,17 +186,17 @@ class UsdMesh:
             low, high = math.floor(max(first, start)) + 1, math.ceil(min(last, end)) - 1
             if high - low >= _MOST_TIMES - len(times):
                 raise ValueError(
-                    f"{self._where}: turns from time {first:g} to {last:g}, which is to be looked at every whole time "
-                    "code; --frames START:END:STEP looks at fewer"
+                    f"frames: {self._where} turns from time {first:g} to {last:g} and is sampled at every whole time "
+                    "code, more than a million; a step takes fewer"
                 )
             if low <= high and (bends or self._bends(first, last)):
                 times.update(map(float, range(low, high + 1)))
         return times
 
     def take_times(self, scene_times: dict[float, float]) -> None:
-        """Replaces the mesh's times by the scene's, where the scene merged times that are almost one.
+        """Replaces the mesh's times by the scene's, which stand for several times that differ by rounding.
 
-        The moment before such a time is read just before the first of the mesh's own times, the rest at the last.
+        The moment before such a time is read just before the first of the mesh's own times, the time at the last.
 
         Args:
             scene_times: The scene's time for each time found in any mesh.
@@ -364,12 +210,20 @@ class UsdMesh:
         self.states = {scene_times.get(time, time): state for time, state in self.states.items()}
         self.may_jump |= any(first != last for first, last in self._own_times.values())
 
+    def state_at(self, time: float) -> bytes | None:
+        """Returns its state at a time, see :attr:`states`."""
+        return next(state for since, state in reversed(self.states.items()) if since <= time)
+
+    def is_there_from(self, time: float) -> bool:
+        """Returns whether it is there at a time or later."""
+        return self.state_at(time) is not None or any(state for since, state in self.states.items() if since > time)
+
     def leave_out(self, since: float) -> None:
         """Removes the mesh from a time on; minus infinity removes it at all times."""
         self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
-        """Reads the points as they are stored, or as a skeleton moves them, shape [point_count, 3].
+        """Returns the stored points, or those that a skeleton and blend shapes deform, shape [point_count, 3].
 
         Args:
             time: Time code.
@@ -378,21 +232,21 @@ class UsdMesh:
         Raises:
             UnreadableError: If there are no points, or the binding to the skeleton is broken.
         """
-        with reading(self._where, self, time):
+        with reading(self._where, self.name, time):
             code = self._time_code(time, before)
             key = code.GetValue(), code.IsPreTime(), before and time not in self.states
             if key in self._last_points:
                 return self._last_points[key]
-            # Where the topology stays, a changed number of points is an error, which the moment before would hide.
+            # A number of points that changes without the topology is an error, which the moment before would hide.
             at_time = before and time not in self.states
             points = self._polygons.read_points(Usd.TimeCode(code.GetValue()) if at_time else code)
-            if _is_empty(points):
+            if is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
             if self._skin:
                 self._skin.deform(points, code)
             array = np.array(points)
             if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
-                raise UnreadableError(f"{self._where}: its points are no points, but {type(points).__name__}")
+                raise UnreadableError(f"{self._where}: attribute points holds {type(points).__name__}, not point3f[]")
             if self.group:
                 self._last_points.clear()
                 self._last_points[key] = array
@@ -401,7 +255,7 @@ class UsdMesh:
     def read_positions(
         self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
     ) -> np.ndarray:
-        """Reads the positions of some points in world space.
+        """Returns the positions of some points in world space.
 
         Args:
             time: Time code.
@@ -417,7 +271,7 @@ class UsdMesh:
             UnreadableError: If the number of points differs, or a position is not finite.
         """
         points = self.read_points(time, before=before)
-        with reading(self._where, self, time):
+        with reading(self._where, self.name, time):
             if len(points) != point_count:
                 raise UnreadableError(
                     f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
@@ -436,7 +290,7 @@ class UsdMesh:
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
     ) -> np.ndarray | None:
-        """Reads the positions of all points in several instances of the same :attr:`group` in world space, float64.
+        """Returns the positions of all points in several instances of one :attr:`group` in world space, float64.
 
         Args:
             time: Time code.
@@ -445,14 +299,14 @@ class UsdMesh:
             before: As of :meth:`read_positions`.
 
         Returns:
-            Positions, shape [n, point_count, 3]; None if any instance is broken, which :meth:`read_positions` of that
-            one then says.
+            Positions, shape [n, point_count, 3]; None if an instance is broken, for which its :meth:`read_positions`
+            raises the error.
 
         Raises:
             UnreadableError: If the points cannot be read.
         """
         points = self.read_points(time, before=before).astype(np.float64)
-        with reading(self._where, self, time):
+        with reading(self._where, self.name, time):
             transforms, are_there = self._read_transforms(self._instance, self._time_code(time, before))
             transforms = transforms[instances]
             if len(points) != point_count or not are_there[instances].all() or not np.isfinite(transforms).all():
@@ -461,11 +315,11 @@ class UsdMesh:
 
     @property
     def index(self) -> int:
-        """Number of the instance, 0 for a mesh that no instancer places."""
+        """Number of the instance, 0 for a mesh without an instancer."""
         return self._instance.index if self._instance else 0
 
     def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Reads the polygons that are no holes, as triangles that turn counterclockwise seen from outside.
+        """Returns the polygons without the holes, as triangles that turn counterclockwise seen from outside.
 
         Args:
             time: Time code.
@@ -480,7 +334,7 @@ class UsdMesh:
         """
         if self._strands:
             return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64), 0
-        with reading(self._where, self, time):
+        with reading(self._where, self.name, time):
             is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
             code = self._time_code(time, False)
             if not self.group:
@@ -493,10 +347,10 @@ class UsdMesh:
             return self._last_triangles[key]
 
     def read_strands(self, times: list[float], point_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reads the edges of curves, and the radii of curves and points; of a mesh, there are none.
+        """Returns the edges of curves, and the radii of curves and points; empty and zero for a mesh with faces.
 
         Args:
-            times: Times, ascending, from the first to before the last of which the topology is the same.
+            times: Times, ascending; the topology is the same from the first to just before the last.
             point_count: Number of points.
 
         Returns:
@@ -508,19 +362,19 @@ class UsdMesh:
         """
         if not self._strands:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1), np.zeros(point_count)
-        with reading(self._where, self, times[0]):
-            counts, _, _ = self._read_topology(self._time_code(times[0], False))
-            edges, curves = self._strands.read_edges(counts, point_count, self._where)
+        with reading(self._where, self.name, times[0]):
+            topology = self._read_topology(self._time_code(times[0], False))
+            edges, curves = self._strands.read_edges(topology.counts, point_count, self._where)
         own = sample_times(self._strands.width_attribute)
         radius = np.zeros(point_count)
         for time in sorted({*times, *(time for time in own if times[0] < time < times[-1])}) if own else times[:1]:
-            with reading(self._where, self, time):
+            with reading(self._where, self.name, time):
                 code = self._time_code(time, time == times[-1] > times[0])
                 radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves, self._where))
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:
-        """Returns the largest factor by which the transform lengthens at each time, to nine digits; 1 for no times."""
+        """Returns the largest stretch of the transform at each time, to nine digits; [1] without times."""
         found = [self._find_transform(self._time_code(time, False)) for time in times if not self.is_placed]
         scales = [
             np.linalg.norm(transform[:3, :3], 2)
@@ -530,40 +384,22 @@ class UsdMesh:
         return [float(f"{scale:.9g}") for scale in scales] or [1.0]
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
-        counts, indices, holes = self._read_topology(code)
-        if counts.min() < 3:
-            face = int(np.argmin(counts))
-            raise UnreadableError(f"{self._where}: face {face} has {counts[face]} vertices; 3 are the fewest")
-        if counts.sum() != indices.size:
-            raise UnreadableError(
-                f"{self._where}: faceVertexCounts add up to {counts.sum()}, "
-                f"but there are {indices.size} faceVertexIndices"
-            )
-        outside = (indices < 0) | (indices >= len(points))
-        if outside.any():
-            corner = int(np.argmax(outside))
-            face = int(np.searchsorted(np.cumsum(counts), corner, side="right"))
-            raise UnreadableError(
-                f"{self._where}: face {face} refers to vertex {indices[corner]}, but the mesh has {len(points)} points"
-            )
-
-        triangles, polygons = triangulate(counts, indices, points)
-        solid = ~np.isin(polygons, holes)
-        if not solid.any():
-            raise UnreadableError(f"{self._where}: all faces of the mesh are holes")
+        """Returns the result of :meth:`read_triangles`."""
+        topology = self._read_topology(code)
+        triangles, polygons = topology.triangles(points, self._where)
         is_left_handed = UsdGeom.Gprim(self._prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if is_left_handed != is_mirrored:
             triangles = triangles[:, ::-1]
-        return triangles[solid], polygons[solid], len(counts)
+        return triangles, polygons, len(topology.counts)
 
     def _time_code(self, time, before) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
-        # Reading the moment before a time takes twice as long: USD interpolates from the sample before.
+        # Reading the moment before a time takes twice as long, as USD interpolates from the previous sample.
         return as_time_code(first if before else last, before=before and (self.may_jump or time in self.states))
 
     def _transform(self, time, *, before=False) -> np.ndarray:
-        """Returns the matrix that takes points, as rows, to world space, shape [4, 4]."""
+        """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""
         transform = self._find_transform(self._time_code(time, before))
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
@@ -572,7 +408,7 @@ class UsdMesh:
         return transform
 
     def _bends(self, start, end) -> bool:
-        """Returns whether the transform leaves the straight way from one sample to the next."""
+        """Returns whether the transform leaves the straight path from one sample to the next."""
         if (start, end) not in self._bent:
             codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
             (first, *_), (between, *_), (last, *_) = found = [self._read_transforms(self._instance, c) for c in codes]
@@ -590,7 +426,7 @@ class UsdMesh:
         return self._instance.transform(self._frame, time)
 
     def _read_transforms(self, instance, time) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what :meth:`Instancer.transforms` does of all instances, or one matrix for a mesh that is none."""
+        """Returns the result of :meth:`Instancer.transforms`, or one matrix for a mesh without an instancer."""
         if instance:
             return instance.instancer.transforms(self._frame, instance.root, time)
         transform = np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
@@ -598,32 +434,5 @@ class UsdMesh:
             transform[:] = np.nan
         return transform[None], np.ones(1, dtype=bool)
 
-    def _read_topology(self, time) -> list[np.ndarray]:
-        """Reads counts, indices and holes at a time."""
-        names = "faceVertexCounts", "faceVertexIndices", "holeIndices"
-        values = self._polygons.read_topology(time)
-        return [self._as_integers(name, value) for name, value in zip(names, values, strict=True)]
-
-    def _as_integers(self, name, value) -> np.ndarray:
-        array = np.array(Vt.IntArray() if value is None else value)
-        if array.ndim != 1 or array.dtype.kind not in "iu":
-            raise UnreadableError(f"{self._where}: {name} is no list of integers")
-        return array.astype(np.int64)
-
-    def _topology_digest(self, time) -> bytes:
-        digest = hashlib.blake2b()
-        for values in self._read_topology(time):
-            digest.update(len(values).to_bytes(8, "little") + values.tobytes())
-        return digest.digest()
-
-
-def _has_clips(prim) -> bool:
-    """Returns whether values of a prim may come from value clips."""
-    return any(
-        prim.GetStage().GetPrimAtPath(path).HasAuthoredMetadata("clips") for path in prim.GetPath().GetPrefixes()
-    )
-
-
-def _is_empty(value) -> bool:
-    """Returns whether a value that should be a list is missing or empty."""
-    return value is None or (hasattr(value, "__len__") and len(value) == 0)
+    def _read_topology(self, time) -> Topology:
+        return read_topology(self._polygons, time, self._where)

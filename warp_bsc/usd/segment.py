@@ -1,62 +1,34 @@
-"""A stretch of a scene's time over which the same meshes, curves and points are there and keep their topology."""
+"""A span of a scene's time over which the same meshes, curves and points exist and keep their topology."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .position_reader import PositionReader
+from .scene_mesh import SceneMesh
+from .welding import group_by_position, split_by_position
+
 if TYPE_CHECKING:
     from .meshes import UsdMesh
 
-__all__ = ["SceneMesh", "Segment"]
-
-
-@dataclass(frozen=True)
-class SceneMesh:
-    """The part of a segment that one mesh of the scene is, or the curves or points of one prim.
-
-    Attributes:
-        path: The prim's path.
-        name: The same, with the number of the instance if a point instancer places it.
-        display_name: Display name in the file, empty if there is none.
-        moves: Whether its points or its transform change with time.
-        deforms: Whether its points do, relative to each other, so that it may collide with itself.
-        vertices: Its vertices, among those of all meshes before they were welded.
-        faces: Its faces, among those of all meshes.
-        points: Index of each vertex among the prim's points, shape [len(vertices)].
-        point_count: Number of the prim's points.
-        polygons: Index of the prim's polygon that each face is a part of, ascending, shape [len(faces)].
-        polygon_count: Number of the prim's polygons, holes included.
-    """
-
-    path: str
-    name: str
-    display_name: str
-    moves: bool
-    deforms: bool
-    vertices: slice
-    faces: slice
-    points: np.ndarray = field(repr=False)
-    point_count: int
-    polygons: np.ndarray = field(repr=False)
-    polygon_count: int
+__all__ = ["Segment"]
 
 
 class Segment:
     """Meshes merged to one list of vertices and one of faces, and their positions at the times of the segment.
 
-    Curves are meshes whose edges no face has, and points are meshes of vertices alone.
+    Curves are meshes of edges without faces, and points are meshes of vertices alone.
 
     Attributes:
         meshes: The meshes, in the order of their vertices.
         faces: Vertices of each face, shape [face_count, 3], int32.
         free_edges: Vertices of the edges of curves, shape [n, 2], int32.
         points: Vertices of points, int32.
-        radius: Radius of each vertex, in the scene's unit of length; 0 where a face is; shape [vertex_count].
+        radius: Radius of each vertex, in the scene's unit of length; 0 at faces; shape [vertex_count].
         vertex_count: Number of vertices of all meshes, welded.
-        welded: Number of vertices that were welded to another.
+        welded: Number of vertices that were welded to another one.
         dtype: Type of the positions, float32 or float64.
     """
 
@@ -77,8 +49,8 @@ class Segment:
             usd_meshes: The meshes.
             times: The segment's times, its first and its last included.
             dtype: Type of the positions.
-            progress: Called with the number of times at which vertices have been compared, and of all.
-            welds: :attr:`welds` of the same meshes and times, if they are known, which saves reading all times.
+            progress: Called with the number of times at which vertices have been compared, and their total.
+            welds: :attr:`welds` of the same meshes and times, if known, so that not all times have to be read.
 
         Raises:
             UnreadableError: If a mesh is broken.
@@ -88,7 +60,9 @@ class Segment:
         self.meshes, faces = [], []
         edges, curves, points_alone, radius = [], [], [], []
         vertex_count = face_count = 0
-        compact: dict[int, tuple] = {}  # triangles that instances share, and what is made of them, by their identity
+        compact: dict[
+            int, tuple
+        ] = {}  # by identity of the triangles, which instances share: used points, corners, and the triangles
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
             triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
@@ -97,7 +71,7 @@ class Segment:
                 used, corners = np.arange(len(points)), triangles
                 own_edges, own_curves, own_radius = strands
                 edges.append(own_edges + vertex_count)
-                curves.append(np.where(own_curves < 0, -1, own_curves + vertex_count))  # unlike those of other prims
+                curves.append(np.where(own_curves < 0, -1, own_curves + vertex_count))  # unique in the segment
                 points_alone.append(vertex_count + np.flatnonzero(own_curves < 0))
                 radius.append(own_radius)
                 compact[id(triangles)] = used, corners, triangles
@@ -143,15 +117,15 @@ class Segment:
             self._welded_to = everything
             self._welded_to[welds[0]] = welds[1]
         used = [self._welded_to[part].reshape(-1) for part in (self._corners, self._unwelded_edges, alone)]
-        self._kept, places = _renumber(np.concatenate(used), vertex_count)
-        corners, ends, points = np.split(places.astype(np.int32), np.cumsum([len(used[0]), len(used[1])]))
+        self._kept, welded = _renumber(np.concatenate(used), vertex_count)
+        corners, ends, points = np.split(welded.astype(np.int32), np.cumsum([len(used[0]), len(used[1])]))
         self.faces, self.free_edges, self.points = corners.reshape(-1, 3), ends.reshape(-1, 2), points
         self.vertex_count = len(self._kept)
         self.radius = np.zeros(self.vertex_count)
         self._curve_of_vertex = curve_of_vertex[self._kept].astype(np.int64)
         if self.has_strands:
             np.maximum.at(self.radius, np.searchsorted(self._kept, self._welded_to), radii)
-            self.radius[self.faces] = 0.0  # welded to a mesh, they would thicken its faces
+            self.radius[self.faces] = 0.0  # curves welded to a mesh would thicken its faces
         self.welded = vertex_count - self.vertex_count
         self._start = self._start[self._kept]
         self._along, self._length = self._measure_curves()
@@ -161,12 +135,12 @@ class Segment:
         self._jumping = self._reader(self._kept, jumping) if jumping else None
 
     def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
-        """Reads the positions of all vertices in world space.
+        """Returns the positions of all vertices in world space.
 
         Args:
             time: Time code.
-            before: Whether to read the moment just before that time, which differs where a mesh jumps at it.
-            last: Positions just before that time, if they are known: only meshes that may jump are read again.
+            before: Whether to read the moment just before that time, which differs for a mesh that jumps then.
+            last: Positions just before that time, if known, so that only meshes that may jump are read again.
 
         Returns:
             Positions in the scene's unit of length, shape [vertex_count, 3], of type :attr:`dtype`; ``last`` itself if
@@ -190,12 +164,12 @@ class Segment:
 
     @property
     def may_jump(self) -> bool:
-        """Whether a mesh may have other positions just before a time than at that time."""
+        """Whether the positions of a mesh just before a time may differ from those at that time."""
         return self._jumping is not None
 
     @property
     def welds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The vertices that are welded to others, before they were welded, and those that they are welded to."""
+        """The welded vertices, numbered before welding, and the vertices that they are welded to."""
         (welded,) = np.nonzero(self._welded_to != np.arange(len(self._welded_to)))
         return welded, self._welded_to[welded]
 
@@ -214,15 +188,15 @@ class Segment:
         return self._locate(self._kept[vertices])
 
     def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns all meshes that have each vertex, welded ones included: rows of the argument, and the meshes."""
+        """Returns pairs of a row of ``vertices`` and a mesh with that vertex, welded or not, in two arrays."""
         unwelded, order = self._unwelded
-        wanted = self._kept[vertices]
-        first, last = np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right")
-        rows, places = _expand(first, last)
-        return rows, np.searchsorted(self._vertex_ends, order[places], side="right")
+        kept = self._kept[vertices]
+        first, last = np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right")
+        rows, indices = _expand(first, last)
+        return rows, np.searchsorted(self._vertex_ends, order[indices], side="right")
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns all meshes that have each edge, shape [n, 2], smaller vertex first: rows, and the meshes."""
+        """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a mesh with it, in two arrays."""
         rows, sides = self._find_sides(ends)
         return rows, np.searchsorted(self._vertex_ends, self._ends_of_sides(sides)[:, 0], side="right")
 
@@ -236,22 +210,22 @@ class Segment:
             polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
         return meshes, polygons
 
-    def places_in_polygons(self, faces: np.ndarray) -> np.ndarray:
-        """Returns which of the triangles of its polygon each face is, from 0, shape [n]."""
-        places = np.zeros(len(faces), dtype=np.int64)
+    def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
+        """Returns the number of each face among the triangles of its polygon, from 0, shape [n]."""
+        triangles = np.zeros(len(faces), dtype=np.int64)
         meshes = np.searchsorted(self._face_ends, faces, side="right")
         for number in np.unique(meshes):
             mesh, members = self.meshes[number], meshes == number
             own = faces[members] - mesh.faces.start
-            places[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
-        return places
+            triangles[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
+        return triangles
 
-    def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Returns faces, given what :meth:`locate_faces` and :meth:`places_in_polygons` return for them, shape [n]."""
+    def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """Returns faces, shape [n]: the inverse of :meth:`locate_faces` and :meth:`triangles_in_polygons`."""
         faces = np.zeros(len(meshes), dtype=np.int64)
         for number in np.unique(meshes):
             mesh, members = self.meshes[number], meshes == number
-            faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + places[members]
+            faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + triangles[members]
         return faces
 
     def find_vertices(self, meshes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -263,16 +237,16 @@ class Segment:
         return np.searchsorted(self._kept, self._welded_to[vertices])
 
     def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        """Returns which points of given meshes' prims vertices are, the first if several were welded, shape [n]."""
+        """Returns the indices of vertices among the points of given meshes' prims, the first if welded, shape [n]."""
         unwelded, order = self._unwelded
-        wanted = self._kept[vertices]
-        rows, places = _expand(np.searchsorted(unwelded, wanted), np.searchsorted(unwelded, wanted, side="right"))
-        own_meshes, points = self._locate(order[places])
+        kept = self._kept[vertices]
+        rows, indices = _expand(np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right"))
+        own_meshes, points = self._locate(order[indices])
         (own,) = np.nonzero(own_meshes == meshes[rows])
         return points[own[np.unique(rows[own], return_index=True)[1]]]
 
     def locate_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the mesh of each edge, the indices of its ends among the prim's points, and which are diagonals.
+        """Returns the mesh of each edge, the indices of its ends among the prim's points, and whether it is a diagonal.
 
         Args:
             ends: Vertices, the smaller first, shape [n, 2].
@@ -282,17 +256,17 @@ class Segment:
             a diagonal, bool, shape [n]: an edge inside a polygon, where two of its triangles meet.
         """
         keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        place = np.searchsorted(keys, wanted)
-        # The face's own corners: the welded ends may belong to an earlier mesh.
-        meshes, points = self._locate(self._ends_of_sides(sides[place]))
+        own = self._side_keys(ends)
+        first = np.searchsorted(keys, own)
+        # The face's own corners, as the welded ends may belong to an earlier mesh.
+        meshes, points = self._locate(self._ends_of_sides(sides[first]))
 
         # Triangles of one polygon are neighbours in the list.
-        following = np.minimum(place + 1, max(0, len(keys) - 1))
-        diagonal = (keys[following] == wanted) & (following > place) & (sides[following] < self._corners.size)
+        following = np.minimum(first + 1, max(0, len(keys) - 1))
+        diagonal = (keys[following] == own) & (following > first) & (sides[following] < self._corners.size)
         (rows,) = np.nonzero(diagonal)
         if len(rows):
-            face, other = (np.stack(self.locate_faces(sides[where[rows]] // 3)) for where in (place, following))
+            face, other = (np.stack(self.locate_faces(sides[where[rows]] // 3)) for where in (first, following))
             diagonal[rows] = (face == other).all(axis=0)
         return meshes[:, 0], np.sort(points, axis=1), diagonal
 
@@ -304,15 +278,16 @@ class Segment:
         return np.flatnonzero(marked[a] | marked[b] | marked[c])
 
     def faces_of_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns all faces that have each edge, shape [n, 2], smaller vertex first, as a side: rows, and the faces."""
+        """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a face with it, in two arrays."""
         rows, sides = self._find_sides(ends)
         of_faces = sides < self._corners.size
         return rows[of_faces], sides[of_faces] // 3
 
     def are_neighbours(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Returns which pairs of edges of one curve are near along it, and may always touch each other.
+        """Returns whether the edges of each pair are close along one curve, so that thick ones always touch, bool.
 
-        What is between them is at most twice as long as their radii together, at the segment's first time.
+        The part of the curve between them is then at most twice as long as the sum of their radii, at the segment's
+        first time.
 
         Args:
             first: Vertices of an edge, shape [n, 2].
@@ -330,16 +305,16 @@ class Segment:
         return near
 
     def are_stiff(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
-        """Returns which elements are paired with their own mesh, and that mesh moves and does not deform.
+        """Returns whether each element is paired with its own mesh, and only a transform moves that mesh.
 
-        Vertices and edges may be welded to those of other meshes: they belong to all of these.
+        A vertex or an edge that is welded to others belongs to all of their meshes.
 
         Args:
             elements: Vertices, shape [n], or edges, shape [n, 2], smaller vertex first.
             meshes: The other element's mesh, shape [n].
 
         Returns:
-            Whether the other mesh is one of the element's, and stiff, bool, shape [n].
+            Bool array of shape [n].
         """
         stiff = np.array([mesh.moves and not mesh.deforms for mesh in self.meshes], dtype=bool)
         are_stiff = np.zeros(len(elements), dtype=bool)
@@ -351,8 +326,8 @@ class Segment:
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        first, last = np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right")
+        own = self._side_keys(ends)
+        first, last = np.searchsorted(keys, own), np.searchsorted(keys, own, side="right")
         marked = np.zeros(len(keys) + 1, dtype=np.int64)
         np.add.at(marked, first, 1)
         np.add.at(marked, last, -1)
@@ -367,9 +342,9 @@ class Segment:
 
     @cached_property
     def _sides(self):
-        """Keys of the sides of all faces and of free edges, ascending, and the number of each side.
+        """Keys of the sides of all faces and of free edges, ascending, and the numbers of these sides.
 
-        That is 3 face + corner, or the number of the free edge after all of these.
+        Side number 3 face + corner is a side of a face; larger numbers are free edges.
         """
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         if len(self.free_edges):
@@ -379,14 +354,14 @@ class Segment:
         return keys[order], order
 
     def _find_sides(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rows of edges, smaller vertex first, shape [n, 2], and all sides that each is."""
+        """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a side, in two arrays."""
         keys, sides = self._sides
-        wanted = self._side_keys(ends)
-        rows, places = _expand(np.searchsorted(keys, wanted), np.searchsorted(keys, wanted, side="right"))
-        return rows, sides[places]
+        own = self._side_keys(ends)
+        rows, indices = _expand(np.searchsorted(keys, own), np.searchsorted(keys, own, side="right"))
+        return rows, sides[indices]
 
     def _ends_of_sides(self, sides: np.ndarray) -> np.ndarray:
-        """Returns the vertices at both ends of sides, as their own mesh has them before welding, shape [n, 2]."""
+        """Returns the vertices at both ends of sides, numbered before welding, shape [n, 2]."""
         face, corner = np.divmod(sides, 3)
         of_faces = sides < self._corners.size
         ends = np.zeros((len(sides), 2), dtype=np.int64)
@@ -399,20 +374,20 @@ class Segment:
         """Measures curves at the segment's first time, in the scene's unit of length.
 
         Returns:
-            How far along its curve each vertex is, NaN for others, and the length of its curve where that is closed,
-            else infinity, each of shape [vertex_count].
+            The distance of each vertex from the start along its curve, NaN without a curve, and the length of its curve
+            if that is closed, else infinity; each of shape [vertex_count].
         """
         ends, x = self._unwelded_edges, self._start.astype(np.float64)
         lengths = np.linalg.norm(x[self.free_edges[:, 1]] - x[self.free_edges[:, 0]], axis=1)
         is_next = ends[:, 1] == ends[:, 0] + 1  # other edges close a curve
         steps = np.zeros(len(self._welded_to))
         steps[ends[is_next, 1]] = lengths[is_next]
-        along = np.cumsum(steps)  # differences within a curve count
+        along = np.cumsum(steps)  # only differences within a curve are used
         curves = self._curve_of_vertex
         closed = np.full(int(curves.max(initial=-1)) + 2, np.inf)
         first, last = ends[~is_next].T
-        places = np.searchsorted(self._kept, self._welded_to[first])
-        closed[curves[places]] = along[last] - along[first] + lengths[~is_next]
+        starts = np.searchsorted(self._kept, self._welded_to[first])
+        closed[curves[starts]] = along[last] - along[first] + lengths[~is_next]
         closed[-1] = np.inf
         return np.where(curves >= 0, along[self._kept], np.nan), closed[curves]
 
@@ -427,19 +402,19 @@ class Segment:
             points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
         return meshes, points
 
-    def _reader(self, vertices, numbers) -> "_Reader":
-        """Returns a reader of some vertices, ascending among the unwelded ones, in the meshes of some numbers."""
+    def _reader(self, vertices, numbers) -> PositionReader:
+        """Returns a reader of some vertices, numbered before welding, ascending, in the meshes of some numbers."""
         ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
         parts = []
         for number in numbers:
             mesh, rows = self.meshes[number], slice(ends[number], ends[number + 1])
             points = mesh.points[vertices[rows] - mesh.vertices.start]
             parts.append((self._usd_meshes[number], mesh.point_count, rows, points))
-        return _Reader(parts, self.dtype)
+        return PositionReader(parts, self.dtype)
 
     def _find_welds(self, times, progress) -> np.ndarray:
-        """Returns for each vertex the first one that is in the same place at every time, shape [vertex_count]."""
-        welded_to = _split(_group(self._start), self._start)
+        """Returns for each vertex the first one that has the same position at every time, shape [vertex_count]."""
+        welded_to = split_by_position(group_by_position(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
         owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
@@ -455,85 +430,20 @@ class Segment:
             if progress:
                 progress(done, len(moments))
             reader.read(positions, time, before)
-            groups = _split(groups, positions)
+            groups = split_by_position(groups, positions)
         welded_to[crowded] = crowded[groups]
         return welded_to
 
 
-class _Reader:
-    """Reads positions of some vertices; those of instances of one prim together."""
-
-    def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
-        """Takes for each mesh the number of its points, the rows of its vertices in the result, and their points."""
-        self._dtype = dtype
-        groups: dict[tuple, list] = {}
-        self._single = []
-        for part in parts:
-            (groups.setdefault(part[0].group, []) if part[0].group else self._single).append(part)
-        self._groups = []
-        for members in groups.values():
-            instances = np.array([mesh.index for mesh, *_ in members])
-            rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
-            taken = np.concatenate([place * count + points for place, (_, count, _, points) in enumerate(members)])
-            self._groups.append((members, instances, rows, taken))
-
-    def read(self, positions: np.ndarray, time: float, before: bool) -> None:
-        """Writes the positions at a time, or just before it, to the rows of the meshes.
-
-        Raises:
-            UnreadableError: If a mesh is broken at that time.
-        """
-        singles = list(self._single)
-        for members, instances, rows, taken in self._groups:
-            first, count, *_ = members[0]
-            together = first.read_instances(time, instances, count, before=before)
-            found = None if together is None else together.reshape(-1, 3)[taken]
-            if found is not None and np.isfinite(found).all():
-                positions[rows] = found
-            else:
-                singles += members  # one of them is broken, and says so
-        for mesh, count, rows, points in singles:
-            positions[rows] = mesh.read_positions(
-                time, before=before, used=points, point_count=count, dtype=self._dtype
-            )
-
-
-def _group(positions) -> np.ndarray:
-    """Returns for each position the first one with the same hash, shape [n]."""
-    bits = (positions + positions.dtype.type(0.0)).view(f"u{positions.itemsize}").astype(np.uint64)  # no -0.0
-    hashes = np.zeros(len(positions), dtype=np.uint64)
-    for column in bits.T:
-        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)
-        hashes ^= hashes >> np.uint64(29)
-    _, firsts, numbers = np.unique(hashes, return_index=True, return_inverse=True)
-    return firsts[numbers]
-
-
-def _split(groups, positions) -> np.ndarray:
-    """Splits groups by position: returns for each vertex the first of its group that is in the same place, shape [n].
-
-    Args:
-        groups: The first vertex of each vertex's group, shape [n].
-        positions: Positions of the vertices, shape [n, 3].
-    """
-    (rows,) = np.nonzero((positions != positions[groups]).any(axis=1))
-    if len(rows):
-        keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
-        _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        groups = groups.copy()
-        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 shapes it otherwise
-    return groups
-
-
 def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the indices below a count that are used, ascending, and the place among these of each index."""
+    """Returns the distinct indices, ascending, and the number of each index among these."""
     is_used = np.zeros(count, dtype=bool)
     is_used[indices] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[indices]
 
 
 def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the range that each place of some ranges is in, and all these places."""
+    """Returns the elements of some ranges one after the other: the number of the range of each, and the elements."""
     counts = last - first
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)

@@ -1,23 +1,26 @@
-"""Selects the meshes of a scene that are checked, and the pairs of them."""
+"""Selects the meshes of a scene, and the pairs of them, that are checked."""
 
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
 from .._arguments import checked_choice, checked_flag, checked_strings, given
 
-__all__ = ["PURPOSES", "NamedMesh", "Selection"]
+__all__ = ["PURPOSES", "NamedMesh", "Purpose", "Selection"]
 
-PURPOSES = ("default", "render", "proxy", "guide")
-"""The purposes of prims in USD."""
+Purpose = Literal["default", "render", "proxy", "guide"]
+"""A purpose of prims in USD."""
+
+PURPOSES: tuple[str, ...] = get_args(Purpose)
+"""All purposes."""
 
 
 class NamedMesh(Protocol):
-    """A mesh as patterns see it: the path of its prim, and a name that contains the number of its instance."""
+    """A mesh that patterns are matched with: the path of its prim, and its name with the number of its instance."""
 
     @property
     def path(self) -> str: ...  # noqa: D102
@@ -28,11 +31,11 @@ class NamedMesh(Protocol):
 
 @dataclass(frozen=True)
 class Selection:
-    """Selects the meshes of a scene that are checked, and the pairs of them.
+    """Selects the meshes of a scene, and the pairs of them, that are checked.
 
     Patterns are those of a shell: ``*`` matches any part of a path. A pattern selects the prims that it matches and all
-    below them. It is matched with the paths of meshes, and with the names of meshes that point instancers place, such
-    as ``"/World/Leaves[3]/Leaf"``.
+    prims below them. It is matched with the paths of meshes, and with the names of meshes in instances, for example
+    ``"/World/Leaves[3]/Leaf"``.
 
     Attributes:
         prims: Patterns of the meshes that are checked; all if there is no pattern.
@@ -40,26 +43,26 @@ class Selection:
         self_collisions: Whether a mesh is checked with itself.
         between: Two patterns: only pairs of a mesh of the first and a mesh of the second are checked.
         purposes: Purposes of the meshes that are checked.
-        ignore: Pairs of patterns: pairs of a mesh of the first and a mesh of the second are not checked.
-        ignored_names: Pairs of names of meshes that are not checked with each other, each pair sorted.
-        ignored_inside: Names of a mesh and of another one that it may be inside.
+        ignore: Pairs of patterns: collisions of a mesh of the first and a mesh of the second are only counted.
+        ignored_names: Pairs of names of meshes that are ignored in the same way, each pair sorted.
+        ignored_inside: Pairs of names of a mesh and another one that it may be inside.
 
     Raises:
-        TypeError: If an argument has another type; a string is not a sequence of patterns.
-        ValueError: If a pair has not two entries, or there is no such purpose.
+        TypeError: If an argument has another type; a single string is not a sequence of patterns.
+        ValueError: If a pair does not have two entries, or a purpose is unknown.
     """
 
     prims: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     self_collisions: bool = True
     between: tuple[str, str] | None = None
-    purposes: tuple[str, ...] = ("default", "render")
+    purposes: tuple[Purpose, ...] = ("default", "render")
     ignore: tuple[tuple[str, str], ...] = ()
     ignored_names: frozenset[tuple[str, str]] = frozenset()
     ignored_inside: frozenset[tuple[str, str]] = frozenset()
 
     def __post_init__(self):
-        """Checks the attributes, and makes tuples and sets of them."""
+        """Checks the attributes, and converts them to tuples and sets."""
         checked: dict[str, object] = {}
         for name in ("prims", "exclude", "purposes"):
             checked[name] = checked_strings(getattr(self, name), name)
@@ -75,7 +78,7 @@ class Selection:
             object.__setattr__(self, name, value)
 
     def includes(self, mesh: NamedMesh) -> bool:
-        """Returns whether a mesh is checked at all, whatever its purpose."""
+        """Returns whether the patterns select a mesh, regardless of its purpose."""
         return (
             (not self.prims or any(_matches(mesh, pattern) for pattern in self.prims))
             and not any(_matches(mesh, pattern) for pattern in self.exclude)
@@ -83,7 +86,7 @@ class Selection:
         )
 
     def check_patterns(self, meshes: Sequence[NamedMesh]) -> None:
-        """Checks that every pattern matches one of all meshes.
+        """Checks that every pattern matches a mesh, given all meshes.
 
         Raises:
             ValueError: If a pattern matches none.
@@ -91,14 +94,14 @@ class Selection:
         for name in ("prims", "exclude", "between"):
             for pattern in getattr(self, name) or ():
                 if not any(_matches(mesh, pattern) for mesh in meshes):
-                    raise ValueError(f"{name} {pattern}: there is no such mesh")
+                    raise ValueError(f"{name}: no mesh matches {pattern}")
 
     def unmatched(self, meshes: Sequence[NamedMesh]) -> list[tuple[str, str]]:
-        """Returns the pairs to ignore of which a pattern matches none of all meshes."""
+        """Returns the pairs to ignore with a pattern that matches no mesh, given all meshes."""
         return [pair for pair in self.ignore if not all(any(_matches(m, pattern) for m in meshes) for pattern in pair)]
 
     def ignored_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
-        """Returns which pairs of meshes are to be ignored, with arguments as of :meth:`counted_pairs`."""
+        """Returns whether each pair of meshes is ignored; arguments and result as of :meth:`counted_pairs`."""
         if not (self.ignore or self.ignored_names) or not len(pairs):
             return np.zeros(len(pairs), dtype=bool)
         keys, rows = np.unique(np.sort(pairs, axis=1) @ np.array([len(meshes), 1]), return_inverse=True)
@@ -111,13 +114,13 @@ class Selection:
         )
 
     def may_be_inside(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
-        """Returns for which pairs of an inner and an outer mesh that is ignored; arguments of :meth:`counted_pairs`."""
+        """Returns whether the first mesh of each pair may be inside the second; arguments of :meth:`counted_pairs`."""
         if not self.ignored_inside or not len(pairs):
             return np.zeros(len(pairs), dtype=bool)
         return np.array([(meshes[a].name, meshes[b].name) in self.ignored_inside for a, b in pairs.tolist()])
 
     def counted_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
-        """Returns which pairs of meshes are checked, those to be ignored included.
+        """Returns whether each pair of meshes is checked, or would be if it were not ignored.
 
         Args:
             meshes: The meshes.
@@ -139,7 +142,7 @@ class Selection:
 def _checked_pair(values, name) -> tuple[str, str]:
     pair = checked_strings(values, name)
     if len(pair) != 2:
-        raise ValueError(f"{name} must have two strings a pair, not {given(pair)}")
+        raise ValueError(f"{name} must be pairs of two strings, not {given(pair)}")
     return pair[0], pair[1]
 
 
@@ -150,7 +153,7 @@ def _checked_pairs(values, name) -> tuple[tuple[str, str], ...]:
 
 
 def _matches(mesh, pattern) -> bool:
-    # Paths of prims have no brackets: [12] is the instance 12, and, as in a shell, one of the digits 1 and 2.
+    # Paths of prims contain no brackets: [12] is instance 12 and, as in a shell, one of the digits 1 and 2.
     instances = re.sub(r"\[(\d+)\]", r"[[]\1]", pattern)
     return any(
         fnmatchcase(text, form) or fnmatchcase(text, form.rstrip("/") + "/*")

@@ -4,18 +4,18 @@
 # (OpenUSD's stubs leave out the classes of its modules.)
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .stage import may_jump
+from .samples import may_jump
 
 __all__ = ["MeshPolygons", "Polygons", "ShapePolygons", "is_shape"]
 
 _SHAPES = (UsdGeom.Cube, UsdGeom.Sphere, UsdGeom.Capsule, UsdGeom.Cylinder, UsdGeom.Cone, UsdGeom.Plane)
-_SECTIONS = 32  # of a circle
 _CUBE = [(x, y, z) for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]
 _CUBE_SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
 _SQUARE = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
@@ -26,17 +26,17 @@ class Polygons(Protocol):
 
     @property
     def topology_attributes(self) -> Sequence[Usd.Attribute]:
-        """Those that say which polygons there are."""
+        """The attributes that define the polygons."""
         ...
 
     @property
     def point_attributes(self) -> Sequence[Usd.Attribute]:
-        """Those that say where their points are."""
+        """The attributes that define the positions of their points."""
         ...
 
     @property
     def may_jump(self) -> bool:
-        """Whether points may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`."""
+        """Whether points may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`."""
         ...
 
     def read_points(self, time: Usd.TimeCode) -> Any:
@@ -44,7 +44,7 @@ class Polygons(Protocol):
         ...
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
-        """Returns numbers of corners, the points at the corners and the holes; None each where there are none."""
+        """Returns numbers of corners, the points at the corners and the holes, each None if there are none."""
         ...
 
 
@@ -52,7 +52,7 @@ class MeshPolygons:
     """The polygons of a mesh prim."""
 
     def __init__(self, prim: Usd.Prim):
-        """Finds the attributes."""
+        """Finds the attributes of a prim."""
         mesh = UsdGeom.Mesh(prim)
         self.topology_attributes = (
             mesh.GetFaceVertexCountsAttr(),
@@ -63,7 +63,7 @@ class MeshPolygons:
 
     @property
     def may_jump(self) -> bool:
-        """Whether value clips hold the points. USD joins other samples; a change of their number is an error."""
+        """Whether value clips hold the points. USD interpolates other samples; a change of their number is an error."""
         return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
     def read_points(self, time: Usd.TimeCode) -> Any:
@@ -76,12 +76,22 @@ class MeshPolygons:
 
 
 class ShapePolygons:
-    """A cube, sphere, capsule, cylinder, cone or plane as polygons; the round ones are inscribed polyhedra."""
+    """A cube, sphere, capsule, cylinder, cone or plane as polygons; the round ones are inscribed polyhedra.
+
+    An inscribed circle of n segments has 1 - 2 pi^2 / (3 n^2) of the area, 99.4% for 32 segments.
+    """
 
     topology_attributes = ()
 
-    def __init__(self, prim: Usd.Prim):
-        """Finds the attributes."""
+    def __init__(self, prim: Usd.Prim, segments: int = 32):
+        """Finds the attributes of a prim.
+
+        Args:
+            prim: The prim.
+            segments: Number of edges around a capsule, cylinder or cone. A sphere is an icosahedron whose edges are
+                halved log2(segments / 4) times, rounded.
+        """
+        self._segments = segments
         self._type = prim.GetTypeName()
         names = "size", "radius", "height", "width", "length", "axis"
         self._attributes = {name: attribute for name in names if (attribute := prim.GetAttribute(name))}
@@ -94,14 +104,14 @@ class ShapePolygons:
 
     def read_points(self, time: Usd.TimeCode) -> np.ndarray:
         """Returns the points."""
-        points, _, _ = _unit_shape(self._type)
+        points, _, _ = _unit_shape(self._type, self._segments)
         values = {name: attribute.Get(time) for name, attribute in self._attributes.items()}
         if self._type == "Cube":
             return points * values["size"]
         if self._type == "Sphere":
             return points * values["radius"]
         if self._type == "Plane":
-            # the width is along x, or along z where that is the axis; the length is along y, or z where y is the axis
+            # the width is along x, or along z if x is the axis; the length is along y, or along z if y is the axis
             x, y, _ = (points * [values["width"], values["length"], 0.0]).T
             nothing = np.zeros_like(x)
             placed = {"X": (nothing, y, -x), "Y": (x, nothing, -y), "Z": (x, y, nothing)}
@@ -115,17 +125,17 @@ class ShapePolygons:
 
     def read_topology(self, _time: Usd.TimeCode) -> list[Any]:
         """Returns numbers of corners, the points at the corners and no holes."""
-        _, counts, indices = _unit_shape(self._type)
+        _, counts, indices = _unit_shape(self._type, self._segments)
         return [counts, indices, None]
 
 
 def is_shape(prim: Usd.Prim) -> bool:
-    """Returns whether a prim is one of the shapes that :class:`ShapePolygons` reads."""
+    """Returns whether :class:`ShapePolygons` reads a prim."""
     return any(prim.IsA(shape) for shape in _SHAPES)
 
 
 @functools.cache
-def _unit_shape(type_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _unit_shape(type_name: str, segments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns points, numbers of corners and corners of a shape of radius, height and size 1, its axis along z."""
     from trimesh import creation  # noqa: PLC0415 (slow)
 
@@ -134,12 +144,12 @@ def _unit_shape(type_name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if type_name == "Plane":
         return np.array(_SQUARE), np.full(1, 4), np.arange(4)
     if type_name == "Sphere":
-        mesh = creation.icosphere(subdivisions=3)
+        mesh = creation.icosphere(subdivisions=round(math.log2(segments / 4)))
     elif type_name == "Capsule":
-        mesh = creation.capsule(radius=1.0, height=1.0, count=[_SECTIONS // 2, _SECTIONS])
+        mesh = creation.capsule(radius=1.0, height=1.0, count=[segments // 2, segments])
     elif type_name == "Cylinder":
-        mesh = creation.cylinder(radius=1.0, height=1.0, sections=_SECTIONS)
+        mesh = creation.cylinder(radius=1.0, height=1.0, sections=segments)
     else:
-        mesh = creation.cone(radius=1.0, height=1.0, sections=_SECTIONS)
+        mesh = creation.cone(radius=1.0, height=1.0, sections=segments)
         mesh.apply_translation([0.0, 0.0, -0.5])
     return np.array(mesh.vertices), np.full(len(mesh.faces), 3), mesh.faces.ravel()

@@ -6,7 +6,8 @@
 import numpy as np
 from pxr import Sdf, Usd, UsdSkel, Vt
 
-from .stage import UnreadableError, may_jump, sample_times
+from .samples import may_jump, sample_times
+from .unreadable import UnreadableError
 
 __all__ = ["Skin", "find_bindings"]
 
@@ -15,9 +16,9 @@ class Skin:
     """The deformation of one mesh: blend shapes, then joints.
 
     Attributes:
-        skeleton: The prim in whose space the joints put the points, None if only blend shapes deform the mesh.
+        skeleton: The prim to whose space the joints transform the points, None if only blend shapes deform the mesh.
         times: Time codes at which the animation has a sample.
-        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.stage.may_jump`.
+        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
     """
 
     def __init__(
@@ -27,7 +28,14 @@ class Skin:
         skeleton_query: UsdSkel.SkeletonQuery,
         where: str,
     ):
-        """Finds the animation of a binding; ``where`` is file and prim, for messages."""
+        """Finds the animation of a binding.
+
+        Args:
+            skinning: Query of the mesh, as of :func:`find_bindings`.
+            skeleton: The skeleton.
+            skeleton_query: Its query.
+            where: File and prim, for messages.
+        """
         self._where = where
         self._skinning = skinning
         self._query = skeleton_query
@@ -39,7 +47,7 @@ class Skin:
             inbetweens = filter(None, map(query.GetInbetween, range(query.GetNumSubShapes())))
             if not np.isfinite([shape.GetWeight() or 0.0 for shape in inbetweens]).all():  # OpenUSD skips these
                 raise UnreadableError(f"{where}: the weight of an in-between of its blend shapes is not finite")
-        # The query's own prim is that of the prototype if the skeleton is in an instance.
+        # The prim of the query would be that of the prototype if the skeleton is in an instance.
         self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
         self._broken_joints = _find_broken_joints(skeleton_query) if self.skeleton else []
         self.times = set()
@@ -97,17 +105,17 @@ class Skin:
 
 
 def _find_broken_joints(query: UsdSkel.SkeletonQuery) -> list[str]:
-    """Returns the joints whose bind transforms have no inverse, for which OpenUSD takes an arbitrary large matrix."""
+    """Returns the joints whose bind transforms have no inverse; OpenUSD replaces it by an arbitrary large matrix."""
     joints, transforms = query.GetJointOrder(), query.GetJointWorldBindTransforms()
     return [
         joint
-        for joint, transform in zip(joints, transforms, strict=False)  # numbers that differ break the binding anyway
+        for joint, transform in zip(joints, transforms, strict=False)  # different numbers break the binding anyway
         if transform.GetDeterminant() == 0.0 or not np.isfinite(np.array(transform)).all()
     ]
 
 
 def find_bindings(root: Usd.Prim) -> dict[Sdf.Path, tuple]:
-    """Returns the bindings of the meshes below a ``SkelRoot`` by path: the first three arguments of :class:`Skin`."""
+    """Returns the bindings of the meshes below a ``SkelRoot``, the first three arguments of :class:`Skin`, by path."""
     cache = UsdSkel.Cache()
     schema = UsdSkel.Root(root)
     predicate = Usd.TraverseInstanceProxies()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .stage import UnreadableError
+from .unreadable import UnreadableError
 
 __all__ = ["Strands", "is_strands"]
 
@@ -23,7 +23,7 @@ class Strands:
     """
 
     def __init__(self, prim: Usd.Prim):
-        """Finds the attributes."""
+        """Finds the attributes of a prim."""
         self.has_edges = prim.IsA(UsdGeom.BasisCurves)
         self._id_times: list[float] = []  # of the samples of points whose ids change
         self._schema = schema = UsdGeom.BasisCurves(prim) if self.has_edges else UsdGeom.Points(prim)
@@ -35,7 +35,7 @@ class Strands:
             self.topology_attributes = (schema.GetPointsAttr(), self._ids)
             if self._ids.ValueMightBeTimeVarying():
                 self._id_times = schema.GetPointsAttr().GetTimeSamples()
-        # As the schema has it, the primvar comes before the attribute.
+        # As the schema requires, the primvar precedes the attribute.
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
         self._widths = primvar if primvar and primvar.HasAuthoredValue() else None
         self.width_attribute = self._widths.GetAttr() if self._widths else schema.GetWidthsAttr()
@@ -48,17 +48,17 @@ class Strands:
     def read_points(self, time: Usd.TimeCode) -> Any:
         """Returns the points.
 
-        Between two samples with different ids, points that have the same id in both move straight, where USD would hold
-        all of them if their number changes; the others stay in place.
+        Between two samples with different ids, points with the same id in both move straight; the others stay in place.
+        (USD would hold all of them if their number changes.)
         """
         held = self.point_attributes[0].Get(time)
         if not self._id_times:
             return held
         earlier = bisect.bisect_left if time.IsPreTime() else bisect.bisect_right
-        place = earlier(self._id_times, time.GetValue())
-        if not 0 < place < len(self._id_times):
+        following = earlier(self._id_times, time.GetValue())
+        if not 0 < following < len(self._id_times):
             return held
-        first, last = self._id_times[place - 1 : place + 1]
+        first, last = self._id_times[following - 1 : following + 1]
         ids, next_ids = (np.array(self._ids.Get(sample) or ()) for sample in (first, last))
         points, next_points = (np.array(self.point_attributes[0].Get(sample) or ()) for sample in (first, last))
         if np.array_equal(ids, next_ids) or len(ids) != len(points) or len(next_ids) != len(next_points):
@@ -69,7 +69,7 @@ class Strands:
         return points
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
-        """Returns the numbers of points of the curves; of points, their number and their ids, which tell them apart."""
+        """Returns the numbers of points of the curves; for points, their number, and the ids that distinguish them."""
         if self.has_edges:
             return [self.topology_attributes[0].Get(time), None, None]
         points = self.read_points(time)
@@ -91,7 +91,7 @@ class Strands:
             The points at both ends of each edge, shape [n, 2], and curves, shape [point_count].
 
         Raises:
-            UnreadableError: If the numbers do not fit.
+            UnreadableError: If the numbers do not add up to the number of points, or one is less than 2.
         """
         if not self.has_edges:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1)
@@ -119,8 +119,8 @@ class Strands:
             where: File and prim, for messages.
 
         Raises:
-            UnreadableError: If there is another number of widths than their interpolation has, or one is negative or
-                not finite.
+            UnreadableError: If the number of widths is not that of their interpolation, or one is negative or not
+                finite.
         """
         value = self._widths.ComputeFlattened(time) if self._widths else self.width_attribute.Get(time)
         if value is None or len(value) == 0:
@@ -128,20 +128,20 @@ class Strands:
         widths = np.array(value, dtype=np.float64)
         interpolation = self._widths.GetInterpolation() if self._widths else self._schema.GetWidthsInterpolation()
         if interpolation == UsdGeom.Tokens.constant:
-            wanted, places = 1, np.zeros(len(curves), dtype=np.int64)
+            count, rows = 1, np.zeros(len(curves), dtype=np.int64)
         elif interpolation == UsdGeom.Tokens.uniform and self.has_edges:
-            wanted, places = int(curves.max(initial=-1)) + 1, curves
+            count, rows = int(curves.max(initial=-1)) + 1, curves
         else:  # varying and vertex values are at the same points of linear curves
-            wanted, places = len(curves), np.arange(len(curves))
-        if widths.shape != (wanted,):
-            raise UnreadableError(f"{where}: {len(widths)} widths of interpolation {interpolation}, which has {wanted}")
+            count, rows = len(curves), np.arange(len(curves))
+        if widths.shape != (count,):
+            raise UnreadableError(f"{where}: {len(widths)} widths of interpolation {interpolation}, which has {count}")
         if not (np.isfinite(widths) & (widths >= 0.0)).all():
             raise UnreadableError(f"{where}: widths must be finite and at least 0")
-        return widths[places]
+        return widths[rows]
 
 
 def is_strands(prim: Usd.Prim) -> bool:
-    """Returns whether a prim is what :class:`Strands` reads."""
+    """Returns whether :class:`Strands` reads a prim."""
     if prim.IsA(UsdGeom.BasisCurves):
         return UsdGeom.BasisCurves(prim).GetTypeAttr().Get() == UsdGeom.Tokens.linear
     return prim.IsA(UsdGeom.Points)

@@ -14,7 +14,7 @@ def triangulate(counts: np.ndarray, indices: np.ndarray, points: np.ndarray) -> 
         points: Positions, shape [point_count, 3].
 
     Returns:
-        The points at the corners of each triangle, shape [triangle_count, 3], and the polygon that it was cut from,
+        The points at the corners of each triangle, shape [triangle_count, 3], and the polygon that it is a part of,
         shape [triangle_count], ascending.
     """
     starts = np.cumsum(counts) - counts
@@ -25,13 +25,13 @@ def triangulate(counts: np.ndarray, indices: np.ndarray, points: np.ndarray) -> 
         fan = np.stack([np.zeros(size - 2, int), np.arange(1, size - 1), np.arange(2, size)], axis=1)
         cut = corners[:, fan]  # (members, size - 2, 3)
         if size > 3:
-            places = points[corners].astype(np.float64)
-            edges = np.roll(places, -1, axis=1) - places
+            positions = points[corners].astype(np.float64)
+            edges = np.roll(positions, -1, axis=1) - positions
             turns = np.cross(np.roll(edges, 1, axis=1), edges)
-            normals = np.cross(places - places[:, :1], edges).sum(axis=1)
+            normals = np.cross(positions - positions[:, :1], edges).sum(axis=1)
             (concave,) = np.nonzero((turns @ normals[:, :, None] < 0).any(axis=(1, 2)))
             for member in concave:
-                cut[member] = corners[member][_clip_ears(places[member], normals[member])]
+                cut[member] = corners[member][_clip_ears(positions[member], normals[member])]
         triangles.append(cut.reshape(-1, 3))
         polygons.append(np.repeat(members, size - 2))
     polygons = np.concatenate(polygons)
@@ -60,7 +60,7 @@ def _clip_ears(corners, normal) -> list[tuple[int, int, int]]:
     triangles, left = [], list(range(len(corners)))
     at = 0
     while len(left) > 2:
-        # The search goes on from the last ear, so that the triangles of a large polygon do not all meet in one corner.
+        # The search continues from the last ear, so that the triangles of a large polygon do not all share a corner.
         turns = (number % len(left) for number in range(at, at + len(left)))
         ear = next(filter(is_ear, turns), 1)  # a polygon that crosses itself may have no ear
         triangles.append((left[ear - 1], left[ear], left[(ear + 1) % len(left)]))

@@ -1,23 +1,35 @@
 """Continuous collision detection by a floating-point cubic solver, the paper's baseline "El-Topo-float".
 
-Written from the papers: Provot 1997, "Collision and self-collision handling in cloth model dedicated to design
-garments"; Bridson, Fedkiw and Anderson 2002, "Robust treatment of collisions, contact and friction for cloth
-animation" (7.1 and 7.2); Brochu and Bridson 2009, "Robust topological operations for dynamic explicit surfaces". What
-they have in common:
+Written from the papers below: Provot 1997; Bridson et al. 2002 (Sec. 7.1 and 7.2); Brochu and Bridson 2009. They have
+in common:
 
 - the four points are coplanar at the roots of a cubic, here with its coefficients in the power basis;
-- its extrema, by the quadratic formula, cut the step into monotone intervals, and a change of sign across one of these
-  says that it has one root, which Newton's method finds, kept in place by bisection;
+- its extrema, by the quadratic formula, cut the step into monotone intervals; a change of sign across one of these
+  shows that it has one root, which Newton's method finds, with bisection as a safeguard;
 - an end of an interval at which the cubic is zero to within a tolerance counts as a root too. So do both ends of the
-  step where all of the cubic is: what stays in one plane is tested there and nowhere between;
+  step where the whole cubic is: motion in one plane is tested there and nowhere between;
 - at each root, earliest first, the closest points of the two features are found. Closer than a tolerance, they collide.
 
-On the 2,324 hand-made queries of Wang et al. 2021 that the tests read, of which 308 collide, it has 88 false positives
-and 2 false negatives, where El Topo has 242 and 2. It takes about 100 ns a query there on one core, where El Topo took
-330 to 357 ns on a larger set that they are part of: nobody is made to look slow here.
+On the 2,324 hand-made queries of Wang et al. 2021 that the tests read (308 collide), it has 88 false positives and 2
+false negatives, where El Topo has 242 and 2. It takes about 100 ns a query on one core, where El Topo took 330 to 357
+ns on a larger set that contains them: the baseline is not slower than the original.
 
-All is in double precision, as it is there. Queries that need no root are out early: by the same boxes as in
+All arithmetic is in double precision, as in the original. Queries without a root end early: by the same boxes as in
 :mod:`warp_bsc.kernels.ccd`, and by the signs at the ends of monotone intervals.
+
+References:
+    Xavier Provot. "Collision and Self-Collision Handling in Cloth Model Dedicated to Design Garments." Computer
+    Animation and Simulation (1997). https://doi.org/10.1007/978-3-7091-6874-5_13.
+
+    Robert Bridson, Ronald Fedkiw, and John Anderson. "Robust Treatment of Collisions, Contact and Friction for Cloth
+    Animation." ACM Transactions on Graphics 21, 3 (2002). https://doi.org/10.1145/566654.566623.
+
+    Tyson Brochu and Robert Bridson. "Robust Topological Operations for Dynamic Explicit Surfaces." SIAM Journal on
+    Scientific Computing 31, 4 (2009). https://doi.org/10.1137/080737617.
+
+    Bolun Wang, Zachary Ferguson, Teseo Schneider, Xin Jiang, Marco Attene, and Daniele Panozzo. "A Large-Scale
+    Benchmark and an Inclusion-Based Algorithm for Continuous Collision Detection." ACM Transactions on Graphics 40, 5
+    (2021). https://doi.org/10.1145/3460775.
 """
 
 from typing import Any
@@ -30,9 +42,9 @@ from ...kernels.signs import FREE, HIT
 __all__ = ["COPLANAR", "DISTANCE", "cubic_solver_edge_edge", "cubic_solver_vertex_face"]
 
 COPLANAR = wp.constant(wp.float64(1.0e-9))
-"""Zero for the cubic, as a share of the sum of its coefficients' absolute values."""
+"""Largest value of the cubic that counts as zero, as a share of the sum of its coefficients' absolute values."""
 DISTANCE = wp.constant(wp.float64(1.0e-6))
-"""Distance at which features collide, in the unit of length that the coordinates have: a micrometre, in metres."""
+"""Distance at which features collide, in the unit of the coordinates: a micrometre, if that is a metre."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -45,7 +57,7 @@ _NEWTON_END = wp.constant(wp.float64(1.0e-10))
 
 @wp.struct
 class Relative:
-    """The differences of the four points at the start, and by how much they change over the step.
+    """The differences of the four points at the start, and their changes over the step.
 
     Vertex p, triangle a b c: u = b - a, v = c - a, w = p - a. Edges a b and c d: u = b - a, v = d - c, w = c - a.
     """
@@ -96,7 +108,7 @@ def _value(c: wp.vec4d, t: wp.float64) -> wp.float64:
 
 @wp.func
 def _extrema(c: wp.vec4d) -> wp.vec2d:
-    """Where in [0, 1] the cubic turns, in order; 1 in place of what is not there.
+    """Returns the extrema of the cubic in [0, 1] in order; 1 for one that does not exist.
 
     The roots of 3 c3 t^2 + 2 c2 t + c1 without cancellation: one as a quotient, the other by the product of both.
     """
@@ -114,7 +126,7 @@ def _extrema(c: wp.vec4d) -> wp.vec2d:
 
 @wp.func
 def _root(c: wp.vec4d, start: wp.float64, end: wp.float64, at_start: wp.float64, at_end: wp.float64) -> wp.float64:
-    """The root in an interval in which the cubic is monotone and changes sign: Newton's method from the secant's."""
+    """Returns the root in an interval where the cubic is monotone and changes sign, by Newton's method."""
     low = start
     high = end
     t = start + (end - start) * (at_start / (at_start - at_end))
@@ -137,7 +149,7 @@ def _root(c: wp.vec4d, start: wp.float64, end: wp.float64, at_start: wp.float64,
 
 @wp.func
 def _to_segment(w: wp.vec3d, u: wp.vec3d) -> wp.float64:
-    """Squared distance of a point w from the segment from the origin to u."""
+    """Returns the squared distance of a point w from the segment from the origin to u."""
     uu = wp.dot(u, u)
     s = _ZERO
     if uu > _ZERO:
@@ -147,7 +159,7 @@ def _to_segment(w: wp.vec3d, u: wp.vec3d) -> wp.float64:
 
 @wp.func
 def _vertex_face_close(r: Relative, t: wp.float64) -> bool:
-    """Whether the vertex is close to the triangle at a time."""
+    """Returns whether the vertex is close to the triangle at a time."""
     u = r.u + t * r.du
     v = r.v + t * r.dv
     w = r.w + t * r.dw
@@ -167,7 +179,7 @@ def _vertex_face_close(r: Relative, t: wp.float64) -> bool:
 
 @wp.func
 def _edge_edge_close(r: Relative, t: wp.float64) -> bool:
-    """Whether the edges are close to each other at a time."""
+    """Returns whether the edges are close to each other at a time."""
     u = r.u + t * r.du
     v = r.v + t * r.dv
     w = r.w + t * r.dw
@@ -224,7 +236,7 @@ def _solve(vertex_face: bool, r: Relative) -> int:
 
 @wp.func
 def cubic_solver_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: Any, c1: Any) -> int:
-    """Whether a moving vertex p comes close to a moving triangle a b c at a root of the cubic: FREE or HIT.
+    """Returns whether a moving vertex p comes close to a moving triangle a b c at a root of the cubic: FREE or HIT.
 
     Points are ``vec3`` or ``vec3d``, finite, at the start (0) and at the end (1) of the step.
     """
@@ -242,7 +254,7 @@ def cubic_solver_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: An
 
 @wp.func
 def cubic_solver_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> int:
-    """Whether a moving edge a b comes close to a moving edge c d at a root of the cubic: FREE or HIT.
+    """Returns whether a moving edge a b comes close to a moving edge c d at a root of the cubic: FREE or HIT.
 
     Points are ``vec3`` or ``vec3d``, finite, at the start (0) and at the end (1) of the step.
     """

@@ -1,6 +1,6 @@
 """Bernstein sign classification with the paper's own inside tests, reduced to degree two by elimination (paper, 3.5).
 
-A test m . n >= 0, of degree four in t, loses two degrees by multiples of the coplanarity cubic Y: t^2 P = k0^2 m . n
+Multiples of the coplanarity cubic Y reduce a test m . n >= 0, of degree four in t, by two degrees: t^2 P = k0^2 m . n
 modulo Y (supplement, 1, equations 18 to 23). P is of degree ten in the coordinates, and identically zero where k0 is.
 
 Everything else, classes of curves, root counts and signs at roots, is :mod:`warp_bsc.kernels.classification`, so that
@@ -23,7 +23,7 @@ _TWO = wp.constant(wp.float64(2.0))
 
 @wp.func
 def _reduce(k: wp.vec4d, l0: wp.float64, l1: wp.float64, l2: wp.float64, l3: wp.float64, l4: wp.float64) -> wp.vec3d:
-    """P from Y and a quartic with Bernstein coefficients l (supplement 1, equations 20 and 23)."""
+    """Returns P from Y and a quartic with Bernstein coefficients l (supplement 1, equations 20 and 23)."""
     s0 = _FOUR * l1 * k[0] - l0 * (k[0] + _THREE * k[1])
     s1 = _TWO * l2 * k[0] - l0 * (k[1] + k[2])
     s2 = (_FOUR * l3 * k[0] - l0 * (_THREE * k[2] + k[3])) / _THREE
@@ -37,7 +37,7 @@ def _reduce(k: wp.vec4d, l0: wp.float64, l1: wp.float64, l2: wp.float64, l3: wp.
 
 @wp.func
 def _reduced_test(y: Coplanarity, sign: wp.float64, x0: wp.vec3d, x1: wp.vec3d, y0: wp.vec3d, y1: wp.vec3d) -> wp.vec3d:
-    """P of the test sign (x cross y) . n >= 0 (paper, inequality 12 and supplement 1)."""
+    """Returns P of the test sign (x cross y) . n >= 0 (paper, inequality 12 and supplement 1)."""
     m0 = sign * wp.cross(x0, y0)
     mh = sign * cross_middle(x0, x1, y0, y1)
     m1 = sign * wp.cross(x1, y1)
@@ -53,9 +53,9 @@ def _reduced_test(y: Coplanarity, sign: wp.float64, x0: wp.vec3d, x1: wp.vec3d, 
 
 @wp.func
 def reduced_inside_tests(motion: Motion, y: Coplanarity) -> InsideTests:
-    """The paper's inside tests, as quadratics none of which may be negative at contact, without error bounds.
+    """Returns the paper's inside tests, quadratics that are not negative at contact, without error bounds.
 
-    Vertex-face: three (paper, inequality 12), and a constant in the place of the fourth. Edge-edge: four, with n = u x
+    Vertex-face: three (paper, inequality 12), and a constant for the fourth. Edge-edge: four, with n = u x
     v, because the three of the supplement (3) say nothing of one end of the second edge.
     """
     tests = InsideTests()

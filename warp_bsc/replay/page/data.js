@@ -1,9 +1,9 @@
-// The data of the page: of the whole replay, as JSON, and blocks of arrays, unpacked when they are asked for.
+// The data of the page: JSON for the whole replay, and blocks of arrays, which are unpacked when they are shown.
 "use strict";
 
 const data = JSON.parse(document.getElementById("data").textContent);
-const KINDS = ["vertex-face", "edge-edge", "vertex-edge", "vertex-vertex", "edge through face", "edge touches face", "inside", "near"];
-const AT_REST = 4, INSIDE = 6, NEAR = 7; // AT_REST is the first kind that is not of collisions
+const KINDS = ["vertex-face", "edge-edge", "vertex-edge", "vertex-vertex", "edge through face", "edge touches face", "inside", "proximity"];
+const AT_REST = 4, INSIDE = 6, PROXIMITY = 7; // AT_REST is the first kind that is not of collisions
 const ELEMENTS = ["vertex", "face", "edge", "diagonal"];
 
 // Returns the facts and the arrays of a block, or null if the page has no such block.
@@ -37,23 +37,23 @@ async function loadRows() {
   const total = data.rows.reduce((sum, counts) => sum + counts[0] + counts[1] + counts[2], 0);
   const rows = {
     count: total,
-    interval: new Int32Array(total), // of what is at a time, the interval that starts then; the last one at its end
+    interval: new Int32Array(total), // for rows at a time: the interval that starts then, or the last interval at its end
     place: new Int32Array(total), // in its block
     kind: new Uint8Array(total),
     elements: new Uint8Array(total),
     time: new Float64Array(total),
-    toi: new Float32Array(total), // of what is at a time, 0 or 1
+    toi: new Float32Array(total), // 0 or 1 for rows at a time
     distance: new Float32Array(total), // of proximities
     phase: new Int8Array(total).fill(-1),
     separate: new Int8Array(total).fill(-1),
   };
   const numbers = ["first", "second", "first_0", "first_1", "second_0", "second_1"];
   for (const key of numbers) rows[key] = new Int32Array(total);
-  const wanted = data.rows.flatMap((counts, index) => ["hits", "rest", "near"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
+  const names = data.rows.flatMap((counts, index) => ["hits", "rest", "near"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
   let at = 0;
   const together = 64; // blocks that are unpacked at the same time
-  for (let first = 0; first < wanted.length; first += together) {
-    const some = wanted.slice(first, first + together);
+  for (let first = 0; first < names.length; first += together) {
+    const some = names.slice(first, first + together);
     const blocks = await Promise.all(some.map(({ name, index }) => unpack(`${name}-${index}`)));
     for (const [which, block] of blocks.entries()) {
       const { name, index } = some[which], isRest = name !== "hits";

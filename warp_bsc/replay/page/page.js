@@ -1,11 +1,11 @@
-// Fills in the page from the data in it, and ties its parts together. Text goes in as text, never as markup.
+// Fills in the page from its data, and connects its parts. Text is inserted as text, never as markup.
 "use strict";
 
 const SVG = "http://www.w3.org/2000/svg";
 const byId = (id) => document.getElementById(id);
 const count = (number) => number.toLocaleString("en");
 const short = (number) => String(Number(number.toPrecision(Math.abs(number) < 1e4 ? 6 : 9)));
-const plural = (number, one) => `${count(number)} ${one}${number === 1 ? "" : "s"}`;
+const plural = (number, one, many = `${one}s`) => `${count(number)} ${number === 1 ? one : many}`;
 
 function add(parent, name, attributes = {}, text = null) {
   const svg = name === "svg" || parent.namespaceURI === SVG;
@@ -96,7 +96,7 @@ function addBars(parent, bars, classes, width, xLabel, height = 230, least = 46)
 }
 
 
-// --- The state: the interval in the view, and what the table is filtered by. The address has it after the #. ---
+// --- The state: the interval in the view, and the filters of the table. The address contains it after the #. ---
 
 const state = { interval: -1, prims: [], text: "", kind: "", only: false };
 const LAST = data.intervals.length - 1;
@@ -158,7 +158,7 @@ function fillIntervals() {
   addKey(byId("intervals-legend"), { class: "first" }, "vertex-face");
   addKey(byId("intervals-legend"), { class: "second" }, data.intervals[0].length > 4 ? "edge-edge, vertex-edge, vertex-vertex" : "edge-edge");
   if (data.rest.length) addKey(byId("intervals-legend"), { class: "third" }, "edges in faces and parts inside, at rest");
-  if (data.near.length) addKey(byId("intervals-legend"), { class: "fourth" }, "near pairs, at rest");
+  if (data.near.length) addKey(byId("intervals-legend"), { class: "fourth" }, "proximities, at rest");
   const width = Math.max(340, Math.min(1100, byId("intervals").clientWidth || 1100));
   const together = Math.ceil(data.intervals.length / (width / 2.5));
   const bars = [], restBars = [], nearBars = [];
@@ -175,7 +175,7 @@ function fillIntervals() {
     if (rest.length && most(2)) tip += `, ${count(most(2))} touch`;
     if (rest.length && most(3)) tip += `\n${plural(most(3), "part")} inside`;
     const near = data.near.slice(at, at + together).reduce((largest, sample) => Math.max(largest, sample[1]), 0);
-    if (near) tip += `\n${together > 1 ? "at most " : ""}${plural(near, "near pair")}`;
+    if (near) tip += `\n${together > 1 ? "at most " : ""}${plural(near, "proximity", "proximities")}`;
     const click = () => {
       let best = at;
       for (let index = at; index < at + some.length; index += 1)
@@ -206,7 +206,7 @@ function markInterval() {
 function addPrim(parent, mesh) {
   const { name } = data.meshes[mesh];
   const link = add(parent, "a", { href: addressOf(-1, [name]), title: `Only ${name}`, class: "prim" });
-  // The end of a long path says most: it stays in sight.
+  // The end of a long path stays visible, as it identifies the prim best.
   add(link, "bdi", {}, name);
   return link;
 }
@@ -227,12 +227,12 @@ function fillTable() {
     { title: "Time", number: true, class: "narrow", key: (row) => rows.time[row], fill: (cell, row) => { cell.textContent = short(rows.time[row]); } },
     { title: "Kind", class: "kind", key: (row) => rows.kind[row], fill: (cell, row) => {
       const kind = rows.kind[row];
-      addKey(cell, { class: kind === NEAR ? "fourth" : kind >= AT_REST ? "third" : kind ? "second" : "first" }, KINDS[kind]);
+      addKey(cell, { class: kind === PROXIMITY ? "fourth" : kind >= AT_REST ? "third" : kind ? "second" : "first" }, KINDS[kind]);
     } },
     side("First", "first", false),
     side("Second", "second", true),
-    { title: data.near.length ? "Surfaces, distance" : "Surfaces", class: "wide-only narrow", key: (row) => (rows.kind[row] === NEAR ? 100 + rows.distance[row] : rows.phase[row] * 2 + rows.separate[row]), fill: (cell, row) => {
-      if (rows.kind[row] === NEAR) cell.textContent = `${short(Number(rows.distance[row].toPrecision(6)))} apart`;
+    { title: data.near.length ? "Surfaces, distance" : "Surfaces", class: "wide-only narrow", key: (row) => (rows.kind[row] === PROXIMITY ? 100 + rows.distance[row] : rows.phase[row] * 2 + rows.separate[row]), fill: (cell, row) => {
+      if (rows.kind[row] === PROXIMITY) cell.textContent = `${short(Number(rows.distance[row].toPrecision(6)))} apart`;
       if (rows.phase[row] >= 0) cell.textContent = PHASES[rows.phase[row]] + (rows.separate[row] === 1 ? ", separate before" : "");
     } },
   ];
@@ -243,7 +243,7 @@ function fillTable() {
 // Shows the interval of a row, with the row's place in the middle.
 function showRow(row) {
   const kind = rows.kind[row];
-  showInterval(rows.interval[row], { from: kind === NEAR ? "near" : kind >= AT_REST ? "rest" : "hits", place: rows.place[row], time: rows.toi[row] });
+  showInterval(rows.interval[row], { from: kind === PROXIMITY ? "near" : kind >= AT_REST ? "rest" : "hits", place: rows.place[row], time: rows.toi[row] });
   const name = (isSecond) => `${data.meshes[rows[isSecond ? "second" : "first"][row]].name} ${elementText(rows, row, isSecond)}`;
   byId("selected").hidden = false;
   byId("selected").textContent = `${KINDS[rows.kind[row]]} at time ${short(rows.time[row])}: ${name(false)} and ${name(true)}`;
@@ -258,13 +258,13 @@ function filterRows() {
   if (!table) return;
   const words = state.text.toLowerCase().split(/\s+/).filter(Boolean);
   const names = data.meshes.map(({ name }) => name.toLowerCase());
-  const wanted = state.prims.map((name) => data.meshes.findIndex((mesh) => mesh.name === name));
+  const selected = state.prims.map((name) => data.meshes.findIndex((mesh) => mesh.name === name));
   const found = [];
   for (let row = 0; row < rows.count; row += 1) {
     const [first, second] = [rows.first[row], rows.second[row]];
     if (state.kind !== "" && rows.kind[row] !== Number(state.kind)) continue;
     if (state.only && rows.interval[row] !== state.interval) continue;
-    if (wanted.length && !((wanted.length < 2 && second === wanted[0]) || (first === wanted[0] && (wanted.length < 2 || second === wanted[1])) || (wanted.length > 1 && first === wanted[1] && second === wanted[0]))) continue;
+    if (selected.length && !((selected.length < 2 && second === selected[0]) || (first === selected[0] && (selected.length < 2 || second === selected[1])) || (selected.length > 1 && first === selected[1] && second === selected[0]))) continue;
     if (words.length) {
       const text = `${names[first]} ${elementText(rows, row, false)} ${names[second]} ${elementText(rows, row, true)}`;
       if (!words.every((word) => text.includes(word))) continue;
@@ -300,7 +300,7 @@ function fillPairs() {
       fillSpans(cell, rest.map(([since, until, most, trend, inner]) => `${range(since, until)}: ${what(most, inner)}, ${trend}`), more_rest);
     } },
   ];
-  if (data.near.length) columns.push({ title: "Near at rest", key: (row) => pairs[row].near.reduce((least, span) => Math.min(least, span[2]), Infinity), fill: (cell, row) => {
+  if (data.near.length) columns.push({ title: "Proximities at rest", key: (row) => pairs[row].near.reduce((smallest, span) => Math.min(smallest, span[2]), Infinity), fill: (cell, row) => {
     const { near, more_near } = pairs[row];
     fillSpans(cell, near.map(([since, until, distance]) => `${range(since, until)}: ${short(Number(distance.toPrecision(6)))}`), more_near);
   } });

@@ -1,8 +1,8 @@
-// A table of any number of rows, of which only those in sight are in the document.
+// A table of any number of rows; the document contains only the visible ones.
 "use strict";
 
 class LongTable {
-  // columns: {title, width, number, fill(cell, row), key(row)}; key gives a number or a text to sort by.
+  // columns: {title, width, number, fill(cell, row), key(row)}; key returns a number or a text to sort by.
   constructor(parent, columns, rowHeight, select) {
     Object.assign(this, { parent, columns, rowHeight, select, rows: [], sorted: null, selected: -1, drawn: null });
     const table = add(parent, "table");
@@ -55,7 +55,7 @@ class LongTable {
     this.rows = this.rows.slice().sort((a, b) => way * compare(keys.get(a), keys.get(b)) || a - b);
   }
 
-  // Selects the row at a place, and brings it into sight.
+  // Selects the row at an index, and scrolls to it.
   choose(at) {
     this.selected = this.rows[at];
     const top = at * this.rowHeight, seen = this.parent.clientHeight - 2 * this.rowHeight;
@@ -68,7 +68,7 @@ class LongTable {
   draw() {
     const { parent, rows, rowHeight } = this;
     const top = Math.floor(parent.scrollTop / rowHeight), seen = Math.ceil(parent.clientHeight / rowHeight);
-    // Rows that are in the document stay there while they are in sight: a click needs its row when it ends, too.
+    // Visible rows stay in the document: a click needs its row until it ends.
     const { drawn } = this;
     if (drawn && drawn.rows === rows && drawn.selected === this.selected && drawn.first <= Math.max(0, top - 1) && drawn.last >= Math.min(rows.length, top + seen + 1)) return;
     const first = Math.max(0, top - 20), last = Math.min(rows.length, top + seen + 20);

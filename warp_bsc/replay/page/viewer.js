@@ -112,7 +112,7 @@ function program(gl, vertex, fragment) {
   return made;
 }
 
-// Attributes: [name, values, width], and for one value an instance also [stride, offset] in bytes.
+// Attributes: [name, values, width], followed by stride and offset in bytes for values by instance.
 function vertexArray(gl, made, attributes, indices) {
   const array = gl.createVertexArray(), buffers = [];
   const fill = (target, values) => {
@@ -172,7 +172,7 @@ async function loadView(index) {
   };
 }
 
-// Makes the view and its controls. Returns how to show an interval, and how to turn the view.
+// Makes the view and its controls. Returns functions that show an interval and turn the view.
 function makeViewer() {
   const message = byId("viewer-message");
   const say = (text) => { message.textContent = text; message.hidden = !text; };
@@ -209,7 +209,7 @@ function makeViewer() {
     if (!gl) return;
     if (isNew) {
       const shown = await loadView(index);
-      if (state.index !== index) return; // another one was asked for meanwhile
+      if (state.index !== index) return; // another one was selected meanwhile
       fill(shown, index);
     }
     if (!state.shown) return;
@@ -228,7 +228,7 @@ function makeViewer() {
     const atEnds = (numberAt, one, how) => { title += `; ${plural(numberAt(index), one)} ${how} at the start, ${count(numberAt(index + 1))} at the end`; };
     if (data.rest.length) atEnds(edgesAt, "edge", "in faces");
     if (insideAt(index) + insideAt(index + 1)) atEnds(insideAt, "part", "inside");
-    if (data.near.length) atEnds(nearAt, "pair", "near");
+    if (data.near.length) atEnds(nearAt, "pair", "within the clearance");
     const isEmpty = !shown;
     byId("viewer-title").textContent = title;
     byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
@@ -260,8 +260,8 @@ function makeViewer() {
     shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
     if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
     if (shown.through.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "curve through a face");
-    if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "near pair");
-    // Marks of what is at the start, and at the end.
+    if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "proximity");
+    // Markers of intersections and proximities at the start, and at the end.
     shown.marks = shown.inside.map((inside, end) => {
       const at = [...inside, ...shown.through[end]], places = new Float32Array([...at, ...shown.close[end]]);
       const markColors = new Float32Array(places.length);
@@ -291,7 +291,7 @@ function makeViewer() {
     }
   }
 
-  // Marks the place of a row, and moves the view to it.
+  // Marks the position of a row, and moves the view to it.
   function choose({ from, place, time }) {
     const { contacts, rest, close } = state.shown;
     const places = from === "hits" ? contacts : (from === "rest" ? rest : close)[Math.round(time)];
@@ -363,9 +363,9 @@ function makeViewer() {
     gl.bindVertexArray(shown.dust.array);
     gl.drawElements(gl.POINTS, shown.alone.length, gl.UNSIGNED_INT, 0);
     gl.depthMask(false);
-    // What is behind a surface shines through it faintly. Cut curves belong to one end of the interval.
+    // Contacts behind a surface are drawn faintly over it. Cut curves belong to one end of the interval.
     const end = state.time < 0.5 ? 0 : 1;
-    // Many contacts would hide one another, and all else.
+    // Large markers of many contacts would hide one another and the surfaces.
     const marks = shown.marks[end], dots = shown.toi.length + marks.count;
     const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
     for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {

@@ -226,7 +226,8 @@ def restore_positions(step: RestoredStep, gradients: Gradients, sums: wp.array[w
         _step_back(step.cursor)
     gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
     gradients.more_x1[vertex] = wp.vec3()
-    move_vertex(step.motion, step.vertices, vertex)
+    if step.vertices.active[vertex] != 0:
+        move_vertex(step.motion, step.vertices, vertex)
 
 
 @wp.kernel

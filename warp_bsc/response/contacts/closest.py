@@ -1,4 +1,4 @@
-"""Closest points of two elements at the start of a step."""
+"""Closest points of two elements."""
 
 import warp as wp
 

@@ -50,13 +50,7 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 @wp.kernel(enable_backward=False)
 def count_crossings(
-    # in
-    motion: Motion,
-    mesh: Connectivity,
-    pairs: wp.array[wp.vec2i],
-    counts: wp.array[wp.int64],
-    # out
-    count: wp.array[int],
+    motion: Motion, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()

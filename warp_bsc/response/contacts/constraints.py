@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
 from ..state.structs import Constraints, ContactKind, Motion, Pace, Vertices
@@ -51,12 +51,7 @@ def kind_of_pair(kind: int) -> int:
 
 @wp.func
 def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector from the second contact point to the first.
-
-    Args:
-        kind: The kind of pair.
-        c: The coordinates of the contact.
-    """
+    """Returns the weights of four vertices in the vector between contact points, by kind and coordinates of a pair."""
     if kind == EDGE_EDGE:
         return wp.vec4d(ONE - c[0], c[0], c[1] - ONE, -c[1])
     if kind == VERTEX_EDGE:
@@ -142,14 +137,10 @@ def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
 def feasible(
     motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
 ) -> wp.float64:
-    """Returns the separation of slow elements: hardly more than at the start, so that standing still nearly meets it.
+    """Returns the separation of slow elements [m]: hardly more than at the start, as standing still should nearly do.
 
-    Args:
-        motion: The motion.
-        corners: The vertices of both elements.
-        target: The separation of fast elements, which is the most [m].
-        start: Distance at the start, beyond the minimum distance [m].
-        separation: Distance that projection moves contacts apart [m].
+    Fast elements get ``target``, which is the most; ``start`` is the distance at the start. Both, like the result, are
+    without minimum distances.
     """
     path = longest_path(motion, corners)
     before = start
@@ -194,7 +185,7 @@ def approach_of(
 @wp.func
 def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constraints: Constraints):
     """Adds a constraint if it fits; counts it in any case."""
-    i = take_place(constraints.count)
+    i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = added.vertices
         constraints.weights[i] = added.weights

@@ -35,9 +35,7 @@ def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
 def detect(work: Workspace, *, only_changed: bool = False) -> None:
     """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again.
 
-    Args:
-        work: The workspace of the step.
-        only_changed: Whether only vertices that changed since the last detection are looked at.
+    With ``only_changed``, only vertices that changed since the last detection are looked at.
     """
     detector, motion, vertices = work.detector, work.motion.vertices, work.vertices
     changed = vertices.changed if only_changed else None
@@ -58,9 +56,7 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
         work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
         work.launch_over(count_grazing, counted(queues[:2]), [motion, vertices, mesh, *queues[:2], work.record])
-    if work.max_penetrations:
-        detect_penetrations(work, ahead=False)
-    work.launch(decide, 1, [work.constraints, *overflow], [work.status])
+    _decide(work, overflow)
     if can_search:
         wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
 
@@ -69,8 +65,13 @@ def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase, motion = work.detector.broad_phase, work.motion.vertices
     broad_phase.fit(motion.x0, work.vertices.x1)
-    arguments = work.connectivity, motion, work.vertices, work.dividing, work.status, work.separation
-    find_contacts_without_queues(broad_phase, *arguments)
+    arrays = {"mesh": work.connectivity, "motion": motion, "vertices": work.vertices}
+    arrays |= {"dividing": work.dividing, "status": work.status}
+    find_contacts_without_queues(broad_phase, work.separation, **arrays)
+    _decide(work, overflow)
+
+
+def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
     work.launch(decide, 1, [work.constraints, *overflow], [work.status])

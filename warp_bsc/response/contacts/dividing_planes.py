@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...kernels.pipeline.pairs import firsts_of
-from ...kernels.pipeline.queues import take_place
+from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Vertices
 from ..state.vectors import HALF, ZERO, relative, to_double
 from ..tuning import CLOSE_MARGIN, MARGIN, SLACK, SMALL_DISTANCE
@@ -34,18 +34,12 @@ def add_plane(
     margin: wp.float64,
     half: wp.float64,
 ):
-    """Adds a plane to the lists of up to four vertices; where it does not fit, their lists end in INCOMPLETE.
+    """Adds a plane with a unit normal to the lists of up to four vertices, -1 for none; see :class:`.DividingPlanes`.
 
-    Args:
-        planes: The planes.
-        corners: The vertices, -1 for none. Those before ``split`` stay above the plane, the others below.
-        split: The first that stays below.
-        normal: Unit normal of the plane.
-        offset: Its coordinate along the normal [m].
-        margin: Least distance from it after projection, beside ``half`` [m].
-        half: Half of the distance that both sides keep from each other [m].
+    Vertices before ``split`` stay above the plane, the others below. Where it does not fit, their lists end in
+    INCOMPLETE.
     """
-    plane = take_place(planes.count)
+    plane = take_slot_int(planes.count)
     fits = plane < planes.normal.shape[0]
     if fits:
         planes.normal[plane] = normal
@@ -141,7 +135,7 @@ def add_dividing_plane(
     cannot bring together.
 
     Args:
-        motion: The motion of the step.
+        motion: The motion.
         vertices: The vertices as they were moved so far.
         corners: The vertices of both elements.
         kind: The kind of pair.

@@ -76,13 +76,7 @@ def _direction(u: wp.vec3d) -> int:
 
 
 @wp.kernel
-def find_nearest(
-    # in
-    motion: Motion,
-    vertex_face: PairQueue,
-    # in and out
-    nearest: wp.array2d[float],
-):
+def find_nearest(motion: Motion, vertex_face: PairQueue, nearest: wp.array2d[float]):
     """Finds how far each vertex is from the nearest face in each of six directions [m]; ``nearest`` is infinite before.
 
     Only faces count that have the closest point within them.

@@ -56,7 +56,7 @@ def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
 
 @wp.func
 def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether the response can move one of two elements, apart from the other."""
+    """Returns whether the response can move one of two elements; of two bodies, only if it keeps them apart."""
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True
@@ -206,19 +206,12 @@ def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
 def are_occluded(
     motion: Motion, mesh: Connectivity, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64
 ) -> bool:
-    """Returns whether one of two edges, of which a body moves one, is not what the other meets first along a normal.
+    """Returns whether a face next to one of two edges shields it from the other along the normal, at a time in [0, 1].
 
-    This is so if a face at the edge reaches farther along the normal than the edge: the edges of a triangulated flat
-    face, or those of a sheet that the side of a box has run into from above. To push along such a normal would hold
-    what slides. Sheets may bend around a body by 30 degrees to either side, bodies do not bend.
-
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        edges: The edges.
-        corners: Their vertices.
-        normal: Unit vector from the second to the first.
-        time: When, in [0, 1].
+    Only pairs with an edge of a body that can be moved are occluded. The face reaches farther along the normal than
+    the edge: at the edges of a triangulated flat face, or at those of a sheet that the side of a box has run into from
+    above. A push along this normal would hold what slides. Sheets may bend around a body by 30 degrees to either side,
+    bodies do not bend.
     """
     if not are_on_body(motion, corners):
         return False

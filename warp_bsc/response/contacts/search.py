@@ -4,19 +4,15 @@ import functools
 
 import warp as wp
 
-from ...detection.broad_phase_hierarchy import (
-    BroadPhaseHierarchy,
-    FaceHierarchy,
-    overlapping_edges,
-    overlapping_vertices,
-    traversal_kernel,
-)
+from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.element_pairs import overlapping_edges, overlapping_vertices
+from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.settings import TOLERANCE
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
 from ...kernels.motion import motion_and_distance, relative_motion
-from ...kernels.pipeline.hierarchy import lowest_place
+from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
@@ -37,7 +33,7 @@ _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
 
 @wp.struct
 class _Arguments:
-    """What a thread needs in order to find the contacts of two faces and to act on them."""
+    """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
     mesh: Connectivity
@@ -157,19 +153,6 @@ def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
 
 
 @wp.func
-def _visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
-    mesh = arguments.faces
-    while found != wp.uint32(0):
-        other = first + lowest_place(found)
-        found = found & (found - wp.uint32(1))
-        left = _pairs_of_faces(mesh, place, other)
-        while left != 0:  # one body for all, which is large
-            kind, pair, corners = _pair_of_bit(mesh, place, other, lowest_place(wp.uint32(left)))
-            left = left & (left - 1)
-            _decide_pair(arguments, kind, pair, corners)
-
-
-@wp.func
 def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     """Returns kind, elements and vertices of a pair of a point and another cell, at two places; kind -1 if none."""
     p = mesh.faces[point, 0]
@@ -181,45 +164,40 @@ def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     return -1, wp.vec2i(), wp.vec4i()
 
 
-@wp.func
-def _visit_at_distances(place: int, first: int, found: wp.uint32, arguments: _Arguments):
-    mesh = arguments.faces
-    while found != wp.uint32(0):
-        other = first + lowest_place(found)
-        found = found & (found - wp.uint32(1))
-        left = _pairs_of_faces(mesh, place, other)
-        point = int(-1)
-        if mesh.order[place] >= mesh.point_start:
-            point = place
-        elif mesh.order[other] >= mesh.point_start:
-            point = other
-        if point >= 0 and place != other:
-            left = left | _POINTS
-        while left != 0:
-            bit = lowest_place(wp.uint32(left))
-            left = left & (left - 1)
-            kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
-            if bit == _POINT_BIT:
-                kind, pair, corners = _point_pair(mesh, point, place + other - point)
-            if kind >= 0:
-                _decide_distance(arguments, kind, pair, corners)
-
-
 @functools.cache
 def _kernel(keep_distances: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
-    return traversal_kernel(_visit_at_distances if keep_distances else _visit, _Arguments)
+    decide = _decide_distance if keep_distances else _decide_pair
+
+    @wp.func
+    def visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
+        mesh = arguments.faces
+        while found != wp.uint32(0):
+            other = first + lowest_set_bit(found)
+            found = found & (found - wp.uint32(1))
+            left = _pairs_of_faces(mesh, place, other)
+            point = int(-1)
+            if wp.static(keep_distances):
+                if mesh.order[place] >= mesh.point_start:
+                    point = place
+                elif mesh.order[other] >= mesh.point_start:
+                    point = other
+                if point >= 0 and place != other:
+                    left = left | _POINTS
+            while left != 0:  # one body for all, which is large
+                bit = lowest_set_bit(wp.uint32(left))
+                left = left & (left - 1)
+                kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
+                if wp.static(keep_distances):
+                    if bit == _POINT_BIT:
+                        kind, pair, corners = _point_pair(mesh, point, place + other - point)
+                if kind >= 0:
+                    decide(arguments, kind, pair, corners)
+
+    return traversal_kernel(visit, _Arguments)
 
 
-def find_contacts_without_queues(
-    broad_phase: BroadPhaseHierarchy,
-    mesh: Connectivity,
-    motion: Motion,
-    vertices: Vertices,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-    separation: float,
-) -> None:
+def find_contacts_without_queues(broad_phase: BroadPhaseHierarchy, separation: float, **arrays) -> None:
     """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
 
     Counts them, adds dividing planes as far as they fit, and finds the first contact of each vertex. Allocates nothing
@@ -227,15 +205,11 @@ def find_contacts_without_queues(
 
     Args:
         broad_phase: The broad phase, fitted to all of the motion.
-        mesh: The connectivity of its mesh.
-        motion: The predicted motion.
-        vertices: The vertices as they were moved so far.
-        dividing: The dividing planes.
-        status: The solve status.
         separation: Distance that projection moves contacts apart [m].
+        arrays: ``mesh``, ``motion``, ``vertices``, ``dividing`` and ``status`` of the step.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.mesh, arguments.motion = broad_phase.hierarchy, mesh, motion
-    arguments.vertices, arguments.dividing, arguments.status = vertices, dividing, status
-    arguments.separation = wp.float64(separation)
-    broad_phase.traverse(_kernel(bool(motion.distances.radius)), arguments)
+    arguments.faces, arguments.separation = broad_phase.hierarchy, wp.float64(separation)
+    for name, struct in arrays.items():
+        setattr(arguments, name, struct)
+    broad_phase.traverse(_kernel(bool(arguments.motion.distances.radius)), arguments)

@@ -1,4 +1,4 @@
-"""A layer around all surfaces in which contacts push gradually, so that what comes of a step is continuous.
+"""A solver around another one that pushes gradually in a layer around all surfaces, so that results are continuous.
 
 A contact that acts where it hits makes trajectories jump: whether a hit falls into this step or the next decides which
 velocities the inner solver sees in the next. In the layer a contact is a spring with a damper instead. It acts at the
@@ -10,25 +10,31 @@ leaves with rho^4 of its speed, which is the restitution, whatever the speed and
 Contacts of one vertex divide its mass among them, by the squares of their depths (mass splitting, Tonge et al. 2012):
 one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
 little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide
-fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable, see
-:meth:`ContactLayer.backward`.
+fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable.
 """
 
 from dataclasses import dataclass
 
+import newton
+import numpy as np
 import warp as wp
+from newton.solvers import SolverBase
 
-from ...detection.approach_phase import MinDistances
+from ..._arguments import checked_distance, checked_number
+from ..._one_thread import one_at_a_time
+from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
 from ..adjoint.arrays import attach_gradients, launch_adjoint
 from ..contacts.queue import PairQueue, queues_of
-from ..state.friction import Friction
+from ..integration.tape import paused_tape
+from ..integration.wrapped_solver import StateArrays, WrappedSolver
+from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion
 from ..state.planes import MovingPlanes
 from ..state.structs import Motion
-from ..tuning import PAIRS_PER_FACE
+from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from .kernels import (
     Layer,
     add_pushes,
@@ -46,14 +52,14 @@ from .kernels import (
 
 
 @dataclass(frozen=True)
-class PushedStep:
-    """What :meth:`ContactLayer.backward` needs of a step.
+class _PushedStep:
+    """What the adjoint needs of a step.
 
     Attributes:
-        motion: The motion that was predicted.
+        motion: The predicted motion.
         planes: The planes.
         pairs: The pairs that may be in the layer, of each kind.
-        shares: The sums of what the contacts of each vertex count.
+        shares: The sums of the weights of the contacts of each vertex.
         dt: Length of the step [s].
     """
 
@@ -64,105 +70,201 @@ class PushedStep:
     dt: float
 
 
-class ContactLayer:
-    """Pushes what comes into a layer around all surfaces, before :class:`.response.Response` resolves hits.
+class ContactLayer(WrappedSolver):
+    """Lets another solver step, then pushes what has come into a layer around all surfaces.
 
-    Pairs that passed each other since the start of the step are left to that, and so are contacts with bodies that the
-    response moves. Pushes conserve linear momentum, but angular momentum only to the first order of the step, as they
-    act along directions at y.
+    Behind it, ``SolverCCD(ContactLayer(solver))``, the stage resolves what the layer leaves: pairs that passed each
+    other since the start of the step, and contacts with dynamic bodies that the inner solver integrates. With the layer
+    results are continuous in the inputs, and gradients hold where contacts come and go. Pushes conserve linear
+    momentum, but angular momentum only to the first order of the step, as they act along directions at y (see above).
+
+    Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps.
+
+    Limitations:
+        Only contacts within one step are seen: what a program moves between steps is passed on to the stage. On a tape,
+        a layer carries no gradients to poses of bodies: a step raises NotImplementedError if shapes move with bodies.
+
+    References:
+        R. Tonge, F. Benevolenski and A. Voroshilov, Mass Splitting for Jitter-Free Parallel Rigid Body Simulation, ACM
+        Transactions on Graphics 31(4), 2012, doi:10.1145/2185520.2185601.
+
+    Attributes:
+        solver: The inner solver.
+        mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
+        thickness: Thickness of the layer [m].
+        friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
+        restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
     """
 
     def __init__(
         self,
-        mesh: ModelMesh,
-        friction: Friction,
+        solver: SolverBase,
         *,
-        thickness: float,
-        restitution: wp.array[float],
-        distances: MinDistances,
-        layerless_steps: wp.array[wp.int64],
+        thickness: float | None = None,
+        friction: float | wp.array[float] | None = None,
+        restitution: float | wp.array[float] | None = None,
+        min_distance: float | None = None,
+        particle_radius: float | np.ndarray | wp.array | None = None,
     ):
-        """Allocates buffers.
+        """Puts the layer around a solver.
 
         Args:
-            mesh: The mesh.
-            friction: The coefficients of its vertices and planes.
-            thickness: Of the layer [m].
-            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
-            distances: Minimum distances of pairs, above which the layer begins; their reach is the thickness.
-            layerless_steps: Is increased in a step in which a queue of a CUDA graph was too small, and the layer pushed
-                nothing, array of one int.
+            solver: Any Newton solver that moves particles.
+            thickness: Thickness of the layer [m], above the minimum distances. It should be more than the longest path
+                of a step, and less than half of the shortest edge, as neighbours beyond the next push each other as
+                well. Default: a quarter of the median edge length, at most 0.45 of the shortest.
+            friction: As for :class:`.solver_ccd.SolverCCD`.
+            restitution: As for :class:`.solver_ccd.SolverCCD`.
+            min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
+            particle_radius: As for :class:`.solver_ccd.SolverCCD`.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If a number, or the friction of a shape that collides with particles, is out of range.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
-        self._mesh, self._friction, self._device = mesh, friction, mesh.device
-        self._layerless_steps = layerless_steps
+        super().__init__(solver)
+        options = StageOptions.of(
+            self.model,
+            friction=friction,
+            restitution=restitution,
+            min_distance=min_distance,
+            particle_radius=particle_radius,
+        )
+        self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
+        self.friction, self.restitution, self._reads_friction = (
+            options.friction,
+            options.restitution,
+            options.reads_friction,
+        )
+        if thickness is None:
+            lengths = particle_edge_lengths(mesh)
+            shares = np.array(LAYER_THICKNESS) * ((np.median(lengths), lengths.min()) if len(lengths) else (1.0, 1.0))
+            thickness = float(shares.min())
+        self.thickness = checked_distance(thickness, "thickness", zero=False)
+        moves_bodies = options.moves_bodies(mesh, solver)
+        self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
         self._layer = layer = Layer()
-        layer.thickness, layer.distances, layer.restitution = thickness, distances, restitution
-        pairs_per_face = None if mesh.device.is_cpu else PAIRS_PER_FACE
-        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=distances)
+        layer.thickness, layer.restitution = self.thickness, self.restitution
+        layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
+        device = mesh.device
+        pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
+        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
         n = mesh.vertex_count
-        self._y = wp.zeros(n, dtype=wp.vec3, device=self._device)
-        self._share_sums = wp.zeros(n, dtype=wp.int64, device=self._device)
-        self._shares = wp.zeros(n, dtype=wp.float64, device=self._device)
-        self._sums = wp.zeros((n, 3), dtype=wp.int64, device=self._device)
+        self._y = wp.zeros(n, dtype=wp.vec3, device=device)
+        self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
+        self._shares = wp.zeros(n, dtype=wp.float64, device=device)
+        self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
+        self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
+        self._motion.set_start(self.model.particle_q, self.model.body_q)
+        self._set_end(self.model, 1.0)
+        self._detect()  # allocates buffers, which a CUDA graph cannot
 
-    def prepare(self, motion: ModelMotion) -> None:
-        """Finds the pairs that may be in the layer; allocates buffers, which a CUDA graph cannot."""
-        detector = self._detector
-        self._launch(place_vertices_between, len(self._y), [motion.vertices, self._layer, self._y])
-        retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self._device)
+    @property
+    def skipped_steps(self) -> int:
+        """Steps so far in which the layer pushed nothing, because a queue of a CUDA graph was too small.
 
-    def push(
+        Contacts then act where they hit, and results are not continuous. Synchronizes with the device.
+        """
+        return int(self.skipped.numpy()[0])
+
+    @one_at_a_time
+    def step(
         self,
-        motion: ModelMotion,
-        particle_q: wp.array[wp.vec3],
-        particle_qd: wp.array[wp.vec3],
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
         dt: float,
-        *,
-        record: bool = False,
-    ) -> PushedStep | None:
-        """Changes the predicted motion, and the state that it was copied from, by the pushes of contacts in the layer.
+        **options,
+    ) -> None:
+        """Steps the inner solver, and pushes particles that have come into the layer.
 
         Args:
-            motion: The motion.
-            particle_q: The predicted positions of particles.
-            particle_qd: Their predicted velocities.
-            dt: Length of the step [s].
-            record: Whether to return what :meth:`backward` needs; None otherwise.
+            state_in: The state at the start; the inner solver may change it.
+            state_out: The state at the end. May be the same, except on a tape.
+            control: As for the inner solver.
+            contacts: As for the inner solver.
+            dt: Length of the step [s], more than 0.
+            options: As for the inner solver.
+
+        Raises:
+            TypeError: If ``dt`` is no number.
+            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients, and ``state_out`` is
+                ``state_in``.
+            NotImplementedError: If a tape records gradients, and shapes move with bodies.
+            RuntimeError: If another thread is using this layer.
         """
-        self.prepare(motion)
-        vertices, layer, detector = motion.vertices, self._layer, self._detector
-        n = len(vertices.x1)
+        checked_number(dt, "dt", 0.0, above=True)
+        with paused_tape() as tape:
+            if tape is not None and self.model.requires_grad:
+                if state_in is state_out:
+                    raise ValueError("on a tape, state_out must not be state_in")
+                if self.mesh.has_shapes_on_bodies:
+                    raise NotImplementedError(
+                        "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
+                    )
+            self._motion.set_start(state_in.particle_q, state_in.body_q)
+        self.solver.step(state_in, state_out, control, contacts, dt, **options)
+        with paused_tape() as tape:
+            end, device = StateArrays.of(state_out), self.mesh.device
+            if end.particle_q is None:
+                return
+            if tape is None or not end.particle_q.requires_grad:
+                run_on_host(lambda: self._push(end, dt), device)
+                return
+            arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
+            read = [self._motion.friction.of_particles, self._motion.friction.of_shapes, self.restitution]
+            read = [a for a in [*read, self.model.particle_inv_mass] if a is not None and len(a) and a.requires_grad]
+            pushed: _PushedStep | None = None
+
+            def forward():
+                nonlocal pushed
+                pushed = self._push(end, dt, record=True)
+
+            def backward():
+                with self._lock:
+                    self._backward(pushed, *(array.grad for array in arrays))
+
+            run_on_host(forward, device)
+            tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+
+    def _set_end(self, end, dt):
+        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
+
+    def _detect(self):
+        """Finds the pairs that may be in the layer."""
+        detector = self._detector
+        self._launch(place_vertices_between, len(self._y), [self._motion.vertices, self._layer, self._y])
+        retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self.mesh.device)
+
+    @one_at_a_time
+    def _push(self, end, dt, *, record=False):
+        """Changes the end of a step by the pushes of contacts; returns what the adjoint needs if that is recorded."""
+        if self._reads_friction:
+            self._motion.friction.read()
+        self._set_end(end, dt)
+        self._detect()
+        motion, planes, layer, detector = self._motion.vertices, self._motion.planes, self._layer, self._detector
         pairs = queues_of(detector)
         for of_kind in pairs:
-            self._launch_over(sum_shares, of_kind, [vertices, layer, of_kind, self._share_sums])
-        inputs = [vertices, motion.planes, layer, detector.counters.array, detector.capacities]
-        self._launch(finish_shares, n, [*inputs, self._share_sums, self._shares, self._layerless_steps])
+            self._launch_over(sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
+        inputs = [motion, planes, layer, detector.counters.array, detector.capacities]
+        self._launch(finish_shares, len(motion.x1), [*inputs, self._share_sums, self._shares, self.skipped])
         for of_kind in pairs:
-            self._launch_over(sum_pushes, of_kind, [vertices, layer, of_kind, self._shares, self._sums])
-        step = self._recorded(motion, pairs, dt) if record else None
-        inputs = [vertices, motion.planes, layer, self._shares, dt, self._sums]
-        self._launch(move_particles, len(particle_q), [*inputs, particle_q, particle_qd])
+            self._launch_over(sum_pushes, of_kind, [motion, layer, of_kind, self._shares, self._sums])
+        step = self._recorded(pairs, dt) if record else None
+        inputs = [motion, planes, layer, self._shares, dt, self._sums]
+        self._launch(move_particles, len(end.particle_q), [*inputs, end.particle_q, end.particle_qd])
         return step
 
-    def backward(
-        self,
-        step: PushedStep,
-        start_q: wp.array[wp.vec3],
-        particle_q: wp.array[wp.vec3],
-        particle_qd: wp.array[wp.vec3],
-    ) -> None:
+    def _backward(self, step, start_q, particle_q, particle_qd):
         """Turns gradients with respect to a pushed state into those with respect to the predicted one, in place.
 
-        Adds to the gradients of inverse masses, of what coefficients of friction are read from, and of restitution,
-        where these have such arrays.
-
-        Args:
-            step: The step.
-            start_q: Gradient with respect to positions at the start, shape [particle_count]; is added to.
-            particle_q: Gradient with respect to the pushed positions; becomes that with respect to the predicted ones.
-            particle_qd: The same for the velocities.
+        Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
+        from, and of restitution, where these have such arrays.
         """
-        motion, planes, layer, device = step.motion, step.planes, self._layer, self._device
+        motion, planes, layer, device = step.motion, step.planes, self._layer, self.mesh.device
         n, particles = len(motion.x0), len(particle_q)
         of_changes, changes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
         self._launch(begin_backward, particles, [motion.is_not_finite, step.dt, particle_q, particle_qd, of_changes])
@@ -181,41 +283,46 @@ class ContactLayer:
             inputs = [motion, layer, of_kind]
             launch_adjoint(add_shares, len(of_kind.pairs), inputs, [sums], [of_shares], device)
         launch_adjoint(add_shares_of_planes, over_planes, [motion, planes, layer], [sums], [of_shares], device)
-        inverse_mass = self._mesh.model.particle_inv_mass
+        inverse_mass = self.model.particle_inv_mass
         assert inverse_mass is not None
         inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
-        outputs = [start_q, particle_q, inverse_mass.grad]
-        self._launch(finish_backward, particles, [*inputs, *outputs])
-        self._friction.backward(of_motion.friction, of_planes.friction)
+        self._launch(finish_backward, particles, [*inputs, start_q, particle_q, inverse_mass.grad])
+        self._motion.friction.backward(of_motion.friction, of_planes.friction)
 
-    def _recorded(self, motion, pairs, dt):
+    def _recorded(self, pairs, dt):
         """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
             copy = PairQueue()
             copy.kind, copy.count, copy.elements = of_kind.kind, of_kind.count, of_kind.elements
             count = len(of_kind.pairs)
-            if not self._device.is_capturing:
+            if not self.mesh.device.is_capturing:
                 count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
             if count:
                 copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
                 copies.append(copy)
-        kept = Motion()
+        motion, planes = Motion(), MovingPlanes()
         for name in ("x0", "x1", "is_not_finite", "friction"):
-            setattr(kept, name, wp.clone(getattr(motion.vertices, name)))
-        kept.inverse_mass, kept.world = motion.vertices.inverse_mass, motion.vertices.world
-        planes = MovingPlanes()
+            setattr(motion, name, wp.clone(getattr(self._motion.vertices, name)))
+        for name in ("inverse_mass", "world"):
+            setattr(motion, name, getattr(self._motion.vertices, name))
         for name in MovingPlanes.vars:
-            array = getattr(motion.planes, name)
+            array = getattr(self._motion.planes, name)
             setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
-        return PushedStep(kept, planes, copies, wp.clone(self._shares), dt)
+        return _PushedStep(motion, planes, copies, wp.clone(self._shares), dt)
 
     def _launch(self, kernel, size, inputs):
-        wp.launch(kernel, size, inputs=inputs, device=self._device)
+        wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
 
     def _launch_over(self, kernel, of_kind, inputs):
         """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
         count = len(of_kind.pairs)
-        if self._device.is_cpu:
+        if self.mesh.device.is_cpu:
             count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
         self._launch(kernel, count, inputs)
+
+    @one_at_a_time
+    def notify_model_changed(self, flags: int) -> None:
+        """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
+        super().notify_model_changed(flags)
+        self.mesh.refresh_inverse_masses()

@@ -10,7 +10,7 @@ import warp as wp
 from ..state.fixed_sum import with_delta
 from ..state.poses import centre_of, inertia_at
 from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Constraints, Motion, Vertices, has_final_velocity
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
+from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
 
 wp.set_module_options({"enable_backward": False})
@@ -181,7 +181,7 @@ def body_moments(motion: Motion, vertices: Vertices, body: int):
     moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
     torque = mass * wp.cross(moved, linear)
     torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
-    half = wp.float64(0.5) * wp.trace(inertia)
+    half = HALF * wp.trace(inertia)
     square = mass * wp.length_sq(change) + wp.dot(turn, inertia * turn)
     return torque, _moments(mass, x, half, inertia, square)
 
@@ -216,16 +216,10 @@ def _turn_of(torque: wp.vec3d, total: Moments):
         total[8] - mass * centre[2] * centre[0],
         total[9] - mass * centre[0] * centre[1],
     )
-    inertia = wp.mat33d(
-        squares[1] + squares[2],
-        -products[2],
-        -products[1],
-        -products[2],
-        squares[0] + squares[2],
-        -products[0],
-        -products[1],
-        -products[0],
-        squares[0] + squares[1],
+    inertia = wp.matrix_from_rows(
+        wp.vec3d(squares[1] + squares[2], -products[2], -products[1]),
+        wp.vec3d(-products[2], squares[0] + squares[2], -products[0]),
+        wp.vec3d(-products[1], -products[0], squares[0] + squares[1]),
     )
     if wp.determinant(inertia) <= ZERO:
         return wp.vec3d(), wp.vec3d()
@@ -236,7 +230,7 @@ def _turn_of(torque: wp.vec3d, total: Moments):
 
 @wp.func
 def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
-    """Returns the change of velocity at ``x`` by a turn of a world that removes a torque [m/s], and the turn [rad/s]."""
+    """Returns the change of velocity at ``x`` by the turn of a world that removes a torque [m/s], and that turn."""
     turn, centre = _turn_of(torque, total)
     return wp.cross(turn, x - centre), turn
 

@@ -1,4 +1,4 @@
-"""Rigid bodies: what constraints do to the pose and velocity of a body, whose vertices follow as one.
+"""Rigid bodies: the changes of poses and velocities by constraints; the vertices of a body follow its pose.
 
 A constraint acts on a body at the contact point: the inverse mass along a normal n is 1/m + (r x n) I^-1 (r x n), with
 the arm r from the centre of mass. Each constraint adds a change of the centre and a turn to the sums of its bodies, as
@@ -63,17 +63,12 @@ def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints
 
 @wp.func
 def body_inverse_masses(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    x: wp.array[wp.vec3],
-    relaxation: wp.float64,
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
 ):
     """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
 
-    The inverse mass of a body is a matrix. The two numbers are those of a matrix without products of the normal with
-    other directions that exceeds it, so that sweeps converge.
+    The inverse mass of a body is a matrix. The two numbers belong to a larger one, without products of the normal with
+    other directions, so that sweeps converge.
     """
     normal = constraints.normal[i]
     along = ZERO
@@ -141,7 +136,7 @@ def add_body_delta(
 
 @wp.func
 def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
-    """Makes the pose of a body that where impulses act."""
+    """Sets the centre and inverse inertia of a body, where impulses act, to those of its pose."""
     pose = moved.pose[body]
     moved.centre[body] = centre_of(bodies, body, pose)
     moved.inverse_inertia[body] = inverse_inertia_at(bodies, body, pose)
@@ -149,7 +144,7 @@ def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
 
 @wp.kernel
 def begin_bodies(motion: Motion, vertices: Vertices):
-    """Initializes the bodies by what is predicted of them, and clears everything else."""
+    """Initializes the bodies by their prediction, and clears everything else."""
     body = wp.tid()
     moved = vertices.bodies
     moved.pose[body] = motion.bodies.end[body]
@@ -168,7 +163,7 @@ def begin_bodies(motion: Motion, vertices: Vertices):
 
 @wp.func
 def move_body(motion: Motion, vertices: Vertices, body: int) -> bool:
-    """Moves a body by the sum of what constraints did to it, if it has active ones; returns whether it has."""
+    """Moves a body by the sum of its changes by constraints, if it has active ones; returns whether it has."""
     moved = vertices.bodies
     moves = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
     if moves:
@@ -182,7 +177,7 @@ def move_body(motion: Motion, vertices: Vertices, body: int) -> bool:
 
 @wp.kernel
 def move_bodies(motion: Motion, vertices: Vertices, last: bool):
-    """Moves each body by the sum of what its constraints did to it in a sweep; ``last`` empties its active set."""
+    """Moves each body by the sum of its changes by constraints; the ``last`` sweep empties its active set."""
     body = wp.tid()
     moved = vertices.bodies
     moves = move_body(motion, vertices, body)
@@ -205,7 +200,7 @@ def place_vertices(motion: Motion, vertices: Vertices):
 
 @wp.kernel
 def move_to_end(motion: Motion, vertices: Vertices):
-    """Makes the poses at the end of the step those where impulses act."""
+    """Makes impulses act on bodies in their poses at the end of the step."""
     body = wp.tid()
     if motion.bodies.inverse_mass[body] > 0.0:
         _set_centre(motion.bodies, vertices.bodies, body)
@@ -237,7 +232,7 @@ def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
 
 @wp.kernel
 def set_vertex_velocities(motion: Motion, vertices: Vertices):
-    """Makes the velocities of vertices those of their bodies."""
+    """Sets the velocities of vertices to those of their bodies."""
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:

@@ -85,14 +85,7 @@ def divide_proximities(
 
 @wp.kernel
 def find_body_shares(
-    # in
-    motion: Motion,
-    # in and out
-    vertices: Vertices,
-    # in
-    status: SolveStatus,
-    dividing: DividingPlanes,
-    record: StepRecord,
+    motion: Motion, vertices: Vertices, status: SolveStatus, dividing: DividingPlanes, record: StepRecord
 ):
     """Finds the share of the path of each body up to which its vertices are above their dividing planes.
 
@@ -134,15 +127,7 @@ def _freeze_body(motion: Motion, vertices: Vertices, body: int):
 
 
 @wp.kernel
-def cut_bodies(
-    # in
-    motion: Motion,
-    # in and out
-    vertices: Vertices,
-    status: SolveStatus,
-    # in
-    dt: wp.float64,
-):
+def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.float64):
     """Moves each body whose path is cut back along it, or freezes it in its pose at the start."""
     body = wp.tid()
     moved = vertices.bodies
@@ -170,7 +155,6 @@ def cut_bodies(
 
 @wp.func
 def _record_truncation(
-    # in
     vertices: Vertices,
     vertex: int,
     body: int,
@@ -178,7 +162,6 @@ def _record_truncation(
     packed: wp.int64,
     vertex_face: PairQueue,
     edge_edge: PairQueue,
-    # in and out
     record: StepRecord,
 ):
     """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
@@ -197,16 +180,7 @@ def _record_truncation(
 
 
 @wp.func
-def _record_contact(
-    # in
-    vertex: int,
-    cuts: bool,
-    packed: wp.int64,
-    contacts: PairQueue,
-    entry: int,
-    # out
-    record: StepRecord,
-):
+def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
     """Records the contact that a path is truncated before."""
     kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
     i = contact_index(packed)
@@ -306,14 +280,7 @@ def truncate_vertices(
 
 @wp.kernel
 def record_body_truncations(
-    # in
-    motion: Motion,
-    # in and out
-    vertices: Vertices,
-    record: StepRecord,
-    # in
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
+    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: PairQueue, edge_edge: PairQueue
 ):
     """Records the pose of each body whose path is truncated next, before the first contact of its vertices."""
     vertex = motion.bodies.particle_count + wp.tid()
@@ -348,12 +315,7 @@ def freeze_undetected_bodies(motion: Motion, vertices: Vertices, status: SolveSt
 
 
 def divide(work: Workspace, dt: float) -> None:
-    """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them.
-
-    Args:
-        work: The workspace of the step.
-        dt: Length of the step [s].
-    """
+    """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
     work.reserve_truncations()
     motion, vertices, status, record = work.motion.vertices, work.vertices, work.status, work.record
     contacts = queues_of(work.detector)[:2]

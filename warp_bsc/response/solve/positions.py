@@ -13,7 +13,8 @@ from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERAN
 from .bodies import move_bodies, place_vertices
 from .sweeps import (
     activate,
-    change_multiplier,
+    add_delta,
+    after_sweep,
     finish_sweep,
     is_held_by_friction,
     max_sweeps,
@@ -29,13 +30,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def activate_position_constraints(
-    # in
-    motion: Motion,
-    status: SolveStatus,
-    tolerance: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
+    motion: Motion, status: SolveStatus, tolerance: wp.float64, vertices: Vertices, constraints: Constraints
 ):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
@@ -80,13 +75,7 @@ def activate_position_constraints(
 
 @wp.kernel
 def project_positions(
-    # in
-    motion: Motion,
-    status: SolveStatus,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    record: StepRecord,
+    motion: Motion, status: SolveStatus, vertices: Vertices, constraints: Constraints, record: StepRecord
 ):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     place = wp.tid()
@@ -100,26 +89,16 @@ def project_positions(
         violated = gap(vertices, constraints, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
     multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
-    change_multiplier(
-        motion,
-        place,
-        multiplier,
-        momentum,
-        motion.x1,
-        vertices,
-        constraints,
-        record,
-        constraints.position_multiplier,
-        vertices.particle_delta_x,
-        vertices.bodies.delta_x,
-    )
+    old = constraints.position_multiplier[i]
+    new = after_sweep(constraints, record, place, old, multiplier, momentum)
+    constraints.position_multiplier[i] = new
+    sums = vertices.particle_delta_x
+    add_delta(motion, vertices, constraints, i, new - old, motion.x1, sums, vertices.bodies.delta_x)
 
 
 @wp.func
 def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
-    """Moves a vertex by the sum of what constraints did to it, if it has active ones; returns whether it has."""
-    if vertices.active[vertex] == 0:
-        return False
+    """Moves a vertex by the sum of its changes by constraints, if it can be moved; returns whether it can."""
     moves = motion.inverse_mass[vertex] > 0.0
     if moves:
         vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
@@ -128,23 +107,13 @@ def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
 
 @wp.kernel
 def update_positions(
-    # in
-    motion: Motion,
-    last: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-    record: StepRecord,
+    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    if vertex == 0:
-        finish_sweep(constraints, status, record, last)
-    moves = move_vertex(motion, vertices, vertex)
-    if last:
-        vertices.active[vertex] = 0
-    if moves:
+    if not finish_sweep(vertices, constraints, status, record, last, vertex):
+        return
+    if move_vertex(motion, vertices, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
@@ -152,9 +121,7 @@ def update_positions(
 def project(work: Workspace, tolerance: float = 1.0) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met.
 
-    Args:
-        work: The workspace of the step.
-        tolerance: Tolerance as a share of that of a whole step.
+    The tolerance is a share of that of a whole step.
     """
     repeat(work.status, work.reserve_entries, lambda first, last: _sweep(work, first, last, tolerance))
 

@@ -22,12 +22,7 @@ from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 @wp.func
 def _effective_inverse_masses(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    x: wp.array[wp.vec3],
-    relaxation: wp.float64,
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
 ):
     """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
 
@@ -208,39 +203,20 @@ def add_delta(
 
 
 @wp.func
-def change_multiplier(
-    # in
-    motion: Motion,
-    place: int,
-    multiplier: wp.vec3d,
-    momentum: wp.float64,
-    x: wp.array[wp.vec3],
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    record: StepRecord,
-    multipliers: wp.array[wp.vec3d],
-    # out
-    sums: wp.array2d[wp.int64],
-    body_sums: wp.array2d[wp.int64],
-):
-    """Changes a multiplier of the active set to ``multiplier`` and beyond, by its momentum, and records what it was.
-
-    Adds what this does to vertices and bodies, at positions ``x``, to their sums.
-    """
+def after_sweep(
+    constraints: Constraints, record: StepRecord, place: int, old: wp.vec3d, multiplier: wp.vec3d, momentum: wp.float64
+) -> wp.vec3d:
+    """Returns a multiplier of the active set moved on by its momentum, and records what it was before the sweep."""
     i = constraints.active_set[place]
-    old = multipliers[i]
     previous = constraints.previous_multiplier[i]
     if is_recording(record):
         record_entry(record, place, i, old, previous, momentum)
-    new = with_momentum(multiplier, previous, momentum)
     constraints.previous_multiplier[i] = multiplier
-    multipliers[i] = new
-    add_delta(motion, vertices, constraints, i, new - old, x, sums, body_sums)
+    return with_momentum(multiplier, previous, momentum)
 
 
 @wp.func
-def finish_sweep(constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool):
+def _finish_sweep(constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool):
     """Counts a sweep; after the last over an active set, empties it, and decides whether another batch is needed."""
     sweep = status.loop.sweep[0] + 1
     active = constraints.active_count[0] > wp.int64(0)
@@ -250,6 +226,22 @@ def finish_sweep(constraints: Constraints, status: SolveStatus, record: StepReco
         end_sweep(record, int(constraints.active_count[0]))
     if last:
         constraints.active_count[0] = wp.int64(0)
+
+
+@wp.func
+def finish_sweep(
+    vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool, vertex: int
+) -> bool:
+    """Returns whether constraints of a sweep act on a vertex; for vertex 0, finishes the sweep.
+
+    The ``last`` sweep over an active set empties it.
+    """
+    if vertex == 0:
+        _finish_sweep(constraints, status, record, last)
+    active = vertices.active[vertex] != 0
+    if active and last:
+        vertices.active[vertex] = 0
+    return active
 
 
 def repeat(status: SolveStatus, reserve_entries: Callable[[int], None], sweep: Callable[[bool, bool], None]) -> None:

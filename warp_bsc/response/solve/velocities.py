@@ -14,7 +14,7 @@ from .bodies import activate_bodies, change_body_velocities, move_to_end, set_ve
 from .sweeps import (
     activate,
     add_delta,
-    change_multiplier,
+    after_sweep,
     excess_speed,
     finish_sweep,
     initial_velocity_multiplier,
@@ -30,14 +30,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def initialize_velocity_multipliers(
-    # in
-    motion: Motion,
-    dt: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-):
+def initialize_velocity_multipliers(motion: Motion, dt: wp.float64, vertices: Vertices, constraints: Constraints):
     """Initializes the velocity multipliers of all constraints that pushed, as if contacts had acted at their times.
 
     This conserves angular momentum, because the two sides of a contact meet in one point at that time only.
@@ -113,24 +106,16 @@ def project_velocities(
     last_sweep = max_sweeps(motion, constraints, status, i, status.slow_velocity_sweeps) - 1
     momentum = momentum_of(constraints, status, i, last_sweep)
     multiplier = velocity_multiplier_after(motion, vertices, constraints, i, restitution)
-    change_multiplier(
-        motion,
-        place,
-        multiplier,
-        momentum,
-        vertices.x1,
-        vertices,
-        constraints,
-        record,
-        constraints.velocity_multiplier,
-        vertices.particle_delta_v,
-        vertices.bodies.delta_v,
-    )
+    old = constraints.velocity_multiplier[i]
+    new = after_sweep(constraints, record, place, old, multiplier, momentum)
+    constraints.velocity_multiplier[i] = new
+    sums = vertices.particle_delta_v
+    add_delta(motion, vertices, constraints, i, new - old, vertices.x1, sums, vertices.bodies.delta_v)
 
 
 @wp.func
 def change_velocity(motion: Motion, vertices: Vertices, vertex: int) -> bool:
-    """Changes a velocity by the sum of what constraints did to it, if they may change it; returns whether they may."""
+    """Changes a velocity by the sum of its changes by constraints, if they may change it; returns whether they may."""
     is_free = motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex])
     if is_free:
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
@@ -139,32 +124,19 @@ def change_velocity(motion: Motion, vertices: Vertices, vertex: int) -> bool:
 
 @wp.kernel
 def update_velocities(
-    # in
-    motion: Motion,
-    last: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-    record: StepRecord,
+    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
 ):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    if vertex == 0:
-        finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
+    if not finish_sweep(vertices, constraints, status, record, last, vertex):
         return
-    if last:
-        vertices.active[vertex] = 0
     change_velocity(motion, vertices, vertex)
 
 
 def project(work: Workspace, dt: float) -> None:
-    """Solves friction and restitution of all contacts that moved a vertex, and restores angular momentum.
+    """Solves friction and restitution of all contacts that moved a vertex in a step of length ``dt`` [s].
 
-    Args:
-        work: The workspace of the step.
-        dt: Length of the step [s].
+    Then restores angular momentum.
     """
     work.launch_over_bodies(move_to_end)
     inputs = [work.motion.vertices, dt, work.vertices, work.constraints]

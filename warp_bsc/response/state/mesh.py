@@ -145,6 +145,11 @@ class ModelMesh(CollisionMesh):
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
 
+    @property
+    def has_shapes_on_bodies(self) -> bool:
+        """Whether a vertex or a plane moves with a body."""
+        return bool((self.shape_vertices.body >= 0).any() or (self.planes.body >= 0).any())
+
     def keep_distances(
         self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
     ) -> None:

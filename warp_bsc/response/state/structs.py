@@ -166,40 +166,8 @@ def has_final_velocity(outcome: int) -> bool:
     return cut or outcome & (FROZEN | NOT_FINITE | UNCONSTRAINED) != 0
 
 
-def allocate(struct_type: type, size: int, columns: int, device: wp.Device):
-    """Returns a struct whose arrays are zeros of this size; those of two dimensions have this many columns."""
-    struct = struct_type()
-    for name, var in struct_type.vars.items():
-        if hasattr(var.type, "ndim"):  # not a struct
-            shape = (size, columns) if var.type.ndim == 2 else size
-            setattr(struct, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
-    return struct
-
-
-def allocate_vertices(count: int, device: wp.Device) -> Vertices:
-    """Returns vertices without contacts."""
-    vertices = allocate(Vertices, count, 3, device)
-    vertices.first_contact.fill_(int(NEVER))
-    return vertices
-
-
-def allocate_bodies(count: int, device: wp.Device) -> MovedBodies:
-    """Returns bodies that nothing has moved."""
-    return allocate(MovedBodies, count, 6, device)
-
-
-def allocate_constraints(capacity: int, device: wp.Device, *, keep_distances: bool = False) -> Constraints:
-    """Returns constraints, none yet, with this capacity."""
-    constraints = Constraints()
-    sizes = {"count": 1, "active_count": 1} | ({} if keep_distances else {"min_distance": 0})
-    for name, var in Constraints.vars.items():
-        setattr(constraints, name, wp.empty(sizes.get(name, capacity), dtype=var.type.dtype, device=device))
-    constraints.count.zero_()
-    constraints.active_count.zero_()
-    return constraints
-
-
 NO_NODE = wp.constant(-1)
+"""In place of a node: the end of a list."""
 
 
 @wp.struct
@@ -220,16 +188,39 @@ class DividingPlanes:
     kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
 
 
+def allocate(struct_type: type, size: int, device: wp.Device, **sizes):
+    """Returns a struct whose arrays are zeros of a size, those named in ``sizes`` of their own sizes."""
+    struct = struct_type()
+    for name, var in struct_type.vars.items():
+        if hasattr(var.type, "dtype"):  # not a struct
+            setattr(struct, name, wp.zeros(sizes.get(name, size), dtype=var.type.dtype, device=device))
+    return struct
+
+
+def allocate_vertices(count: int, device: wp.Device) -> Vertices:
+    """Returns vertices without contacts."""
+    vertices = allocate(Vertices, count, device, particle_delta_x=(count, 3), particle_delta_v=(count, 3))
+    vertices.first_contact.fill_(int(NEVER))
+    return vertices
+
+
+def allocate_bodies(count: int, device: wp.Device) -> MovedBodies:
+    """Returns bodies that nothing has moved."""
+    return allocate(MovedBodies, count, device, delta_x=(count, 6), delta_v=(count, 6))
+
+
+def allocate_constraints(capacity: int, device: wp.Device, *, keep_distances: bool = False) -> Constraints:
+    """Returns constraints, none yet, with this capacity."""
+    min_distances = capacity if keep_distances else 0
+    return allocate(Constraints, capacity, device, count=1, active_count=1, min_distance=min_distances)
+
+
 def allocate_dividing_planes(
     vertices: int, capacity: int, device: wp.Device, *, keep_distances: bool = False
 ) -> DividingPlanes:
     """Returns lists without planes for this many vertices, with a capacity for all planes together."""
-    planes = DividingPlanes()
     sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
-    sizes |= {} if keep_distances else {"half": 0}
-    for name, var in DividingPlanes.vars.items():
-        setattr(planes, name, wp.empty(sizes.get(name, capacity), dtype=var.type.dtype, device=device))
-    planes.count.zero_()
-    for nodes in (planes.first, planes.kept):
-        nodes.fill_(int(NO_NODE))
+    planes = allocate(DividingPlanes, capacity, device, **sizes, half=capacity if keep_distances else 0)
+    planes.first.fill_(int(NO_NODE))
+    planes.kept.fill_(int(NO_NODE))
     return planes

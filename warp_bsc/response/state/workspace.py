@@ -146,7 +146,7 @@ class Workspace:
         self.body_count = mesh.model.body_count if moves_bodies else 0
         device = self.device
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, keeping=mesh.distances)
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
         self.connectivity = Connectivity()
         self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges

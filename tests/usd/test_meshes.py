@@ -20,8 +20,6 @@ from stages import (
     save,
 )
 
-from warp_bsc.cli.main import main
-
 
 @pytest.fixture
 def stage(tmp_path):
@@ -257,7 +255,7 @@ def test_purpose(stage):
     add_falling(stage, "/World/Render", 0.25, 0.1).CreatePurposeAttr("render")
     found = find(stage)
     assert hits(found) == []
-    assert "meshes of purpose proxy are not checked: 1; --purpose proxy checks them" in found["warnings"]
+    assert "purposes: meshes of purpose proxy are not checked: 1" in found["warnings"]
     assert hits(find(stage, "--purpose", "default", "proxy")) == [("/World/Proxy", *HIT[1:])]
 
 
@@ -431,106 +429,6 @@ def test_subdivision_follows_a_turn(stage):
     assert [interval["start"] for interval in found["intervals"]] == [0, 0.25, 0.5, 0.75]
     assert "Motion between time samples is taken to be linear." in found["motion"]
     assert "1 mesh is moved by transforms" in found["motion"]
-
-
-# --- Which meshes, which pairs, which times ---
-
-
-@pytest.fixture
-def crowd(stage):
-    """A floor, a mesh A of two triangles of which one falls through the floor and the other, and B as A's first."""
-    add_floor(stage)
-    start = [*moved(FALLING, (0, 0, 0.25)), (0.3, -0.7, 0.1), (0.7, -0.4, 0.1), (0.7, -0.7, 0.1)]
-    end = moved(FALLING, (0, 0, -0.25)) + start[3:]
-    add_mesh(stage, "/World/A/Mesh", {0: start, 1: end}, [3, 3], list(range(6)))
-    add_falling(stage, "/World/B")
-    UsdGeom.Xformable(stage.GetPrimAtPath("/World/B")).AddTranslateOp().Set((-1.5, 0.1, 0))
-    return stage
-
-
-def pairs(found):
-    return {tuple(pair["meshes"]): pair["hits"] for pair in found["mesh_pairs"]}
-
-
-A, B, GROUND = "/World/A/Mesh", "/World/B", "/World/Floor"
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ([], {(GROUND, A), (A, A), (GROUND, B)}),
-        (["--no-self"], {(GROUND, A), (GROUND, B)}),
-        (["--self"], {(GROUND, A), (A, A), (GROUND, B)}),
-        (["--prims", "/World/A", "/World/Fl*"], {(GROUND, A), (A, A)}),
-        (["--prims", "/World/A", "--prims", "/World/B"], {(A, A)}),
-        (["--exclude", "/World/A"], {(GROUND, B)}),
-        (["--between", "/World/A", "/World/Floor"], {(GROUND, A)}),
-        (["--between", "/World/[AB]*", "*"], {(GROUND, A), (A, A), (GROUND, B)}),
-        (["--between", "/World/A", "/World/A"], {(A, A)}),
-    ],
-)
-def test_pairs(crowd, options, expected):
-    assert set(pairs(find(crowd, *options))) == expected
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--prims", "/World/Z"], "--prims /World/Z: there is no such mesh"),
-        (["--exclude", "/World/Z*"], "--exclude /World/Z*: there is no such mesh"),
-        (["--between", "/World/A", "/World/Z"], "--between /World/Z: there is no such mesh"),
-        (["--frames", "5:9"], "--frames"),
-        (["--frames", "3:1"], "--frames"),
-        (["--frames", "0:1:0"], "STEP must be more than 0"),
-        (["--frames", "a:b"], "three numbers"),
-        (["--subdivide", "0"], "at least 1"),
-        (["--validate", "some"], "--validate"),
-        (["--purpose", "fun"], "fun"),
-        (["--purpose", "guide"], "no visible mesh in the scene, or none is selected"),
-        (["--json", "--csv"], "only one of them can be printed"),
-        (["--overlay", "out.usdz"], "must end in .usda, .usdc or .usd"),
-        (["--report", "gone/out.html"], "there is no folder gone"),
-        (["--json", "same.json", "--csv", "same.json"], "named twice"),
-    ],
-)
-def test_wrong_use_is_one_line(crowd, capsys, tmp_path, monkeypatch, options, message):
-    monkeypatch.chdir(tmp_path)
-    assert main(["replay", save(crowd), "--device", "cpu", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("warp-bsc: error: ") and message in line
-    assert {path.name for path in tmp_path.iterdir()} == {"scene.usda"}
-
-
-@pytest.mark.parametrize(
-    ("frames", "times"),
-    [
-        ("1:3", [1, 2, 3]),
-        ("1:", [1, 2, 3, 4]),
-        (":2", [0, 1, 2]),
-        ("0.5:1.5", [0.5, 1, 1.5]),
-        ("::2", [0, 2, 4]),
-        ("0:4:1.5", [0, 1.5, 3]),
-        ("1:3:0.5", [1, 1.5, 2, 2.5, 3]),
-    ],
-)
-def test_frames(stage, frames, times):
-    add_floor(stage)
-    points = {time: moved(FALLING, (0, 0, 2.25 - time)) for time in range(5)}
-    points[3] = moved(FALLING, (0, 0, -0.75 - 1e-3))
-    add_mesh(stage, "/World/Falling", points)
-    found = find(stage, f"--frames={frames}")
-    starts = [interval["start"] for interval in found["intervals"]]
-    assert [*starts, found["intervals"][-1]["end"]] == pytest.approx(times)
-    assert any("steps over" in warning for warning in found["warnings"]) == (frames in ("::2", "0:4:1.5"))
-
-
-def test_steps_do_not_go_over_a_change_of_topology(stage):
-    add_floor(stage)
-    mesh = add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, 4 - time)) for time in range(5)})
-    for time, corners in ((0, [0, 1, 2]), (3, [0, 2, 1])):
-        mesh.GetFaceVertexIndicesAttr().Set(corners, time)
-    found = find(stage, "--frames", "::2")
-    assert [interval["start"] for interval in found["intervals"]] == [0, 2, 3]
 
 
 def test_instances_are_where_usd_has_them(stage):

@@ -37,23 +37,23 @@ def largest_stretch(model, dt, duration=0.4, **options):
         solver.step(*rollout.states, rollout.control, None, dt)
         rollout.states = rollout.states[::-1]
         largest.append((lengths() / rest).max() - 1.0)
-    assert solver.report.uncertified_steps == 0
+    assert solver.report.totals.uncertified_steps == 0
     return np.mean(largest[-round(0.1 / dt) :]), solver.report
 
 
 def test_a_coupled_step_stretches_as_little_as_small_steps(device):
-    """At 1/60 s, coupled cloth stretches as at 1/480 s; without coupling, it stretches several times as much.
+    """At 1/60 s, coupled cloth stretches as at 1/480 s; without substeps, it stretches several times as much.
 
     That is so with a number of substeps, and where the stage chooses.
     """
     model = drape(device)
     reference, _ = largest_stretch(model, 1.0 / 480.0)
     plain, report = largest_stretch(model, 1.0 / 60.0)
-    assert report.coupled_steps == 0
+    assert report.totals.substepped_steps == 0
     assert plain > 3.0 * reference
-    for coupling in (8, "auto"):
-        coupled, report = largest_stretch(model, 1.0 / 60.0, coupling=coupling)
-        assert report.coupled_steps > 0.5 * report.steps
+    for substeps in (8, "auto"):
+        coupled, report = largest_stretch(model, 1.0 / 60.0, substeps=substeps)
+        assert report.totals.substepped_steps > 0.5 * report.totals.steps
         assert coupled < 1.2 * reference
 
 
@@ -62,7 +62,7 @@ def test_auto_is_the_least_number_that_keeps_the_strain_small(device):
     model = drape(device)
     state, ends, control = model.state(), [model.state() for _ in range(2)], model.control()
     inner = newton.solvers.SolverVBD(model, iterations=5)
-    solvers = {n: bsc.SolverCCD(inner, friction=0.5, coupling=n) for n in (None, 2, 4, 8, 16, 32, "auto")}
+    solvers = {n: bsc.SolverCCD(inner, friction=0.5, substeps=n) for n in (None, 2, 4, 8, 16, 32, "auto")}
     chosen = []
     for dt in (1.0 / 480.0, 1.0 / 60.0):
         state.assign(model.state())
@@ -78,17 +78,17 @@ def test_auto_is_the_least_number_that_keeps_the_strain_small(device):
                 assert auto == fixed
             state.assign(ends[0])
     assert len(set(chosen)) >= 3
-    assert solvers["auto"].report.coupled_steps == np.count_nonzero(chosen)
+    assert solvers["auto"].report.totals.substepped_steps == np.count_nonzero(chosen)
 
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
     add_patch(builder, 4, 0.05, (0.0, 0.0, 0.001))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling="auto"))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps="auto"))
     for _ in range(10):
         rollout.step()
-    assert rollout.solver.report.coupled_steps == 0
+    assert rollout.solver.report.totals.substepped_steps == 0
     assert 0.0 < rollout.positions[:, 2].max() < 0.001  # it lies
 
 
@@ -104,7 +104,7 @@ def test_soft_bodies_are_coupled_where_they_are_compressed(device):
     builder.color()
     model = builder.finalize(device=device)
     inner = newton.solvers.SolverVBD(model, iterations=5, integrate_with_external_rigid_solver=True)
-    solver = bsc.SolverCCD(inner, coupling="auto")
+    solver = bsc.SolverCCD(inner, substeps="auto")
     start, end = model.state(), model.state()
     end.body_q.assign(np.float32([[0.0, 0.0, 0.006, 0.0, 0.0, 0.0, 1.0]]))
     solver.step(start, end, model.control(), None, DT)
@@ -142,7 +142,7 @@ def test_each_world_takes_the_substeps_that_it_needs(device):
     for builder in (worlds, *alone):
         builder.color()
         model = builder.finalize(device=device)
-        solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), separation=2e-4, coupling="auto")
+        solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), separation=2e-4, substeps="auto")
         rollouts.append(Rollout(model, solver))
     substeps = []
     for _ in range(3):
@@ -154,7 +154,7 @@ def test_each_world_takes_the_substeps_that_it_needs(device):
         expected = np.concatenate([rollout.positions for rollout in rollouts[1:]])
         assert rollouts[0].positions.tobytes() == expected.tobytes()
     assert any(len(set(numbers)) == 3 for numbers in substeps)
-    assert all(rollout.solver.report.uncertified_steps == 0 for rollout in rollouts)
+    assert all(rollout.solver.report.totals.uncertified_steps == 0 for rollout in rollouts)
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
@@ -165,13 +165,13 @@ def test_without_contacts_coupling_changes_no_bit(inner, device):
     builder.color()
     model = builder.finalize(device=device)
     plain = Rollout(model, SOLVERS[inner](model))
-    coupled = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), coupling=4))
+    coupled = Rollout(model, bsc.SolverCCD(SOLVERS[inner](model), substeps=4))
     for _ in range(5):
         plain.step(1e-4)  # short enough for the explicit solver
         coupled.step(1e-4)
     assert coupled.positions.tobytes() == plain.positions.tobytes()
     assert coupled.velocities.tobytes() == plain.velocities.tobytes()
-    assert coupled.solver.report.coupled_steps == 0
+    assert coupled.solver.report.totals.substepped_steps == 0
 
 
 def test_a_world_without_contacts_keeps_its_bits(device):
@@ -185,12 +185,12 @@ def test_a_world_without_contacts_keeps_its_bits(device):
     builder.color()
     model = builder.finalize(device=device)
     plain = Rollout(model, SOLVERS["vbd"](model))
-    coupled = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=3))
+    coupled = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3))
     for _ in range(4):
         plain.step()
         coupled.step()
     half = model.particle_count // 2
-    assert coupled.solver.report.coupled_steps > 1
+    assert coupled.solver.report.totals.substepped_steps > 1
     assert coupled.positions[:half, 2].min() > 0.0 > plain.positions[:half, 2].min()
     assert coupled.positions[half:].tobytes() == plain.positions[half:].tobytes()
     assert coupled.velocities[half:].tobytes() == plain.velocities[half:].tobytes()
@@ -198,38 +198,38 @@ def test_a_world_without_contacts_keeps_its_bits(device):
 
 def test_worlds_are_like_one_alone(device):
     models = bullet(30.0, device=device), bullet(30.0, device=device, worlds=2)
-    one, both = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), restitution=0.3, coupling=3)) for model in models)
+    one, both = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), restitution=0.3, substeps=3)) for model in models)
     for _ in range(6):
         one.step()
         both.step()
-    assert both.collisions == 0 and both.solver.report.coupled_steps > 1
+    assert both.collisions == 0 and both.solver.report.totals.substepped_steps > 1
     for world in both.positions.reshape(2, -1, 3):
         assert world.tobytes() == one.positions.tobytes()
 
 
-@pytest.mark.parametrize("coupling", [None, 4, "auto"])
-def test_momentum_of_free_bodies_is_conserved(coupling, device):
+@pytest.mark.parametrize("substeps", [None, 4, "auto"])
+def test_momentum_of_free_bodies_is_conserved(substeps, device):
     """Two patches collide; momentum is kept to 1e-6 of what collides, as XPBD keeps it and VBD by itself does not."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 1.0))
     add_patch(builder, 5, 0.04, (0.013, 0.017, 0.012), velocity=(0.5, 0.0, -1.0))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, coupling=coupling))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), friction=0.3, substeps=substeps))
     before, _ = rollout.momenta()
     colliding = model.particle_mass.numpy() @ np.linalg.norm(rollout.velocities, axis=1)
     for _ in range(8):
         rollout.step()
     after, _ = rollout.momenta()
-    assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    assert (rollout.solver.report.coupled_steps > 0) is (coupling is not None)
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert (rollout.solver.report.totals.substepped_steps > 0) is (substeps is not None)
     assert np.abs(after - before).max() < 1e-6 * colliding
     assert abs(rollout.velocities[: 7 * 7, 2].mean() - 1.0) > 0.3  # they did collide
 
 
-@pytest.mark.parametrize("coupling", [None, 4])
+@pytest.mark.parametrize("substeps", [None, 4])
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_a_bounce_returns_the_energy_of_restitution(restitution, coupling, device):
+def test_a_bounce_returns_the_energy_of_restitution(restitution, substeps, device):
     """A patch hits a box squarely: its energy afterwards is that before times restitution squared."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     box = newton.ModelBuilder.ShapeConfig(mu=0.0)
@@ -237,18 +237,18 @@ def test_a_bounce_returns_the_energy_of_restitution(restitution, coupling, devic
     add_patch(builder, 5, 0.05, (0.0, 0.0, 0.02), velocity=(0.0, 0.0, -2.0))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, coupling=coupling)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, restitution=restitution, substeps=substeps)
     rollout = Rollout(model, solver)
     mass = model.particle_mass.numpy()[:, None]
     before = (mass * rollout.velocities**2).sum()
     for _ in range(8):
         rollout.step()
-    assert (solver.report.coupled_steps > 0) is (coupling is not None) and rollout.collisions == 0
+    assert (solver.report.totals.substepped_steps > 0) is (substeps is not None) and rollout.collisions == 0
     assert abs((mass * rollout.velocities**2).sum() / before - restitution**2) < 0.02
 
 
-@pytest.mark.parametrize("coupling, dt", [(None, DT), (3, DT), ("auto", DT), (None, DT / 3)])
-def test_a_pile_comes_to_rest(coupling, dt, device):
+@pytest.mark.parametrize("substeps, dt", [(None, DT), (3, DT), ("auto", DT), (None, DT / 3)])
+def test_a_pile_comes_to_rest(substeps, dt, device):
     """Layers that fall on the ground gain no energy, and lie still; in small steps they are very near the ground."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
@@ -256,7 +256,7 @@ def test_a_pile_comes_to_rest(coupling, dt, device):
         add_patch(builder, 4, 0.05, (0.011 * layer, 0.007 * layer, 0.02 * (layer + 1)))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, coupling=coupling))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5, substeps=substeps))
     mass = model.particle_mass.numpy().astype(float)
 
     def energy():
@@ -266,13 +266,13 @@ def test_a_pile_comes_to_rest(coupling, dt, device):
     for _ in range(90 if dt == DT else 150):
         rollout.step(dt)
         energies.append(energy())
-    assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
     assert max(energies) < 1.001 * start
     assert np.sqrt((rollout.velocities**2).sum(axis=1).mean()) < 0.1
 
 
 def test_style3d_is_coupled_too(device):
-    """Cloth on a fixed box stretches less at 1/60 s with coupling, and nothing passes through."""
+    """Cloth on a fixed box stretches less at 1/60 s with substeps, and nothing passes through."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverStyle3D.register_custom_attributes(builder)
     builder.add_shape_box(-1, xform=wp.transform((0.0, 0.0, -0.05), wp.quat_identity()), hx=0.08, hy=0.3, hz=0.05)
@@ -293,17 +293,17 @@ def test_style3d_is_coupled_too(device):
     model = builder.finalize(device=device)
     contacts = newton.CollisionPipeline(model).contacts()
     stretch = []
-    for coupling in (None, 8):
+    for substeps in (None, 8):
         inner = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
-        rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, coupling=coupling))
+        rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=substeps))
         edges = rollout.mesh.edges[rollout.mesh.edges[:, 1] < model.particle_count]
         rest = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
         for _ in range(20):
             rollout.step(1.0 / 60.0, contacts)
         length = np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1)
         stretch.append((length / rest).max() - 1.0)
-        assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    assert rollout.solver.report.coupled_steps > 10
+        assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert rollout.solver.report.totals.substepped_steps > 10
     assert stretch[1] < 0.5 * stretch[0]
 
 
@@ -317,13 +317,13 @@ def test_xpbd_is_coupled_too(device):
     builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(), **cells, **springs)
     model = builder.finalize(device=device)
     inner = newton.solvers.SolverXPBD(model, iterations=10)
-    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, coupling=8))
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=8))
     edges, lengths, _ = edges_at_rest(model)
     for _ in range(12):
         rollout.step(1.0 / 60.0)
     stretch = (np.linalg.norm(np.diff(rollout.positions[edges], axis=1)[:, 0], axis=1) / lengths).max() - 1.0
-    assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
-    assert rollout.solver.report.coupled_steps > 6
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
+    assert rollout.solver.report.totals.substepped_steps > 6
     assert stretch < 0.5
 
 
@@ -343,23 +343,23 @@ class Clocked(newton.solvers.SolverVBD):
 
 def test_a_clock_of_the_inner_solver_advances_once_a_step(device):
     model = bullet(30.0, device=device)
-    rollout = Rollout(model, bsc.SolverCCD(Clocked(model), coupling=4))
+    rollout = Rollout(model, bsc.SolverCCD(Clocked(model), substeps=4))
     for _ in range(6):
         rollout.step()
-    assert rollout.solver.report.coupled_steps > 1
+    assert rollout.solver.report.totals.substepped_steps > 1
     assert rollout.solver.solver.calls == 6
     assert np.isclose(rollout.solver.solver.time.numpy()[0], 6 * DT)
 
 
 def test_the_state_at_the_start_may_be_that_at_the_end(device):
     model = bullet(30.0, device=device)
-    apart = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=3))
-    state, solver = model.state(), bsc.SolverCCD(SOLVERS["vbd"](model), coupling=3)
+    apart = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3))
+    state, solver = model.state(), bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3)
     for _ in range(6):
         apart.step()
         state.clear_forces()
         solver.step(state, state, apart.control, None, DT)
-    assert apart.solver.report.coupled_steps > 1
+    assert apart.solver.report.totals.substepped_steps > 1
     assert state.particle_q.numpy().tobytes() == apart.positions.tobytes()
 
 
@@ -370,13 +370,13 @@ def test_forces_act_as_often_as_without_coupling(device):
     add_patch(builder, 4, 0.05, (0.0, 0.0, 0.001))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, coupling=4)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.0, substeps=4)
     start, end = model.state(), model.state()
     for _ in range(24):
         start.particle_f.assign(model.particle_mass.numpy()[:, None] * np.float32([2.0, 0.0, 0.0]))
         solver.step(start, end, model.control(), None, DT)
         start, end = end, start
-    assert solver.report.coupled_steps > 10
+    assert solver.report.totals.substepped_steps > 10
     velocity = start.particle_qd.numpy().mean(axis=0)
     assert np.allclose(velocity[0], 2.0 * 24 * DT, rtol=1e-3)
     assert abs(velocity[2]) < 9.81 * DT  # it falls within the separation
@@ -391,7 +391,7 @@ def test_a_moving_plate_pushes_in_each_substep(device):
     builder.color()
     model = builder.finalize(device=device)
     inner = newton.solvers.SolverVBD(model, iterations=5, integrate_with_external_rigid_solver=True)
-    solver = bsc.SolverCCD(inner, restitution=0.0, coupling=4)
+    solver = bsc.SolverCCD(inner, restitution=0.0, substeps=4)
     start, end = model.state(), model.state()
     heights = 0.5 * 20.0 * (DT * np.arange(1, 13)) ** 2  # at 20 m/s^2
     for height in heights:
@@ -399,21 +399,21 @@ def test_a_moving_plate_pushes_in_each_substep(device):
         end.body_q.assign(np.float32([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]]))
         solver.step(start, end, model.control(), None, DT)
         assert solver.report.certified
-        is_pushed = solver._work.progress.fast.numpy()[0] == 1  # so that no vertex is left in the way
+        is_pushed = solver._work.status.is_fast.numpy()[0] == 1  # so that no vertex is left in the way
         assert is_pushed or solver.report.hits == 0
         start, end = end, start
-    assert solver.report.coupled_steps > 8
+    assert solver.report.totals.substepped_steps > 8
     above = start.particle_q.numpy()[:, 2] - (0.05 + heights[-1])
     assert above.min() > 0.0 and above.max() < 0.001
     assert np.allclose(start.particle_qd.numpy()[:, 2], 20.0 * 12 * DT, rtol=0.1)
 
 
-@pytest.mark.parametrize("coupling", [3, "auto"])
-def test_coupled_steps_in_a_graph_are_those_without(coupling, device):
+@pytest.mark.parametrize("substeps", [3, "auto"])
+def test_coupled_steps_in_a_graph_are_those_without(substeps, device):
     if device.is_cuda and not wp.is_conditional_graph_supported():
         pytest.skip("needs conditional nodes")
     model = bullet(30.0, device=device)
-    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), coupling=coupling)) for _ in range(2))
+    plain, captured = (Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps)) for _ in range(2))
     start, end = captured.states
 
     def frame():
@@ -427,8 +427,8 @@ def test_coupled_steps_in_a_graph_are_those_without(coupling, device):
         wp.capture_launch(capture.graph)
     for _ in range(6):
         plain.step()
-    assert plain.solver.report.coupled_steps > 1
-    assert captured.solver.report.coupled_steps == plain.solver.report.coupled_steps
+    assert plain.solver.report.totals.substepped_steps > 1
+    assert captured.solver.report.totals.substepped_steps == plain.solver.report.totals.substepped_steps
     assert captured.positions.tobytes() == plain.positions.tobytes()
 
 
@@ -437,7 +437,7 @@ def test_a_solver_that_allocates_is_captured_too(device):
     if device.is_cuda and not wp.is_conditional_graph_supported():
         pytest.skip("needs conditional nodes")
     model = bullet(30.0, device=device)
-    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), coupling=3))
+    rollout = Rollout(model, bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=3))
     start, end = rollout.states
     rollout.step()
     with wp.ScopedCapture(device) as capture:
@@ -446,28 +446,26 @@ def test_a_solver_that_allocates_is_captured_too(device):
             rollout.solver.step(*states, rollout.control, None, DT)
     for _ in range(3):
         wp.capture_launch(capture.graph)
-    assert rollout.solver.report.steps == 7 and rollout.solver.report.coupled_steps > 1
-    assert rollout.solver.report.uncertified_steps == 0
+    assert rollout.solver.report.totals.steps == 7 and rollout.solver.report.totals.substepped_steps > 1
+    assert rollout.solver.report.totals.uncertified_steps == 0
     if device.is_cuda:  # a graph of the CPU knows what to leave out
-        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model), coupling="auto")
+        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps="auto")
         with pytest.raises(NotImplementedError, match="SolverXPBD needs a number"), wp.ScopedCapture(device):
             chooses.step(start, end, rollout.control, None, DT)
 
 
 def test_what_cannot_be_coupled_is_refused(device):
     model = bullet(10.0, device=device)
-    with pytest.raises(ValueError, match="coupling must be an integer in"):
-        bsc.SolverCCD(SOLVERS["vbd"](model), coupling=1)
+    with pytest.raises(ValueError, match="substeps must be an integer in"):
+        bsc.SolverCCD(SOLVERS["vbd"](model), substeps=1)
     with pytest.raises(ValueError, match="'auto', not 'always'"):
-        bsc.SolverCCD(SOLVERS["vbd"](model), coupling="always")
-    with pytest.raises(ValueError, match="coupling has no meaning"):
-        bsc.SolverCCD(SOLVERS["vbd"](model), coupling=4, respond=False)
+        bsc.SolverCCD(SOLVERS["vbd"](model), substeps="always")
     builder = newton.ModelBuilder()
     add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
     builder.color()
     differentiable = builder.finalize(device=device, requires_grad=True)
     with pytest.raises(NotImplementedError, match="no gradients"):
-        bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), coupling=4)
+        bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), substeps=4)
 
 
 def vbd_with_self_contact(model):
@@ -525,7 +523,7 @@ def test_a_bullet_behind_self_contact_is_stopped(device):
     rollout = Rollout(rollout_of, bsc.SolverCCD(vbd_with_self_contact(rollout_of)))
     for _ in range(8):
         rollout.step()
-    assert rollout.collisions == 0 and rollout.solver.report.uncertified_steps == 0
+    assert rollout.collisions == 0 and rollout.solver.report.totals.uncertified_steps == 0
 
 
 def test_the_inner_solver_alone_keeps_its_limit(device):
@@ -557,7 +555,7 @@ def test_friction_holds_and_slides_as_without_coupling(device):
         builder.add_cloth_grid(pos=wp.vec3(*(0.1003 * up - down)), rot=tilt, vel=wp.vec3(), **cells, **STIFF)
         builder.color()
         model = builder.finalize(device=device)
-        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=friction, coupling=4))
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=friction, substeps=4))
         start = rollout.positions.mean(axis=0)
         for _ in range(round(time / DT)):
             rollout.states[0].clear_forces()

@@ -4,8 +4,8 @@ import csv
 import json
 
 import pytest
+from boxes import CORNERS, SIDES, add_box, sum_up
 from stages import FALLING, add_mesh, animate, find, moved, new_stage, save
-from test_intersections import CORNERS, SIDES, add_box, sum_up
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

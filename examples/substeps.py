@@ -1,12 +1,12 @@
-"""Measures how far cloth and soft bodies stretch between the inner solver and the contacts, by the coupling of both.
+"""Measures how far cloth and soft bodies stretch between the inner solver and the contacts, by the substeps of both.
 
-    python examples/coupling.py
-    python examples/coupling.py --scenes blocks --coupling 4
+    python examples/substeps.py
+    python examples/substeps.py --scenes blocks --substeps 4
 
 Three scenes in which contact works against elasticity: a cloth drapes over a sphere; a cylinder moves into a sleeve a
 third narrower than itself; two plates press two soft blocks to half their height. The first row of each scene is the
-stage without coupling at a small step, the reference. The second has twice that step, and shows how far the reference
-can be trusted. The others have larger steps: without coupling, with a number of substeps, and with one that the stage
+stage without substeps at a small step, the reference. The second has twice that step, and shows how far the reference
+can be trusted. The others have larger steps: without substeps, with a number of substeps, and with one that the stage
 chooses. Distances are root mean squares.
 """
 
@@ -170,7 +170,7 @@ SCENES = {"drape": Drape, "sleeve": Sleeve, "blocks": Blocks}
 class Run:
     """A simulation of a scene."""
 
-    def __init__(self, scene, dt, coupling):
+    def __init__(self, scene, dt, substeps):
         self.scene, self.dt = scene, dt
         builder = newton.ModelBuilder()
         scene.build(builder)
@@ -179,7 +179,7 @@ class Run:
         self.inner = newton.solvers.SolverVBD(
             model, iterations=scene.iterations, integrate_with_external_rigid_solver=model.body_count > 0
         )
-        self.solver = bsc.SolverCCD(self.inner, friction=scene.friction, coupling=coupling)
+        self.solver = bsc.SolverCCD(self.inner, friction=scene.friction, substeps=substeps)
         self.states, self.control = [model.state(), model.state()], model.control()
         rest = getattr(scene, "rest", model.particle_q.numpy())
         corners = model.tri_indices.numpy()
@@ -243,7 +243,7 @@ def main():
     """Prints a table for each scene."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES), help="scenes (default: all)")
-    parser.add_argument("--coupling", type=int, default=4, help="substeps at 1/240 s; four times as many at 1/60 s")
+    parser.add_argument("--substeps", type=int, default=4, help="substeps at 1/240 s; four times as many at 1/60 s")
     parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
@@ -251,19 +251,19 @@ def main():
         for name in options.scenes:
             scene = SCENES[name]()
             columns = "substeps a step", "distance [mm]", "uncertified", "time [s]"
-            table = Table("step", "coupling", *scene.measures, *columns, title=type(scene).__doc__)
+            table = Table("step", "substeps", *scene.measures, *columns, title=type(scene).__doc__)
             rows = [(REFERENCE, None), (2.0 * REFERENCE, None)]
             for dt in STEPS:
-                rows += [(dt, None), (dt, round(options.coupling * dt / STEPS[0])), (dt, "auto")]
+                rows += [(dt, None), (dt, round(options.substeps * dt / STEPS[0])), (dt, "auto")]
             reference = None
-            for dt, coupling in rows:
-                run = Run(scene, dt, coupling).simulate()
+            for dt, substeps in rows:
+                run = Run(scene, dt, substeps).simulate()
                 reference = run.positions() if reference is None else reference
                 distance = 1e3 * np.sqrt(((run.positions() - reference) ** 2).sum(axis=1).mean())
                 values = [f"{value:.3g}" for value in (*scene.measure(run), np.mean(run.substeps), distance)]
                 report = run.solver.report
-                values += [str(report.uncertified_steps), f"{run.seconds:.1f}"]
-                table.add_row(f"1/{1.0 / dt:.0f}", str(coupling or "-"), *values)
+                values += [str(report.totals.uncertified_steps), f"{run.seconds:.1f}"]
+                table.add_row(f"1/{1.0 / dt:.0f}", str(substeps or "-"), *values)
             Console().print(table)
 
 

@@ -5,11 +5,11 @@ import json
 
 import numpy as np
 import pytest
+from boxes import CORNERS, SIDES
 from chromium import CHROMIUM, Browser
 from pxr import Usd, UsdGeom
+from replay_files import Page
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
-from test_intersections import CORNERS, SIDES
-from test_replay_outputs import Page
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -321,7 +321,7 @@ def test_a_scene_without_faces(tmp_path, capsys):
     add_rope(stage, "/World/Falling", lowered([(0, -1, 0), (0, 1, 0)], 1, -1), [0.25])
     add_points(stage, "/World/Thin", lowered([(0.5, 0, 0)], 1, -1))
     words = [word for name in ("csv", "overlay", "report") for word in (f"--{name}", str(tmp_path / f"{name}.usda"))]
-    found = find(stage, "--min-distance", "0.1", *words)
+    found = find(stage, "--clearance", "0.1", *words)
     said = "at 2 times; between times, distances are not checked, nor are those of curves and points at all.\n"
     assert said in capsys.readouterr().out
     notes = Page((tmp_path / "report.usda").read_text()).data["notes"]

@@ -8,7 +8,7 @@ import sys
 import time
 
 import pytest
-from test_replay_interrupted import OUTPUTS, options, write_old, write_scene
+from waving_sheets import OUTPUTS, options, write_old, write_scene
 
 from warp_bsc._atomic_file import OutputFile, unfinished_path
 from warp_bsc.cli import replay as replay_command
@@ -124,7 +124,9 @@ def test_a_file_of_other_options_is_not_taken(tmp_path, scene, whole, capsys):
     part = tmp_path / PART
     part.write_bytes(whole["hits.json"])
     replay(scene, tmp_path, "--resume", "--no-self", status=2)
-    said = f"warp-bsc: error: {part}: its replay was another one, and cannot go on: self_collisions was True, and is"
+    said = (
+        f"warp-bsc: error: {part}: written with other options or files; cannot resume: self_collisions was True, and is"
+    )
     assert capsys.readouterr().err.startswith(said)
     assert contents(tmp_path) == {PART: whole["hits.json"]}
     (tmp_path / "hits.json").write_bytes(

@@ -1,0 +1,239 @@
+"""The options of ``warp-bsc replay``, their types and its help text."""
+
+import argparse
+import math
+from typing import Literal
+
+from .._atomic_file import STDOUT
+from ..replay.workers import checked_address
+from ..usd.frames import FrameRange
+from ..usd.selection import PURPOSES
+from .exit_status import ExitStatus, explain_statuses
+from .options import add_detection_options, add_fail_on, distance, positive
+
+__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options"]
+
+DESCRIPTION = """\
+Find the collisions of the meshes of a USD scene, with themselves and with each
+other, between each two consecutive time samples; vertices move straight from
+sample to sample. Meshes that never move are obstacles: contacts between
+obstacles are excluded, and so are contacts of a mesh with itself if only its
+transform moves it. Linear curves and points are included, with half their
+widths as radii. Rotations are sampled at every whole time code as well.
+At the time samples themselves, find the edges that pass through faces and the
+meshes that are wholly inside closed ones, including obstacles and linear
+curves; if nothing moves, at one time.
+Parts that cannot be read are named and left out. Files are written atomically.
+If Ctrl-C, SIGTERM, SIGHUP or an error stops the run, it leaves valid files of
+the finished intervals, marked partial. If it is killed, --json leaves a file
+from which --resume continues."""
+"""The help text above the options."""
+
+EPILOG = f"""\
+examples:
+  warp-bsc replay cloth.usd
+  warp-bsc replay shot.usd --overlay hits.usda --report hits.html
+  warp-bsc replay shot.usd --between '/World/Coat' '/World/Body*' --no-self
+  warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
+  warp-bsc replay cloth.usd --device cpu --method conservative
+  warp-bsc replay cloth.usd --json > collisions.json
+  warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
+  warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
+  warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
+  warp-bsc replay shot.usd --workers 16 --json hits.json --resume
+  warp-bsc replay shot.usd --workers tcp://head:8786 --report hits.html
+
+  a recording of one of Newton's examples:
+  python -m newton.examples cloth_twist --viewer usd --num-frames 60 \\
+      --output-path twist.usd
+  warp-bsc replay twist.usd
+
+{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
+"""The help text below the options."""
+
+
+def add_replay_options(command: argparse.ArgumentParser) -> None:
+    """Adds the options of the command."""
+    command.add_argument("scene", metavar="SCENE", nargs="?", help="a .usd, .usda, .usdc or .usdz file")
+
+    which = command.add_argument_group("selection")
+    patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
+    which.add_argument(
+        "--prims",
+        **patterns,
+        help="check only meshes at or below these prims or instances, named as in the report; * matches any text",
+    )
+    which.add_argument("--exclude", **patterns, help="do not check meshes at or below these prims")
+    which.add_argument(
+        "--self",
+        dest="self_collisions",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="check each mesh with itself (default: yes, unless only its transform moves it)",
+    )
+    which.add_argument(
+        "--intersections",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "
+        "are wholly inside others (default: yes)",
+    )
+    which.add_argument(
+        "--clearance",
+        type=distance,
+        metavar="D",
+        help="find the proximities at the time samples themselves: vertices and faces, and edges, that are at most D "
+        "apart, in the scene's unit, and neither share a vertex nor are joined by an edge. Distances between the "
+        "samples are not checked, nor are those of curves and points; an edge that passes through a face is an "
+        "intersection instead",
+    )
+    which.add_argument(
+        "--between", nargs=2, metavar=("A", "B"), help="check only pairs of a mesh of pattern A and one of pattern B"
+    )
+    which.add_argument(
+        "--ignore",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("A", "B"),
+        help="only count the collisions of a mesh of pattern A and one of pattern B; may be repeated",
+    )
+    which.add_argument(
+        "--ignore-from",
+        metavar="FILE",
+        help="read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
+        "begins a comment",
+    )
+    which.add_argument(
+        "--ignore-initial",
+        action="store_true",
+        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; for "
+        "meshes that are inside others then, ignore only that they are inside",
+    )
+    which.add_argument(
+        "--purpose",
+        nargs="+",
+        action="extend",
+        choices=PURPOSES,
+        metavar="PURPOSE",
+        help="purposes of the meshes to check: default, render, proxy, guide (default: default render)",
+    )
+    which.add_argument(
+        "--frames",
+        type=_frames,
+        metavar="START:END:STEP",
+        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
+    )
+    which.add_argument(
+        "--subdivide",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="divide the time from each sample to the next into N intervals, for motion that is not linear, such as "
+        "rotations (default: 1)",
+    )
+    which.add_argument(
+        "--strict",
+        action="store_true",
+        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
+    )
+    which.add_argument(
+        "--allow-missing",
+        **patterns,
+        help="do not count these files, or the files and prims that these prims refer to, as left out if they are "
+        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
+        "may always be missing",
+    )
+    which.add_argument(
+        "--validate",
+        type=_validate,
+        default=0,
+        metavar="all|N",
+        help="decide pairs of each interval again by the exact checker: all, or N hits and N other pairs",
+    )
+
+    out = command.add_argument_group("output")
+    out.add_argument(
+        "--overlay",
+        metavar="FILE",
+        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
+    )
+    file = {"type": _output, "metavar": "FILE"}
+    out.add_argument(
+        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
+    )
+    printed = {"nargs": "?", "const": STDOUT, **file}
+    out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
+    out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
+    out.add_argument(
+        "--baseline",
+        metavar="FILE",
+        help="compare with the JSON file of an earlier replay with the same options: print which meshes collide, "
+        "cross, are inside others or, with --clearance, are near each other at times at which they were not then",
+    )
+    add_fail_on(
+        out,
+        {
+            "intersections": "edges through faces, meshes inside others",
+            "collisions": "",
+            "distance": "proximities, with --clearance",
+            "new": "findings that --baseline does not contain",
+        },
+    )
+    run = command.add_argument_group("running")
+    run.add_argument(
+        "--workers",
+        type=_workers,
+        default=1,
+        metavar="N|ADDRESS",
+        help="check intervals in N processes on this machine, which share its cores or, unless --device names one "
+        "such as cuda:0, its GPUs (default: 1); or in the workers of the Dask cluster whose scheduler has this "
+        "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
+    )
+    run.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue an earlier run with the same options and files that was stopped or killed: take its finished "
+        "intervals from the file of --json, or that name with .part appended, and check the others; without these "
+        "files, check all",
+    )
+    add_detection_options(command, method="exact")
+
+
+def _output(text: str) -> str:
+    return STDOUT if text == "/dev/stdout" else text
+
+
+def _frames(text: str) -> FrameRange:
+    parts = text.split(":")
+    if len(parts) > 3:
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP, not {text!r}")
+    try:
+        numbers = [float(part) if part else None for part in parts]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP, three numbers, not {text!r}") from None
+    start, end, step = numbers + [None] * (3 - len(numbers))
+    if any(number is not None and not math.isfinite(number) for number in numbers):
+        raise argparse.ArgumentTypeError(f"must be finite numbers, not {text!r}")
+    if step is not None and step <= 0:
+        raise argparse.ArgumentTypeError(f"STEP must be more than 0, not {step:g}")
+    if len(parts) < 2 or (start is not None and end is not None and end <= start):
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END after START, not {text!r}")
+    return FrameRange(start, end, step)
+
+
+def _validate(text: str) -> int | Literal["all"]:
+    if text == "all":
+        return "all"
+    try:
+        return positive(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"must be all or an integer of at least 1, not {text}") from error
+
+
+def _workers(text: str) -> int | str:
+    try:
+        return checked_address(text) if "://" in text else positive(text)
+    except (argparse.ArgumentTypeError, ValueError) as error:
+        message = f"must be an integer of at least 1, or an address such as tcp://head:8786, not {text}"
+        raise argparse.ArgumentTypeError(message) from error

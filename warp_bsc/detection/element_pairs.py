@@ -1,0 +1,283 @@
+"""The pairs of elements that two faces of a hierarchy represent: kernels that enqueue those whose boxes overlap."""
+
+import warp as wp
+
+from ..kernels.pipeline.bits import lowest_bit
+from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box
+from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits
+from ..kernels.pipeline.pairs import owns_edge, owns_vertex
+from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
+from .face_hierarchy import FaceHierarchy
+from .settings import NO_GRADIENTS, Count
+
+__all__ = [
+    "PAIRS_OF_THREAD",
+    "overlapping_edges",
+    "overlapping_vertices",
+    "pair_edges_with_faces",
+    "pair_elements",
+    "pair_points",
+]
+
+_CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_QUEUED = wp.constant(int(Count.QUEUED))
+
+_WIDTH = wp.constant(WIDTH)
+
+PAIRS_OF_THREAD = wp.constant(4)
+"""Most pairs of faces whose elements a thread pairs."""
+_PAIRS_AT_ONCE = wp.constant(1 << 17)
+"""Pairs of faces that a GPU works on at once, each by a thread of its own."""
+_BITS_OF_PAIR = wp.constant(15)
+"""Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
+
+
+@wp.func
+def _overlap(a: BoxRows, b: BoxRows):
+    """Returns whether two boxes overlap over the time of the motion."""
+    return boxes_overlap(wp.min(a[0], a[2]), wp.max(a[1], a[3]), wp.min(b[0], b[2]), wp.max(b[1], b[3]))
+
+
+@wp.func
+def _apart(a: BoxRows, b: BoxRows):
+    return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
+
+
+@wp.func
+def _next(corner: int):
+    return wp.where(corner == 2, 0, corner + 1)
+
+
+@wp.func
+def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
+    return faces[face, 0] == vertex or faces[face, 1] == vertex or faces[face, 2] == vertex
+
+
+@wp.func
+def _is_face(mesh: FaceHierarchy, place: int) -> bool:
+    """Returns whether the cell at a place is a face; where all are, nothing is read."""
+    if mesh.all_faces:
+        return True
+    return mesh.order[place] < mesh.face_count
+
+
+@wp.func
+def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+    """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
+
+    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
+    """
+    owned = mesh.owned[face]
+    found = int(0)
+    if owned & 7 == 0 or not _is_face(mesh, other):
+        return found
+    other_box = read_box(mesh.face_boxes, other)
+    corners = int(3)  # not a constant, as the body would be repeated
+    for corner in range(corners):
+        if owns_vertex(owned, corner):
+            box = read_box(mesh.vertex_boxes, 3 * face + corner)
+            if _overlap(box, other_box) and not _has_vertex(mesh.faces, other, mesh.faces[face, corner]):
+                found = found | (1 << corner)
+                if keep_separated or not _apart(box, other_box):
+                    found = found | (8 << corner)
+    return found
+
+
+@wp.func
+def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
+    """Returns which edges that two faces own have overlapping boxes: bit 3 i + j for sides i and j.
+
+    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well.
+    """
+    owned = mesh.owned[face]
+    other_owned = mesh.owned[other]
+    found = int(0)
+    sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
+    for side in range(sides):
+        if owns_edge(owned, side):
+            box = read_box(mesh.edge_boxes, 3 * face + side)
+            if boxes_overlap(
+                wp.min(box[0], box[2]), wp.max(box[1], box[3]), mesh.places.lowers[other], mesh.places.uppers[other]
+            ):
+                a = mesh.faces[face, side]
+                b = mesh.faces[face, _next(side)]
+                for other_side in range(sides):
+                    if owns_edge(other_owned, other_side):
+                        c = mesh.faces[other, other_side]
+                        d = mesh.faces[other, _next(other_side)]
+                        if a != c and a != d and b != c and b != d:
+                            other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
+                            if _overlap(box, other_box):
+                                bit = 3 * side + other_side
+                                found = found | (1 << bit)
+                                if keep_separated or not _apart(box, other_box):
+                                    found = found | (512 << bit)
+    return found
+
+
+@wp.kernel(**NO_GRADIENTS)
+def pair_elements(
+    mesh: FaceHierarchy,
+    # in
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    threads: int,
+    keep_separated: bool,
+    # counts, in and out, and queues
+    vertex_face_counts: wp.array[wp.int64],
+    vertex_face: wp.array[wp.vec2i],
+    edge_edge_counts: wp.array[wp.int64],
+    edge_edge: wp.array[wp.vec2i],
+):
+    """Counts the candidates of pairs of faces, and enqueues those that no axis separates.
+
+    A thread first finds all its pairs, then takes slots for them: where pairs of faces are many, a warp makes one
+    atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
+    """
+    i = wp.tid()
+    count = int(wp.min(face_pair_count[0], wp.int64(face_pairs.shape[0])))
+    turns = wp.min(wp.max((count - 1) / threads + 1, count / _PAIRS_AT_ONCE), PAIRS_OF_THREAD)
+    first = (i / _WIDTH) * turns * _WIDTH + i % _WIDTH
+    if first >= count:
+        return
+    found = wp.uint64(0)
+    candidates = wp.vec2i()  # vertex-face, edge-edge
+    queued = wp.vec2i()
+    for turn in range(turns):
+        at = first + turn * _WIDTH
+        if is_filled(at, face_pairs, face_pair_count, 0):
+            face = face_pairs[at][0]
+            other = face_pairs[at][1]
+            vertices = overlapping_vertices(mesh, face, other, keep_separated)
+            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
+            edges = overlapping_edges(mesh, face, other, keep_separated)
+            candidates[0] += count_set_bits(wp.uint32(vertices & 455))
+            candidates[1] += count_set_bits(wp.uint32(edges & 511))
+            # of the rest only what no axis separates
+            vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
+            edges = edges >> 9
+            queued[0] += count_set_bits(wp.uint32(vertices))
+            queued[1] += count_set_bits(wp.uint32(edges))
+            found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
+    raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
+    raise_count(edge_edge_counts, _CANDIDATES, candidates[1])
+    vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
+    edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
+    while found != wp.uint64(0):
+        bit = lowest_bit(found)
+        found = found & (found - wp.uint64(1))
+        at = first + (bit / _BITS_OF_PAIR) * _WIDTH
+        bit = bit % _BITS_OF_PAIR
+        face = face_pairs[at][0]
+        other = face_pairs[at][1]
+        if bit < 3:
+            write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
+        elif bit < 6:
+            write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
+            vertex_face_slot += wp.int64(1)
+        else:
+            edge = mesh.face_edges[face, (bit - 6) / 3]
+            other_edge = mesh.face_edges[other, (bit - 6) % 3]
+            write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
+            edge_edge_slot += wp.int64(1)
+
+
+@wp.func
+def _pair_edges_with_face(
+    mesh: FaceHierarchy,
+    face: int,
+    other: int,
+    # in and out
+    counts: wp.array[wp.int64],
+    # out
+    pairs: wp.array[wp.vec2i],
+):
+    """Enqueues the edges that a face owns with another face."""
+    owned = mesh.owned[face]
+    sides = wp.where(owned >> 3 == 0 or not _is_face(mesh, other), 0, 3)
+    for side in range(sides):
+        if owns_edge(owned, side):
+            row = 3 * face + side
+            a = mesh.faces[face, side]
+            b = mesh.faces[face, _next(side)]
+            if _overlap(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
+                if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
+                    append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
+
+
+@wp.kernel(**NO_GRADIENTS)
+def pair_edges_with_faces(
+    mesh: FaceHierarchy,
+    # in
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    # in and out
+    counts: wp.array[wp.int64],
+    # out
+    pairs: wp.array[wp.vec2i],
+):
+    """Enqueues the edges that two faces own, each with the other face, where their boxes overlap."""
+    i = wp.tid()
+    if not is_filled(i, face_pairs, face_pair_count, 0):
+        return
+    face = face_pairs[i][0]
+    other = face_pairs[i][1]
+    _pair_edges_with_face(mesh, face, other, counts, pairs)
+    _pair_edges_with_face(mesh, other, face, counts, pairs)
+
+
+@wp.func
+def _pair_point(
+    mesh: FaceHierarchy,
+    place: int,
+    other: int,
+    keep_separated: bool,
+    # in and out
+    vertex_edge_counts: wp.array[wp.int64],
+    # out
+    vertex_edge: wp.array[wp.vec2i],
+):
+    """Enqueues a point with an edge that no face has, if the cells at two places are that."""
+    cell = mesh.order[other]
+    if mesh.order[place] >= mesh.point_start and cell >= mesh.face_count and cell < mesh.point_start:
+        box = read_box(mesh.vertex_boxes, 3 * place)
+        other_box = read_box(mesh.edge_boxes, 3 * other)
+        if _overlap(box, other_box):
+            take_slot(vertex_edge_counts, _CANDIDATES)
+            if keep_separated or not _apart(box, other_box):
+                append(
+                    wp.vec2i(mesh.faces[place, 0], mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED
+                )
+
+
+@wp.kernel(**NO_GRADIENTS)
+def pair_points(
+    mesh: FaceHierarchy,
+    # in
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    keep_separated: bool,
+    # counts, in and out, and queues
+    vertex_edge_counts: wp.array[wp.int64],
+    vertex_edge: wp.array[wp.vec2i],
+    vertex_vertex_counts: wp.array[wp.int64],
+    vertex_vertex: wp.array[wp.vec2i],
+):
+    """Counts and enqueues the points among two cells, with an edge that no face has or with another point."""
+    i = wp.tid()
+    if not is_filled(i, face_pairs, face_pair_count, 0):
+        return
+    place = face_pairs[i][0]
+    other = face_pairs[i][1]
+    _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)
+    _pair_point(mesh, other, place, keep_separated, vertex_edge_counts, vertex_edge)
+    if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
+        box = read_box(mesh.vertex_boxes, 3 * place)
+        other_box = read_box(mesh.vertex_boxes, 3 * other)
+        if _overlap(box, other_box):
+            take_slot(vertex_vertex_counts, _CANDIDATES)
+            if keep_separated or not _apart(box, other_box):
+                p = mesh.faces[place, 0]
+                q = mesh.faces[other, 0]
+                append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)

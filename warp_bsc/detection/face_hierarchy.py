@@ -1,0 +1,354 @@
+"""A hierarchy of boxes over the faces of a mesh, and its traversal on a GPU.
+
+The hierarchy is made once, from the connectivity of the mesh, see :mod:`.face_order`: patches of connected faces stay
+compact however a mesh moves. A run only fits its boxes. Edges that no face has and points have places as well, as faces
+that have collapsed: the cells of the mesh are its faces, then these edges, then the points. Cells without neighbours
+are in no order, and in the worst case are compared by brute force, 1,024 pairs of cells at a time.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..kernels.pipeline.boxes import BoxRows, lowered, raised, rounded, write_box
+from ..kernels.pipeline.hierarchy import (
+    WIDTH,
+    HierarchyLevel,
+    bits_from,
+    changed_children,
+    fit_parent,
+    lowest_set_bit,
+    overlapping_children,
+    overlapping_faces,
+)
+from ..kernels.pipeline.queues import raise_count
+from .launch import made_once
+from .mesh import CollisionMesh
+from .settings import NO_GRADIENTS
+
+__all__ = ["FaceHierarchy", "box_elements_kernel", "box_groups", "group_count", "make_hierarchy", "traversal_kernel"]
+
+_WIDTH = wp.constant(WIDTH)
+
+_UNGROUPED = 8
+"""Number of groups up to which all of them are traversed: their boxes would take longer than they save."""
+
+
+@wp.struct
+class FaceHierarchy:
+    """The faces in the order of their places, the boxes of elements, and the nodes above the faces.
+
+    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end. Those of vertices and
+    edges lie beside one another where the face is that represents them: row ``3 place + corner`` or side. Other rows
+    are not set.
+
+    Attributes:
+        all_faces: Whether all cells are faces.
+        only_free: Whether pairs of two faces are left out.
+        face_count: Number of faces; greater cells are edges.
+        point_start: First cell that is a point.
+        order: Cell at each place, -1 for none.
+        faces: Vertices of the face at each place.
+        face_edges: Edges of the face at each place.
+        owned: The elements whose representative the face at each place is.
+        edges: Vertices of each edge.
+        vertex_rows: Row of each vertex in ``vertex_boxes``, -1 if no face uses it.
+        edge_rows: Row of each edge in ``edge_boxes``.
+        vertex_boxes: Boxes of the vertices that each face represents.
+        edge_boxes: Boxes of the edges that each face represents.
+        face_boxes: Box of the face at each place.
+        places: Level of the faces.
+        clusters: Level above.
+        groups: Highest level; without arrays in a small mesh, where all groups are traversed.
+    """
+
+    all_faces: wp.bool
+    only_free: wp.bool
+    face_count: int
+    point_start: int
+    order: wp.array[int]
+    faces: wp.array2d[int]
+    face_edges: wp.array2d[int]
+    owned: wp.array[int]
+    edges: wp.array2d[int]
+    vertex_rows: wp.array[int]
+    edge_rows: wp.array[int]
+    vertex_boxes: wp.array2d[wp.vec3]
+    edge_boxes: wp.array2d[wp.vec3]
+    face_boxes: wp.array2d[wp.vec3]
+    places: HierarchyLevel
+    clusters: HierarchyLevel
+    groups: HierarchyLevel
+
+
+@wp.func
+def empty_box() -> BoxRows:
+    """Returns a box that overlaps none."""
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    return wp.matrix_from_rows(low, -low, low, -low)
+
+
+@made_once
+def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
+    """Returns the kernel that boxes moving elements and clusters, for one type of position, padded or not.
+
+    Its threads are the places of faces, then the edges, then the vertices.
+    """
+
+    @wp.func
+    def padding_of(padding: wp.array[wp.float64], vertex: int) -> wp.float64:
+        """Returns the padding of a vertex; without one the array is not read."""
+        if wp.static(padded):
+            return padding[vertex]
+        return wp.float64(0.0)
+
+    @wp.func
+    def lowest(x: Any, pad: wp.float64) -> wp.vec3:
+        if wp.static(padded):
+            return lowered(x, pad)
+        return rounded(x)
+
+    @wp.func
+    def highest(x: Any, pad: wp.float64) -> wp.vec3:
+        if wp.static(padded):
+            return raised(x, pad)
+        return rounded(x)
+
+    @wp.func
+    def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
+        return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
+
+    @wp.func
+    def box_of_two(
+        x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], a: int, b: int, finite: bool
+    ) -> BoxRows:
+        """Returns the box of two vertices, an empty one if that is not finite."""
+        if finite:
+            pad = wp.max(padding_of(padding, a), padding_of(padding, b))
+            return wp.matrix_from_rows(
+                lowest(wp.min(x0[a], x0[b]), pad),
+                highest(wp.max(x0[a], x0[b]), pad),
+                lowest(wp.min(x1[a], x1[b]), pad),
+                highest(wp.max(x1[a], x1[b]), pad),
+            )
+        return empty_box()
+
+    @wp.kernel(**NO_GRADIENTS)
+    def box_elements(
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        changed: wp.array[int],
+        checked: wp.array[int],
+        padding: wp.array[wp.float64],
+        # in and out
+        mesh: FaceHierarchy,
+        # out
+        not_finite: wp.array[wp.int64],
+    ):
+        i = wp.tid()
+        finite = bool(True)  # here, as Warp selects between the values before and after a branch
+        places = mesh.order.shape[0]
+        if i < places:  # the same for all threads of a warp
+            low = wp.vec3(wp.inf, wp.inf, wp.inf)
+            high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            has_changed = int(0)
+            if mesh.order[i] >= 0:
+                a = mesh.faces[i, 0]
+                b = mesh.faces[i, 1]
+                c = mesh.faces[i, 2]
+                pad = wp.max(wp.max(padding_of(padding, a), padding_of(padding, b)), padding_of(padding, c))
+                low0 = lowest(wp.min(wp.min(x0[a], x0[b]), x0[c]), pad)
+                high0 = highest(wp.max(wp.max(x0[a], x0[b]), x0[c]), pad)
+                low1 = lowest(wp.min(wp.min(x1[a], x1[b]), x1[c]), pad)
+                high1 = highest(wp.max(wp.max(x1[a], x1[b]), x1[c]), pad)
+                finite = is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c)
+                if not finite:  # the place covers the other elements that it represents
+                    low0 = low
+                    high0 = high
+                    low1 = low
+                    high1 = high
+                    for corner in range(3):
+                        vertex = mesh.faces[i, corner]
+                        if is_finite(x0, x1, vertex):
+                            low0 = wp.min(low0, lowest(x0[vertex], pad))
+                            high0 = wp.max(high0, highest(x0[vertex], pad))
+                            low1 = wp.min(low1, lowest(x1[vertex], pad))
+                            high1 = wp.max(high1, highest(x1[vertex], pad))
+                low = wp.min(low0, low1)
+                high = wp.max(high0, high1)
+                box = wp.matrix_from_rows(low0, high0, low1, high1)
+                if not finite:
+                    box = empty_box()
+                write_box(box, mesh.face_boxes, i)
+                has_changed = 1
+                if changed:
+                    has_changed = changed[a] | changed[b] | changed[c]
+                if mesh.only_free and mesh.order[i] < mesh.face_count:
+                    has_changed = 0
+            mesh.places.lowers[i] = low
+            mesh.places.uppers[i] = high
+            mesh.places.changed[i] = has_changed
+            fit_parent(i, low, high, has_changed, mesh.clusters)
+            return
+        edge = i - places
+        if edge < mesh.edges.shape[0]:
+            a = mesh.edges[edge, 0]
+            b = mesh.edges[edge, 1]
+            finite = is_finite(x0, x1, a) and is_finite(x0, x1, b)
+            write_box(box_of_two(x0, x1, padding, a, b, finite), mesh.edge_boxes, mesh.edge_rows[edge])
+            return
+        vertex = edge - mesh.edges.shape[0]
+        finite = is_finite(x0, x1, vertex)
+        if not_finite:
+            if not finite:
+                counted = int(1)
+                if checked:
+                    counted = checked[vertex]
+                if counted != 0:
+                    raise_count(not_finite, 0, 1)
+        row = mesh.vertex_rows[vertex]
+        if row >= 0:
+            write_box(box_of_two(x0, x1, padding, vertex, vertex, finite), mesh.vertex_boxes, row)
+
+    return box_elements
+
+
+@wp.kernel(**NO_GRADIENTS)
+def box_groups(
+    # in
+    clusters: HierarchyLevel,
+    # out
+    groups: HierarchyLevel,
+):
+    """Boxes the groups of clusters."""
+    i = wp.tid()
+    low = wp.vec3(wp.inf, wp.inf, wp.inf)
+    high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    has_changed = int(0)
+    if i < clusters.lowers.shape[0]:
+        low = clusters.lowers[i]
+        high = clusters.uppers[i]
+        has_changed = clusters.changed[i]
+    fit_parent(i, low, high, has_changed, groups)
+
+
+@made_once
+def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
+    """Returns a kernel that visits the pairs of faces whose swept boxes overlap, each pair once.
+
+    Its parameters are a :class:`FaceHierarchy`, the warps of a cluster and the arguments; launch it with
+    :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
+
+    Args:
+        visit: Device function, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
+            overlaps the face at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
+            together, each for its own face of one cluster, some of them with no bits. A thread may call it for many
+            ``first``, or for none.
+        arguments_type: Type of the last argument, a struct of Warp.
+    """
+
+    @wp.kernel(**NO_GRADIENTS)
+    def traverse(mesh: FaceHierarchy, warps_of_cluster: int, arguments: arguments_type):
+        i = wp.tid()
+        cluster = i / (_WIDTH * warps_of_cluster)
+        part = (i / _WIDTH) % warps_of_cluster
+        place = cluster * _WIDTH + i % _WIDTH
+        low = mesh.clusters.lowers[cluster]
+        high = mesh.clusters.uppers[cluster]
+        own_group = cluster / _WIDTH
+        turn = int(0)
+        count = (mesh.clusters.lowers.shape[0] - 1) / _WIDTH + 1
+        for first_group in range(own_group, count, _WIDTH):
+            groups = wp.uint32(0)
+            if mesh.groups.lowers:
+                groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
+            else:
+                groups = ~bits_from(count - first_group)
+            while groups != wp.uint32(0):
+                group = first_group + lowest_set_bit(groups)
+                groups = groups & (groups - wp.uint32(1))
+                clusters = overlapping_children(mesh.clusters, cluster, low, high, mesh.clusters, group * _WIDTH)
+                if group == own_group:
+                    clusters = clusters & bits_from(cluster % _WIDTH)
+                while clusters != wp.uint32(0):
+                    first = (group * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
+                    clusters = clusters & (clusters - wp.uint32(1))
+                    if turn % warps_of_cluster == part:
+                        faces = overlapping_children(mesh.clusters, cluster, low, high, mesh.places, first)
+                        if faces != wp.uint32(0):
+                            changed = changed_children(mesh.places, first)
+                            found = overlapping_faces(mesh.places, place, first, faces, changed)
+                            visit(place, first, found, arguments)
+                    turn += 1
+
+    return traverse
+
+
+def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
+    """Allocates a level of nodes; worlds: the lowest and the highest of each, int, shape [2, count], or None."""
+    level = HierarchyLevel()
+    level.lowers = wp.empty(count, dtype=wp.vec3, device=device)
+    level.uppers = wp.empty(count, dtype=wp.vec3, device=device)
+    level.changed = wp.zeros(count, dtype=int, device=device)
+    if worlds is not None:
+        level.first_world, level.last_world = (wp.array(w.astype(np.int32), dtype=int, device=device) for w in worlds)
+    return level
+
+
+def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
+    """Returns the lowest and the highest world of each parent, from those of the children, shape [2, n]."""
+    if worlds is None:
+        return None
+    first, last = (np.pad(w, (0, -len(w) % WIDTH), mode="edge").reshape(-1, WIDTH) for w in worlds)
+    return np.stack([first.min(axis=1), last.max(axis=1)])
+
+
+def group_count(places: int) -> int:
+    """Returns the number of groups that have boxes."""
+    groups = -(-places // (WIDTH * WIDTH))
+    return groups if groups > _UNGROUPED else 0
+
+
+def make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
+    """Allocates the hierarchy of a mesh on its device."""
+    device, order = mesh.device, mesh.face_order
+    hierarchy = FaceHierarchy()
+
+    def by_place(values: np.ndarray) -> wp.array:
+        return wp.array(values[order] if len(order) else values, dtype=int, device=device)
+
+    hierarchy.order = wp.array(order, dtype=int, device=device)
+    hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
+    hierarchy.only_free = mesh.only_free
+    hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
+    hierarchy.faces = by_place(mesh.cells)
+    hierarchy.face_edges = by_place(mesh.cell_edges)
+    hierarchy.owned = by_place(mesh.cell_owned)
+    hierarchy.edges = mesh.device_edges
+    vertex_rows, edge_rows = np.full(mesh.vertex_count, -1), np.empty(len(mesh.edges))
+    filled = np.flatnonzero(order >= 0)
+    for i in range(3):
+        for rows, elements, bit in ((vertex_rows, mesh.cells, i), (edge_rows, mesh.cell_edges, 3 + i)):
+            representing = filled[(mesh.cell_owned[order[filled]] >> bit) & 1 == 1]
+            rows[elements[order[representing], i]] = 3 * representing + i
+    hierarchy.vertex_rows = wp.array(vertex_rows.astype(np.int32), dtype=int, device=device)
+    hierarchy.edge_rows = wp.array(edge_rows.astype(np.int32), dtype=int, device=device)
+    hierarchy.vertex_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
+    hierarchy.edge_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
+    hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)
+    worlds = None
+    if mesh.world is not None and len(order):
+        world = mesh.world[mesh.cells[:, 0]][order]
+        # empty places have the worlds of the faces before, which keeps those of nodes
+        filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
+        worlds = np.stack([world[filled], world[filled]])
+    clusters, groups = len(order) // WIDTH, group_count(len(order))
+    hierarchy.places = _level(len(order), worlds, device)
+    worlds = _parents(worlds)
+    hierarchy.clusters = _level(clusters, worlds, device)
+    if groups:
+        hierarchy.groups = _level(groups, _parents(worlds), device)
+    return hierarchy

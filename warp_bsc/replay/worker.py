@@ -1,0 +1,205 @@
+"""The program of a worker, which checks chunks of intervals, and the pickles that it exchanges with its starter."""
+
+import contextlib
+import io
+import multiprocessing
+import os
+import pickle
+import signal
+import socket
+import threading
+import traceback
+from collections.abc import Iterator
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from .._version import __version__
+from ..detection.launch import cores
+from ..detection.start import find_device, gpu_count
+from ..usd.interval import ReadingNotes
+from ..usd.scene import Scene
+from ..usd.segment import Segment
+from ..usd.selection import Selection
+from .checking import Checks, IntervalChecker
+from .results import IntervalResult
+
+__all__ = [
+    "check_chunk",
+    "device_of_worker",
+    "find_selection_without_initial",
+    "name_device",
+    "pack",
+    "serve",
+    "unpack",
+]
+
+_CHUNK_SECONDS = 15.0  # a chunk ends after this time: results that are not yet written can be lost
+
+_ONE_CHUNK = threading.Lock()
+"""Held while a chunk is checked: a worker of Dask has several threads."""
+
+_local: tuple[int, int] | None = None
+"""Number of this worker and number of all workers on this machine, None in a worker of Dask."""
+
+_opened: tuple[bytes, IntervalChecker] | None = None
+"""The job of the last chunk of this worker, and its checker."""
+
+
+def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
+    """Returns the name of the device that a worker on this machine uses: the GPUs in turns unless one is named.
+
+    If there are more workers than GPUs, workers share them.
+
+    Args:
+        name: Name of the requested device, None for Warp's default.
+        number: Number of the worker, from 0.
+        gpu_count: Number of GPUs of the machine.
+    """
+    return f"cuda:{number % gpu_count}" if gpu_count and name in (None, "cuda") else name
+
+
+def serve(connection: Connection, number: int, count: int) -> None:
+    """Runs a local worker: calls the functions that it receives through a connection until that is closed."""
+    global _local  # noqa: PLW0603 (one for the process)
+    _local = number, count
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            function, arguments = connection.recv()
+            try:
+                reply = function(*arguments), None
+            except Exception as error:
+                reply = None, _portable(error)
+            connection.send(reply)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent
+    parent.join()
+    os._exit(1)
+
+
+def check_chunk(job: bytes, first: int, stop: int) -> bytes:
+    """Checks intervals and returns the results, and the error that stopped them, pickled for :func:`unpack`.
+
+    After :data:`_CHUNK_SECONDS` no more intervals are read, so that the last ones may be missing; the first one never
+    is.
+    """
+    global _opened  # noqa: PLW0603
+    stream = io.BytesIO()
+    pickler = _Pickler(stream, pickle.HIGHEST_PROTOCOL)
+    with _ONE_CHUNK:
+        checker = None
+        try:
+            checker = _open(job)
+            with cores(_core_count()):
+                for result in checker.check(first, stop, _CHUNK_SECONDS):
+                    checker.scene.files.check()
+                    pickler.index = result.summary.index
+                    pickler.dump((pickler.index, result.contacts.interval.notes))
+                    pickler.dump(result)
+        except Exception as raised:
+            _opened = None
+            pickler.dump((first, checker.scene.take_notes() if checker else ReadingNotes()))
+            pickler.dump(_portable(raised))
+        pickler.dump(None)
+    return stream.getvalue()
+
+
+def find_selection_without_initial(job: bytes) -> Selection:
+    """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
+    try:
+        with _ONE_CHUNK, cores(_core_count()):
+            return _open(job).selection_without_initial()
+    except Exception as error:
+        raise _portable(error) from None
+
+
+def name_device(name: str | None) -> str:
+    """Returns the name of the device that this worker uses."""
+    return find_device(name).alias
+
+
+def _open(job: bytes) -> IntervalChecker:
+    """Returns the checker of a job, the last one if it is the same."""
+    global _opened  # noqa: PLW0603
+    if _opened is None or _opened[0] != job:
+        _opened = None  # before the next scene is opened, to free memory
+        stream = io.BytesIO(job)
+        version = pickle.load(stream)
+        if version != __version__:
+            raise ValueError(f"{_worker_name()}: this worker has version {__version__} of warp-bsc, not {version}")
+        scene, checks = pickle.load(stream)
+        device = checks.device
+        if _local:
+            device = device_of_worker(device, _local[0], gpu_count())
+        checks = replace(checks, device=find_device(device).alias)
+        _opened = job, IntervalChecker(scene, checks, _worker_name())
+    return _opened[1]
+
+
+def _core_count() -> int:
+    """Returns the number of cores for this worker: its share of the machine, or the threads that Dask gives it."""
+    if _local:
+        return max(1, (os.cpu_count() or 1) // _local[1])
+    from distributed import get_worker  # noqa: PLC0415 (optional)
+
+    return get_worker().state.nthreads
+
+
+def _worker_name() -> str:
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+def _portable(error: Exception) -> Exception:
+    """Returns an error with the same message that can be sent to another process."""
+    if isinstance(error, OSError):
+        return OSError(error.errno, error.strerror, error.filename) if error.strerror else OSError(str(error))
+    if isinstance(error, ValueError):
+        return ValueError(str(error))
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    place = f"{Path(frame.filename).name}:{frame.lineno}"
+    return RuntimeError(f"{type(error).__name__}: {error} (in worker {_worker_name()}, {place})")
+
+
+# Messages between the processes ----------------------------------------------------------------------------------
+
+
+def pack(scene: Scene, checks: Checks) -> bytes:
+    """Returns a scene and checks as a worker opens them, equal bytes for equal content."""
+    return pickle.dumps(__version__) + pickle.dumps((scene, checks))
+
+
+class _Pickler(pickle.Pickler):
+    """Writes the number of an interval instead of its segment."""
+
+    index = 0
+
+    def persistent_id(self, obj: Any) -> int | None:
+        return self.index if isinstance(obj, Segment) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads numbers of intervals as their segments in a scene."""
+
+    def __init__(self, stream: io.BytesIO, scene: Scene):
+        super().__init__(stream)
+        self._scene = scene
+
+    def persistent_load(self, pid: int) -> Segment:
+        return self._scene.segment(pid)
+
+
+def unpack(scene: Scene, found: bytes) -> Iterator[IntervalResult]:
+    """Yields the results of a chunk, records the scene's reading notes, and raises the error that stopped the chunk."""
+    unpickler = _Unpickler(io.BytesIO(found), scene)  # one for all, as consecutive intervals share objects
+    while notes := unpickler.load():
+        scene.note(*notes)
+        result = unpickler.load()
+        if isinstance(result, Exception):
+            raise result
+        yield result

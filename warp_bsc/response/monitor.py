@@ -1,0 +1,74 @@
+"""The stage that only watches: it reports the collisions of another solver's steps, and changes nothing."""
+
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from .._one_thread import one_at_a_time
+from ..detection.host_function import run_on_host
+from .integration.wrapped_solver import StateArrays
+from .options import checked_min_distance, checked_radii, default_separation
+from .stage import CollisionStage
+from .state.friction import Friction
+from .state.mesh import ModelMesh
+from .step import inspect
+from .write_back import finish_inspection
+
+
+class CollisionMonitor(CollisionStage):
+    """Lets another solver step, and reports the collisions of its motion; changes no bit of its results.
+
+    Each step costs one detection. The certificate is that of :class:`.solver_ccd.SolverCCD`: a certified step is free
+    of collisions, except for those of elements that crossed or touched at its start. The :attr:`report` counts a
+    contact among its ``hits`` in the step that passes it. Elements that cross from then on are counted in
+    ``crossings``, and their contacts as ``excluded``. With a minimum distance, it counts the pairs that come nearer
+    than they may. On a :class:`warp.Tape` a step records what the inner solver records.
+
+    Attributes:
+        solver: The inner solver.
+        mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
+        report: What the monitor found, :class:`.report.SolverReport`.
+    """
+
+    def __init__(
+        self,
+        solver: SolverBase,
+        *,
+        min_distance: float | None = None,
+        particle_radius: float | np.ndarray | wp.array | None = None,
+    ):
+        """Puts the monitor behind a solver.
+
+        Args:
+            solver: Any Newton solver that moves particles.
+            min_distance: Distance that pairs should keep [m], as for :class:`.solver_ccd.SolverCCD`.
+            particle_radius: Radius of each particle [m], as for :class:`.solver_ccd.SolverCCD`.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If a distance is out of range.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
+        """
+        super().__init__(solver)
+        min_distance, radii = checked_min_distance(min_distance), checked_radii(particle_radius, self.model)
+        keeps_distances = min_distance > 0.0 or bool(radii.any())
+        mesh = ModelMesh(self.model, strands=keeps_distances)
+        if keeps_distances:
+            mesh.keep_distances(min_distance, radii, reach=0.0)
+        nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
+        friction = Friction(mesh, nothing[:1], nothing)
+        self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)
+
+    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
+        end = StateArrays.of(state_out)
+        run_on_host(lambda: self._inspect(end, dt), self.mesh.device)
+
+    @one_at_a_time
+    def _inspect(self, end, dt):
+        """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
+        with self._timed():
+            self._set_end(end, dt)
+            resolution = inspect(self._work, self._motion)
+            inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
+            self._launch(finish_inspection, self.mesh.vertex_count, inputs, outputs)
+            self._count_step(resolution)

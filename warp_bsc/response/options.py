@@ -1,0 +1,193 @@
+"""The arguments of the collision stage as one frozen dataclass, with their checks."""
+
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
+
+import newton
+import numpy as np
+import warp as wp
+from newton import BodyFlags
+from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
+
+from .._arguments import (
+    checked_choice,
+    checked_distance,
+    checked_distances,
+    checked_flag,
+    checked_integer,
+    checked_number,
+    given,
+)
+from .schedule import MAX_ITERATIONS
+from .state.friction import Friction
+from .state.mesh import ModelMesh
+from .tuning import SEPARATION
+
+MAX_SUBSTEPS = 1024
+MAX_FLOAT = float(np.finfo(np.float32).max)
+Bodies = Literal["pushed", "separated", "left"]
+
+
+@dataclass(frozen=True, eq=False)
+class StageOptions:
+    """The arguments of :class:`.solver_ccd.SolverCCD`, checked, with defaults that follow from the model.
+
+    Attributes:
+        separation: Distance that contacts are moved apart [m], None for the default of the mesh.
+        friction: Coefficients of particles, shape [1] or [particle_count].
+        reads_friction: Whether each step reads the coefficients again.
+        restitution: Share of the approaching velocity that comes back, shape [1].
+        substeps: Substeps of a step that collides, "auto" or None.
+        bodies: What becomes of dynamic bodies.
+        min_distance: Distance that pairs keep [m].
+        radii: Radius of each particle [m], shape [particle_count].
+        contact_layer: Whether to put in a contact layer if the model requires gradients.
+        lift_speed_limit: Whether to lift the speed limit of VBD's self-contact.
+        max_iterations: Iterations of detect and project.
+    """
+
+    separation: float | None
+    friction: wp.array
+    reads_friction: bool
+    restitution: wp.array
+    substeps: int | Literal["auto"] | None
+    bodies: Bodies
+    min_distance: float
+    radii: np.ndarray
+    contact_layer: bool
+    lift_speed_limit: bool
+    max_iterations: int
+
+    @classmethod
+    def of(
+        cls,
+        model: newton.Model,
+        *,
+        separation=None,
+        friction=None,
+        restitution=None,
+        substeps=None,
+        bodies="pushed",
+        min_distance=None,
+        particle_radius=None,
+        contact_layer=True,
+        lift_speed_limit=True,
+        max_iterations=MAX_ITERATIONS,
+    ) -> "StageOptions":
+        """Returns the options, with arguments and errors as of :class:`.solver_ccd.SolverCCD`."""
+        if separation is not None:
+            separation = checked_distance(separation, "separation", zero=False)
+            checked_number(separation, "separation", 0.0, MAX_FLOAT)
+        substeps = checked_substeps(substeps)
+        if substeps is not None and model.requires_grad:
+            raise NotImplementedError("substeps: steps in substeps carry no gradients; omit substeps, or requires_grad")
+        return cls(
+            separation=separation,
+            friction=checked_friction(friction, model),
+            reads_friction=model.requires_grad or isinstance(friction, wp.array),
+            restitution=checked_restitution(restitution, model),
+            substeps=substeps,
+            bodies=cast(Bodies, checked_choice(bodies, "bodies", get_args(Bodies))),
+            min_distance=checked_min_distance(min_distance),
+            radii=checked_radii(particle_radius, model),
+            contact_layer=checked_flag(contact_layer, "contact_layer"),
+            lift_speed_limit=checked_flag(lift_speed_limit, "lift_speed_limit"),
+            max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),
+        )
+
+    @property
+    def keeps_distances(self) -> bool:
+        """Whether pairs keep a distance."""
+        return self.min_distance > 0.0 or bool(self.radii.any())
+
+    def moves_bodies(self, mesh: ModelMesh, solver: SolverBase) -> bool:
+        """Returns whether the response can move bodies behind a solver."""
+        model = mesh.model
+        if self.bodies == "left" or not model.body_count:
+            return False
+        if self.bodies == "pushed":
+            integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
+            if not integrates or getattr(solver, "integrate_with_external_rigid_solver", False):
+                return False
+        shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        assert model.body_flags is not None and model.body_inv_mass is not None
+        kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
+        return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
+
+
+def default_separation(mesh: ModelMesh) -> float:
+    """Returns the distance that contacts are moved apart by default [m]: a share of the median edge length."""
+    lengths = particle_edge_lengths(mesh)
+    return SEPARATION * (float(np.median(lengths)) if lengths.any() else 1.0)
+
+
+def particle_edge_lengths(mesh: ModelMesh) -> np.ndarray:
+    """Returns the lengths of the edges of cloth, soft bodies and ropes at rest [m], shape [n]."""
+    particle_q = mesh.model.particle_q
+    rest = np.zeros((0, 3)) if particle_q is None else particle_q.numpy()
+    edges = mesh.edges[mesh.edges[:, 1] < mesh.model.particle_count]
+    return np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+
+
+def checked_substeps(substeps) -> int | Literal["auto"] | None:
+    """Returns the argument ``substeps``: None, "auto" or a number of substeps."""
+    if substeps is None or (isinstance(substeps, str) and substeps == "auto"):
+        return substeps
+    if isinstance(substeps, str):
+        raise ValueError(f"substeps takes 2 substeps or more, or 'auto', not {given(substeps)}")
+    return checked_integer(substeps, "substeps", 2, MAX_SUBSTEPS)
+
+
+def checked_min_distance(min_distance) -> float:
+    """Returns the argument ``min_distance`` [m]; None is 0."""
+    return 0.0 if min_distance is None else checked_distance(min_distance, "min_distance")
+
+
+def checked_radii(particle_radius, model: newton.Model) -> np.ndarray:
+    """Returns the argument ``particle_radius``, one for each particle [m]; None is 0."""
+    radii = particle_radius.numpy() if isinstance(particle_radius, wp.array) else particle_radius
+    return checked_distances(0.0 if radii is None else radii, "particle_radius", model.particle_count)
+
+
+def checked_friction(friction, model: newton.Model) -> wp.array:
+    """Returns the argument ``friction``; by default the model's ``particle_mu``."""
+    friction = model.particle_mu if friction is None else friction
+    limits = "at least 0, and finite in single precision"
+    return _checked_coefficients(friction, "friction", (1, model.particle_count), MAX_FLOAT, limits, model)
+
+
+def checked_restitution(restitution, model: newton.Model) -> wp.array:
+    """Returns the argument ``restitution``; by default the model's ``soft_contact_restitution``."""
+    restitution = model.soft_contact_restitution if restitution is None else restitution
+    return _checked_coefficients(restitution, "restitution", (1,), 1.0, "in [0, 1]", model)
+
+
+def _checked_coefficients(value, name, lengths, most, limits, model):
+    """Returns a coefficient, or an array of some, as an array."""
+    if not isinstance(value, wp.array):
+        values = np.full(1, checked_number(value, name))
+    elif value.dtype is not wp.float32 or value.ndim != 1 or len(value) not in lengths:
+        allowed = " or ".join(map(str, dict.fromkeys(lengths)))
+        raise ValueError(f"{name} must be a number, or an array of float32 of length {allowed}")
+    else:
+        values = value.numpy()
+    if not ((values >= 0.0) & (values <= most)).all():
+        raise ValueError(f"{name} must be {limits}, not {value!r}")
+    return value if isinstance(value, wp.array) else wp.array(values, dtype=float, device=model.device)
+
+
+def friction_of(mesh: ModelMesh, of_particles: wp.array) -> Friction:
+    """Returns the coefficients of vertices and of infinite planes, those of shapes by their materials.
+
+    Raises:
+        ValueError: If the friction of a shape is negative or no number.
+    """
+    model = mesh.model
+    of_shapes = model.shape_material_mu
+    if of_shapes is None:
+        of_shapes = wp.zeros(0, dtype=float, device=mesh.device)
+    values = of_shapes.numpy()
+    for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
+        if not values[shape] >= 0.0:
+            raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
+    return Friction(mesh, of_particles, of_shapes)

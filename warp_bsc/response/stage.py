@@ -1,0 +1,162 @@
+"""What both stages behind a solver do: step it, keep the motion of the step, and count the step in a report."""
+
+import contextlib
+import time
+
+import newton
+import warp as wp
+
+from .._arguments import checked_number
+from .._one_thread import one_at_a_time
+from .integration.coupling_interface import CouplingHooks
+from .integration.tape import paused_tape
+from .integration.wrapped_solver import WrappedSolver
+from .report import SolverReport
+from .schedule import MAX_ITERATIONS
+from .state.friction import Friction
+from .state.mesh import ModelMesh
+from .state.motion import ModelMotion
+from .state.workspace import Resolution, Workspace
+from .step import prepare
+from .write_back import count_step
+
+
+class CollisionStage(WrappedSolver, CouplingHooks):
+    """A stage behind another solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are.
+
+    Attributes:
+        solver: The inner solver.
+        mesh: The triangles that collide.
+        report: What the stage found and did.
+    """
+
+    report: SolverReport
+
+    mesh: ModelMesh
+
+    def _allocate(
+        self,
+        mesh: ModelMesh,
+        friction: Friction,
+        *,
+        separation: float,
+        restitution: wp.array,
+        moves_bodies: bool = False,
+        responds_to_bodies: bool = False,
+        max_iterations: int = MAX_ITERATIONS,
+        responds: bool = True,
+    ):
+        """Allocates the motion and the workspace of steps, and makes the report."""
+        self.mesh, model = mesh, self.model
+        self._moves_bodies = moves_bodies
+        self._motion = ModelMotion(mesh, friction, moves_bodies=moves_bodies, responds_to_bodies=responds_to_bodies)
+        self._work = Workspace(
+            mesh,
+            separation=separation,
+            restitution=restitution,
+            differentiable=model.requires_grad,
+            moves_bodies=moves_bodies,
+            max_iterations=max_iterations,
+        )
+        self._motion.set_start(model.particle_q, model.body_q)
+        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
+        prepare(self._work, self._motion)
+        self._recount_crossings()
+        if not model.requires_grad:
+            self._motion.remember(self._work.vertices.x1)
+        self.report = SolverReport(self._motion, self._work, responds=responds)
+
+    @one_at_a_time
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        **options,
+    ) -> None:
+        """Steps the inner solver, and detects the collisions of its motion.
+
+        Args:
+            state_in: The state at the start; the inner solver may change it.
+            state_out: The state at the end. May be the same.
+            control: As for the inner solver.
+            contacts: As for the inner solver.
+            dt: Length of the step [s], more than 0.
+            options: As for the inner solver.
+
+        Raises:
+            TypeError: If ``dt`` is no number.
+            ValueError: If ``dt`` is not finite or not more than 0.
+            RuntimeError: If another thread is using this stage.
+        """
+        checked_number(dt, "dt", 0.0, above=True)
+        with paused_tape() as tape:
+            self._check_tape(tape, state_in, state_out)
+            start = state_in if self._coupled is None else self._coupled.start_of(state_in)
+            self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
+            passed = self._begin_step(state_in, contacts)
+        self._step_inner(state_in, state_out, control, passed, dt, **options)
+        with paused_tape() as tape:
+            self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+            if self._coupled is not None:
+                self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
+
+    def _check_tape(self, tape, state_in, state_out):
+        """Raises an error if the step cannot be recorded on a tape."""
+
+    def _begin_step(self, state, contacts):
+        """Prepares for a step of the inner solver, and returns its contacts."""
+        return contacts
+
+    def _step_inner(self, *arguments, **options):
+        """Steps the inner solver."""
+        self.solver.step(*arguments, **options)
+
+    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
+        """Detects the collisions of the step after the inner solver, which was passed contacts of the program."""
+        raise NotImplementedError
+
+    def _set_end(self, end, dt):
+        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+
+    def _count_step(self, resolution: Resolution):
+        self._launch(count_step, 1, [resolution.status, self.report.last_substeps], [self.report.device_totals])
+
+    def _recount_crossings(self):
+        """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
+        self._work.status.loop.recount.fill_(1)
+
+    @contextlib.contextmanager
+    def _timed(self):
+        """Measures the time of a step for the report; does nothing while capturing."""
+        device = self.mesh.device
+        if device.is_capturing:
+            yield
+            return
+
+        def now():
+            if device.is_cuda:
+                return wp.record_event(wp.Event(device, enable_timing=True))
+            return time.perf_counter()
+
+        start = now()
+        yield
+        self.report.span = start, now()
+
+    @one_at_a_time
+    def notify_model_changed(self, flags: int) -> None:
+        """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
+        super().notify_model_changed(flags)
+        self.mesh.refresh_inverse_masses()
+        self._recount_crossings()
+
+    @one_at_a_time
+    def reset(self, state, world_mask=None, flags=None):
+        """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
+        super().reset(state, world_mask, flags)
+        self._motion.interrupt(world_mask)

@@ -1,0 +1,110 @@
+"""Finds the prims of a USD stage that are read as meshes. Imports pxr, which is slow: import this where it is used."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
+
+from .instancers import Instance, find_instances, is_shown
+from .shapes import is_shape
+from .skinning import find_bindings
+from .strands import is_strands
+from .unreadable import LeftOut, UnreadableError, reading
+
+__all__ = ["MeshPrim", "MeshPrimFinder"]
+
+
+class MeshPrim:
+    """A prim that is read as a mesh, or one instance of it, before it is read.
+
+    Attributes:
+        prim: The prim.
+        path: Its path.
+        name: The path, with the number of the instance if a point instancer places it.
+        instance: That instance, None if no point instancer places it.
+        binding: Its binding, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
+        group: The same value for all instances of a prim that one instancer places; empty without an instancer.
+    """
+
+    def __init__(self, prim: Usd.Prim, instance: Instance | None, binding: tuple | None):
+        self.prim = prim
+        self.path = str(prim.GetPath())
+        self.name = instance.name_of(prim.GetPath()) if instance else self.path
+        self.instance = instance
+        self.binding = binding
+        self.group = (id(instance.instancer), self.path) if instance else ()
+
+    @cached_property
+    def purpose(self) -> str:
+        """Purpose of the prim."""
+        return str(UsdGeom.Imageable(self.prim).ComputePurpose())
+
+    @property
+    def has_unevaluated_binding(self) -> bool:
+        """Whether the prim is bound to a skeleton in a way that USD does not evaluate."""
+        return self.binding is None and bool(UsdSkel.BindingAPI(self.prim).GetInheritedSkeleton())
+
+
+class MeshPrimFinder:
+    """Walks a stage, and the prototypes of point instancers once for each instance.
+
+    Attributes:
+        found: The prims that are read as meshes, in the order of the walk.
+        other: Number of the other visible prims with a shape, by their type.
+    """
+
+    def __init__(self, file: str | os.PathLike, left_out: LeftOut):
+        """Makes a finder that has found nothing.
+
+        Args:
+            file: The stage's file, for messages.
+            left_out: Records broken skeletons and instancers.
+        """
+        self._file = file
+        self._left_out = left_out
+        self._bindings: dict[Sdf.Path, Any] = {}  # by path; of a root, the error or None
+        self.found: list[MeshPrim] = []
+        self.other: Counter[str] = Counter()
+
+    def walk(self, prims: Iterator[Usd.Prim], instance: Instance | None = None) -> None:
+        """Adds what is found among prims.
+
+        Args:
+            prims: Iterator over a ``Usd.PrimRange``.
+            instance: The instance whose prototype the prims are, None in the scene itself.
+
+        Raises:
+            UnreadableError: If a skeleton or an instancer is broken and may not be left out.
+        """
+        for prim in prims:
+            if prim.IsA(UsdGeom.PointInstancer):
+                # Meshes below it are prototypes, which are not shown where they stand in the hierarchy.
+                prims.PruneChildren()
+                for inner in find_instances(prim, instance, self._file, self._left_out):
+                    self.walk(inner.prims(), inner)
+            elif prim.IsA(UsdSkel.Root):
+                if not self._find_bindings(prim):
+                    prims.PruneChildren()
+            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim) or is_strands(prim):
+                self.found.append(MeshPrim(prim, instance, self._bindings.get(prim.GetPath())))
+            elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
+                self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
+
+    def _find_bindings(self, root) -> bool:
+        """Returns whether the bindings below a ``SkelRoot`` can be read."""
+        path = root.GetPath()
+        if path not in self._bindings:
+            self._bindings[path] = None
+            try:
+                with reading(f"{self._file}: {path}"):
+                    self._bindings.update(find_bindings(root))
+            except UnreadableError as error:
+                self._left_out.add(error)
+                self._bindings[path] = error
+        return self._bindings[path] is None

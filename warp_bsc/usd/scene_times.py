@@ -1,0 +1,99 @@
+"""Finds the times of a scene: those of all its meshes, with times that differ by rounding alone made one."""
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from .frames import FrameRange
+from .interval import times_in_words
+
+if TYPE_CHECKING:
+    from .meshes import UsdMesh  # which imports pxr
+
+__all__ = ["SceneTimes", "find_times"]
+
+_SAME_TIME = 1e-6  # times less apart are one, in time codes, or as a share of the whole time if that is shorter
+
+
+class SceneTimes(NamedTuple):
+    """The times of a scene.
+
+    Attributes:
+        times: Time codes between which motion is straight, ascending, at least two; one time code twice if nothing
+            moves, appears or vanishes.
+        changes: Those at which meshes change their topology, appear or vanish.
+        warnings: Sentences on the changes to the motion.
+    """
+
+    times: list[float]
+    changes: set[float]
+    warnings: list[str]
+
+
+def find_times(
+    meshes: "list[UsdMesh]", frames: FrameRange, subdivide: int, sample_turns: bool, start: float
+) -> SceneTimes:
+    """Finds the times of a scene, and replaces the times of its meshes by these.
+
+    Args:
+        meshes: The meshes.
+        frames: The part of the time.
+        subdivide: Number of intervals into which each step between two times is divided.
+        sample_turns: Whether turning meshes are sampled at every whole time code too, if ``frames`` has no step.
+        start: Start of the stage, the time at which a stage is checked in which nothing moves.
+
+    Raises:
+        ValueError: If ``frames`` contains fewer than two times, or a turn takes too many.
+    """
+    own = set().union(*(mesh.times | mesh.states.keys() for mesh in meshes)) - {-math.inf}
+    if not any(mesh.times for mesh in meshes):
+        own.add(start)  # what appears and vanishes does so between moments at rest
+    if len(own) == 1:
+        (time,) = own
+        return SceneTimes([time, time], set(), [f"nothing moves: checked at rest, at time {time:g}"])
+    turning = set()
+    if sample_turns and frames.step is None:
+        low, high = frames.bounds(sorted(own))
+        turning = turning.union(*(mesh.turning_times(low, high) for mesh in meshes))
+    scene_times = _merge(own | turning)
+    for mesh in meshes:
+        mesh.take_times(scene_times)
+    changes = {time for mesh in meshes for time in mesh.states if time != -math.inf}
+    samples = sorted(set(scene_times.values()))
+    times = frames.times(samples, changes)
+    warnings = []
+    if skipped := sum(times[0] < time < times[-1] for time in set(samples) - set(times)):
+        warnings.append(f"frames: the step passes over {skipped} time samples: motion is straight from step to step")
+    if subdivide > 1:
+        times = [
+            start + (end - start) * part / subdivide for start, end in pairwise(times) for part in range(subdivide)
+        ] + times[-1:]
+    return SceneTimes(times, changes, warnings + _change_warnings(meshes, times[0], times[-1]))
+
+
+def _change_warnings(meshes: "list[UsdMesh]", first: float, last: float) -> list[str]:
+    """Returns a sentence for each way in which a mesh appears, vanishes or changes its topology between two times."""
+    warnings = []
+    for mesh in meshes:
+        times_of = {}
+        for (_, old), (time, new) in pairwise(mesh.states.items()):
+            if first < time <= last:
+                change = "appears" if old is None else "vanishes" if new is None else "changes its topology"
+                times_of.setdefault(change, []).append(time)
+        for change, times in times_of.items():
+            when = times_in_words(times)
+            warnings.append(f"{mesh.name} {change} {when}: its motion is split there, a jump is not checked")
+    return warnings
+
+
+def _merge(times: set[float]) -> dict[float, float]:
+    """Returns for each time the one that stands for all of its group: the one nearest to a whole time code."""
+    ordered = sorted(times)
+    largest_gap = _SAME_TIME * min(1.0, ordered[-1] - ordered[0])
+    groups = []
+    for time in ordered:
+        if groups and time - groups[-1][0] <= largest_gap:
+            groups[-1].append(time)
+        else:
+            groups.append([time])
+    return {time: min(group, key=lambda time: abs(time - round(time))) for group in groups for time in group}
