@@ -7,8 +7,8 @@ import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.contacts.constraints import EDGE_EDGE_PROXIMITY, VERTEX_FACE_PROXIMITY
 from warp_bsc.response.schedule import MAX_ITERATIONS
+from warp_bsc.response.state.structs import ContactKind
 
 SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
 
@@ -130,7 +130,7 @@ def test_proximities_are_of_neighbours_in_a_pile(device):
     layer = np.where(corners < particles, corners // (particles // layers), -1)  # of the box: -1
     x = model.particle_q.numpy()[:, :2]
     covered = (np.abs(x) < 0.05).all(axis=1)  # by every layer
-    for kind in (int(VERTEX_FACE_PROXIMITY), int(EDGE_EDGE_PROXIMITY)):
+    for kind in (ContactKind.VERTEX_FACE_PROXIMITY, ContactKind.EDGE_EDGE_PROXIMITY):
         found = (kinds == kind) & (corners < particles).all(axis=1)
         found &= covered[np.minimum(corners, particles - 1)].all(axis=1)
         apart = np.abs(layer[found, 0] - layer[found, 3])

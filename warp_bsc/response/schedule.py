@@ -1,20 +1,30 @@
 """When a world projects, divides, truncates and freezes: all limits, the predicates on them, and the solve status.
 
-What a world does after the ``n``-th detection of a step, ``MAX_ITERATIONS`` being 40 and ``MAX_DIVISIONS`` 32::
+What a world does after the ``n``-th detection of a step, counted from 0, which ``loop.iteration`` is during detection.
+The first detection tells slow worlds from fast ones::
 
                      slow contacts only              a fast, pushing or body contact
     n = 0            project                         project
     n = 1 .. 39      divide (recorded: project)      project, target widened 1.25 times each n, at most 5 times
-    n = 40 .. 71     divide (recorded: truncate, n = 40 .. 47)                       the same in both columns
+    n = 40 .. 71     divide                          divide (both recorded: truncate, n = 40 .. 47)
     then             freeze what still collides
 
-A step ends when a detection finds nothing to do, or when freezing changes nothing more. It ends, as vertices that stood
-apart at the start and stand still do not collide. The step is certified if its last detection was complete and found no
-contact, see :func:`decide`. A detection whose queues are too small takes all worlds to the third row, where
-:mod:`.contacts.search` finds contacts without queues; where it cannot (a recorded step in a CUDA graph), all is frozen.
+Where a contact has no dividing plane, its paths are truncated instead.
 
-Excluded from all this are contacts of which no vertex can be moved, of elements that crossed or touched at the start of
-the step, and of vertices that began in the solid of a plane, see :func:`.contacts.rules.classify_contact`.
+When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
+more. It ends: vertices that stood apart at the start and stand still do not collide.
+
+When is a vertex frozen, that is, left at its start? If it still collides in the last row; if its prediction is not
+finite; with all others, if the last detection was incomplete. A detection is incomplete if a queue was too small, and
+queues cannot grow in a CUDA graph. :mod:`.contacts.search` then finds contacts without queues, and all worlds go to the
+third row. Recorded steps cannot be searched, and freeze at once.
+
+What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or positions that are not
+finite, see :func:`decide`.
+
+What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
+plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for contacts of
+bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`.
 """
 
 import warp as wp
@@ -136,6 +146,14 @@ def allocate_status(
 
 
 @wp.func
+def _clear_detection(detection: DetectionCounts):
+    detection.hits[0] = 0
+    detection.excluded[0] = 0
+    detection.of_bodies[0] = 0
+    detection.too_near[0] = 0
+
+
+@wp.func
 def clear_status(status: SolveStatus):
     """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
     status.loop.active[0] = 0
@@ -143,10 +161,7 @@ def clear_status(status: SolveStatus):
     status.loop.iteration[0] = 0
     status.loop.projecting[0] = 0
     status.loop.newly_frozen[0] = 0
-    status.detection.hits[0] = 0
-    status.detection.excluded[0] = 0
-    status.detection.of_bodies[0] = 0
-    status.detection.too_near[0] = 0
+    _clear_detection(status.detection)
     status.results.certified[0] = 0
     status.results.undetected[0] = 0
     status.results.counted[0] = 0
@@ -251,10 +266,7 @@ def decide(
     overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and results.undetected[0] == 0:
         results.undetected[0] = 1
-        detection.too_near[0] = 0
-        detection.hits[0] = 0
-        detection.excluded[0] = 0
-        detection.of_bodies[0] = 0
+        _clear_detection(detection)
         loop.iteration[0] = wp.max(loop.iteration[0], status.max_iterations)
         return
     overflowed = overflowed and not can_search
@@ -264,10 +276,7 @@ def decide(
     results.remaining[0] = hits
     results.excluded[0] = detection.excluded[0]
     results.body_contacts[0] = detection.of_bodies[0]
-    detection.too_near[0] = 0
-    detection.hits[0] = 0
-    detection.excluded[0] = 0
-    detection.of_bodies[0] = 0
+    _clear_detection(detection)
     loop.newly_frozen[0] = 0
     if results.counted[0] == 0:
         results.first_hits[0] = results.first_hits[0] + hits

@@ -7,9 +7,17 @@ import warp as wp
 from ..integration.private import empty_struct
 
 
-def copy_arrays(struct, into, lengths):
-    """Copies the first elements of a struct's arrays, by name, into one of the same type; None: all."""
-    for name, length in lengths.items():
+def copied(struct, lengths):
+    """Returns a struct with copies of some arrays, and all other fields those of ``struct``.
+
+    Args:
+        struct: The struct.
+        lengths: Names of the arrays to copy; a dictionary says how many elements, None for all.
+    """
+    into = struct._cls()
+    for name in struct._cls.vars:
+        setattr(into, name, getattr(struct, name))
+    for name, length in lengths.items() if isinstance(lengths, dict) else dict.fromkeys(lengths).items():
         array = getattr(struct, name)
         if length == 0:  # Warp makes no empty slices
             setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))

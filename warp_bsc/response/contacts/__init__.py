@@ -1,1 +1,1 @@
-"""What a detection found: which contacts count, and their constraints and dividing planes."""
+"""Contacts: their detection, the rules by which they count, and the constraints and planes that they become."""

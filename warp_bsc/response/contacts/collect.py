@@ -7,59 +7,50 @@ from ...kernels.pipeline.queues import is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
-from ..state.mesh import Connectivity
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Constraints, DividingPlanes, Motion, Vertices
-from ..state.vectors import ZERO, relative
+from ..state.structs import Connectivity, Constraints, ContactKind, DividingPlanes, Motion, Pace, Vertices
+from ..state.vectors import ONE, ZERO, relative
 from ..tuning import MAX_SAGITTA, PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from .constraints import (
-    EDGE_EDGE_CONTACT,
-    PLANE_CONTACT,
     TOUCH,
-    VERTEX_FACE_CONTACT,
-    Contacts,
+    Constraint,
     add_constraint,
     contact_friction,
-    contact_vertices,
     contact_weights,
     distances_at_start,
     feasible,
-    feasible_in_contact,
     is_pushing,
-    is_slow,
+    kind_of_contact,
+    pace_of,
     sagitta,
-    update_first_contact,
 )
 from .dividing_planes import add_dividing_plane, add_plane
+from .first_contact import update_first_contact
+from .queue import PairQueue, has_pair, vertices_of
 from .rules import (
+    ContactClass,
     are_occluded,
     are_on_body,
-    bodies_meet,
+    classify_contact,
     collides,
-    crossed_at_start,
     crosses_face,
     inverse_mass_of,
     is_movable,
     is_on_body,
-    met_at_start,
-    touched_at_start,
+    owner_of,
 )
 
 wp.set_module_options({"enable_backward": False})
 
 _QUEUED = wp.constant(int(Count.QUEUED))
+_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
+"""Share of its distance at the start that a particle keeps."""
 
 
 @wp.kernel(enable_backward=False)
 def count_crossings(
-    # in
-    motion: Motion,
-    mesh: Connectivity,
-    pairs: wp.array[wp.vec2i],
-    counts: wp.array[wp.int64],
-    # out
-    count: wp.array[int],
+    motion: Motion, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
@@ -73,13 +64,9 @@ def count_crossings(
             wp.atomic_add(count, 0, 1)
 
 
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a particle keeps."""
-
-
 @wp.func
 def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
-    """Returns whether a plane is to stop a vertex: not one of its own body, or of a shape that it passes."""
+    """Returns whether a plane stops a vertex: not one of its own body, or of a shape that it does not collide with."""
     if not is_on_body(motion, vertex):
         return True
     body = motion.bodies.of_vertex[vertex]
@@ -89,22 +76,26 @@ def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
 
 @wp.func
 def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float64:
-    """Returns the distance from a plane that a vertex is kept at [m]: 0, or less for one of a body, see the module."""
-    least = ZERO
+    """Returns the distance from a plane that a vertex is kept at, without a minimum distance [m].
+
+    It is 0; less for a vertex of a body that starts in the solid or, if the response moves no bodies there, is
+    predicted to end in it: a body goes no deeper.
+    """
+    lowest = ZERO
     if is_on_body(motion, vertex):
         before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-        least = wp.min(before, ZERO)
+        lowest = wp.min(before, ZERO)
         if motion.bodies.responds == 0:
             predicted, _error_predicted = signed_distance(planes.end[i], motion.x1[vertex])
-            least = wp.min(predicted, least)
-    return least
+            lowest = wp.min(predicted, lowest)
+    return lowest
 
 
 @wp.func
 def offset_from(
     motion: Motion, planes: MovingPlanes, i: int, vertex: int, status: SolveStatus, separation: wp.float64
 ) -> wp.float64:
-    """Returns the offset that constraints move a vertex to that a plane stops, without a minimum distance [m]."""
+    """Returns the offset at which constraints keep a vertex that a plane stops, without a minimum distance [m]."""
     distance = level(motion, planes, i, vertex)
     if distance == ZERO:
         before, _error = signed_distance(planes.start[i], motion.x0[vertex])
@@ -123,22 +114,24 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
     if not motion.distances.radius:
         return ZERO, ZERO
     before, error = signed_distance(planes.start[i], motion.x0[vertex])
-    least = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
-    return wp.max(least, ZERO), motion.distances.reach
+    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
+    return wp.max(kept, ZERO), motion.distances.reach
 
 
 @wp.kernel
 def collect_penetrations(
+    # in
     motion: Motion,
-    vertices: Vertices,
     planes: MovingPlanes,
+    separation: wp.float64,
+    ahead: bool,
+    # in and out
+    vertices: Vertices,
     constraints: Constraints,
     dividing: DividingPlanes,
     status: SolveStatus,
-    separation: wp.float64,
-    ahead: bool,
 ):
-    """Adds constraints for vertices that may have entered solids; after the last projection, finds when they did.
+    """Adds constraints for vertices that may have entered solids; after the last projection, dividing planes too.
 
     Vertices that were inside at the start are excluded, like pairs of elements that crossed. Ahead of the first
     detection, contacts are counted as those of the predicted motion only.
@@ -151,19 +144,19 @@ def collect_penetrations(
         if planes.world[i] >= 0 and planes.world[i] != world:
             continue
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
-        least, reach = _distances_from_plane(motion, planes, i, vertex)
-        if not (after <= least + wp.max(reach, error_after)):  # nor where the plane is not finite
+        kept, reach = _distances_from_plane(motion, planes, i, vertex)
+        if not (after <= kept + wp.max(reach, error_after)):  # nor where the plane is not finite
             continue
-        near = after > least + error_after  # only
+        near = after > kept + error_after  # not a contact
         if near and not ahead:
             continue
-        if least < ZERO and after >= least - PLANE_DEPTH * separation:
+        if kept < ZERO and after >= kept - PLANE_DEPTH * separation:
             continue
         if not _stops(motion, planes, i, vertex):
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
-        before -= least
-        after -= least
+        before -= kept
+        after -= kept
         if before < -error_before:
             if not ahead:
                 wp.atomic_add(status.detection.excluded, 0, 1)
@@ -174,167 +167,156 @@ def collect_penetrations(
             count_contact(status, world)
             vertices.changed[vertex] = 1
             if status.loop.iteration[0] == 0 and is_on_body(motion, vertex):
-                status.is_fast[world] = 1  # as between elements, see kernels.collect_contacts
+                status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
-        normal = wp.vec3d(plane[0], plane[1], plane[2])
-        multiplier = wp.vec3d()
+        added = Constraint()
+        added.normal = wp.vec3d(plane[0], plane[1], plane[2])
         if is_dividing(status, world, status.loop.iteration[0]):
-            update_first_contact(vertices, vertex, time_of_entry(before, after), PLANE_CONTACT, i)
+            update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
             if not dividing.first:
                 continue
             stays, _error_stays = signed_distance(plane, motion.x0[vertex])
-            margin = wp.min(PLANE_MARGIN * separation, PLANE_APPROACH * wp.max(stays - least, ZERO))
-            offset = plane[3] + least + wp.min(wp.float64(2.0) * error_after, margin)
-            if least < ZERO:
-                offset = plane[3] + least - PLANE_DEPTH * separation
-            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, normal, offset, margin, ZERO)
-            multiplier = TOUCH * normal
+            margin = wp.min(PLANE_MARGIN * separation, PLANE_APPROACH * wp.max(stays - kept, ZERO))
+            offset = plane[3] + kept + wp.min(wp.float64(2.0) * error_after, margin)
+            if kept < ZERO:
+                offset = plane[3] + kept - PLANE_DEPTH * separation
+            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, added.normal, offset, margin, ZERO)
+            added.multiplier = TOUCH * added.normal
         else:
             status.loop.projecting[0] = 1
-        place = add_constraint(
-            motion,
-            vertices,
-            constraints,
-            wp.vec4i(vertex),
-            wp.vec4d(wp.float64(1.0), ZERO, ZERO, ZERO),
-            normal,
-            offset_from(motion, planes, i, vertex, status, separation) + wp.max(least, ZERO),
-            contact_friction(motion.friction[vertex], planes.friction[i]),
-            1,
-            PLANE_CONTACT,
-            True,
-            ZERO,
-            multiplier,
-            wp.max(least, ZERO),
-        )
-        if place < constraints.plane.shape[0]:
-            constraints.plane[place] = i
+        added.vertices = wp.vec4i(vertex)
+        added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+        added.min_distance = wp.max(kept, ZERO)
+        added.separation = offset_from(motion, planes, i, vertex, status, separation) + added.min_distance
+        added.friction = contact_friction(motion.friction[vertex], planes.friction[i])
+        added.kind = ContactKind.PLANE
+        added.plane = i
+        added.within_tolerance = True
+        added.pace = Pace.SLOW
+        add_constraint(motion, vertices, added, constraints)
 
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
+@wp.func
+def mark_changed(vertices: Vertices, corners: wp.vec4i):
+    """Marks the vertices of a contact, so that the next detection finds it again if it is still there."""
+    for j in range(4):
+        vertices.changed[corners[j]] = 1
 
 
 @wp.func
 def _collect_contact(
     motion: Motion,
-    vertices: Vertices,
-    contacts: Contacts,
+    mesh: Connectivity,
+    contacts: PairQueue,
     i: int,
+    separation: wp.float64,
+    vertices: Vertices,
     constraints: Constraints,
     dividing: DividingPlanes,
     status: SolveStatus,
-    separation: wp.float64,
 ):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
-    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS):
+    if not has_pair(contacts, i):
         return
-    near = int(contacts.status[i]) == FREE  # only
+    near = int(contacts.status[i]) == FREE  # within reach of its minimum distance, but not a contact
     if near and not motion.distances.radius:
         return
-    corners = contact_vertices(contacts, i)
-    if not is_movable(motion, corners):
-        if not near and bodies_meet(motion, corners):
-            if not met_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i], corners, contacts.toi[i]):
-                wp.atomic_add(status.detection.of_bodies, 0, 1)
-                for j in range(4):
-                    vertices.changed[corners[j]] = 1  # so that the next detection finds them again
+    kind = contacts.kind
+    toi = contacts.toi[i]
+    corners = vertices_of(contacts, i)
+    owner = owner_of(motion, corners)
+    if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
         return
-    least = wp.float64(0.0)
-    bound = contacts.toi[i]
+    added = Constraint()
+    bound = toi
     if motion.distances.radius:
-        start, kept = distances_at_start(motion, corners, contacts.kind)
-        least = kept
+        start, kept = distances_at_start(motion, corners, kind)
+        added.min_distance = kept
         bound = start
-    met = touched_at_start(motion, contacts.kind, corners, bound)
-    if status.results.crossings[0] > 0 and not met and contacts.kind <= EDGE_EDGE:
-        met = crossed_at_start(motion, contacts.mesh, contacts.edges, contacts.pairs[i])
-    if met:
+    may_cross = status.results.crossings[0] > 0
+    found = classify_contact(motion, mesh, kind, contacts.pairs[i], corners, owner, bound, may_cross)
+    if found == ContactClass.CROSSED:
         wp.atomic_add(status.detection.excluded, 0, wp.where(near, 0, 1))
+    if found == ContactClass.OF_BODIES:
+        wp.atomic_add(status.detection.of_bodies, 0, 1)
+        mark_changed(vertices, corners)
+    if found != ContactClass.OURS:
         return
     world = motion.world[corners[0]]
     iteration = status.loop.iteration[0]
-    slow = is_slow(motion, corners, contacts.kind)
-    weights = contact_weights(contacts.kind, contacts.coordinates[i])
-    normal = contacts.normal[i]
+    added.vertices = corners
+    added.pace = pace_of(motion, corners, kind)
+    added.weights = contact_weights(kind, contacts.coordinates[i])
+    added.normal = contacts.normal[i]
+    added.kind = kind_of_contact(kind)
     if not near:
         count_contact(status, world)
-        for j in range(4):
-            vertices.changed[corners[j]] = 1
+        mark_changed(vertices, corners)
         if iteration == 0:
-            # planes stand still: they would stop a body that takes along what it pushes
-            moves = slow == 0 or are_on_body(motion, corners)
-            if moves or is_pushing(motion, corners, weights, normal, least):
+            # dividing planes do not move: they would stop a body that takes along what it pushes
+            moves = added.pace == Pace.FAST or are_on_body(motion, corners)
+            if moves or is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
                 status.is_fast[world] = 1
-    multiplier = wp.vec3d()
-    if near and is_dividing(status, world, iteration):
-        return
     if is_dividing(status, world, iteration):
+        if near:
+            return
         for j in range(4):
-            update_first_contact(vertices, corners[j], contacts.toi[i], contacts.edges, i)
+            update_first_contact(vertices, corners[j], toi, added.kind, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, contacts.edges, separation, least, dividing, True, True)
-        multiplier = TOUCH * normal
+        add_dividing_plane(motion, vertices, corners, kind, separation, added.min_distance, dividing, True, True)
+        added.multiplier = TOUCH * added.normal
     else:
         if not near:
             status.loop.projecting[0] = 1
-        if iteration == 0 and contacts.edges == 1:
-            time = wp.where(near, wp.float64(0.0), contacts.toi[i])
-            if are_occluded(motion, contacts.mesh, contacts.pairs[i], corners, normal, time):
+        if iteration == 0 and kind == EDGE_EDGE:
+            time = wp.where(near, ZERO, toi)
+            if are_occluded(motion, mesh, contacts.pairs[i], corners, added.normal, time):
                 return  # the next detection finds it, if it is still there
-    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     target = widened(separation, status)
-    if slow == 1:
-        target = feasible_in_contact(motion, corners, weights, normal, target, separation, least)
+    if added.pace == Pace.SLOW:
+        before = wp.dot(added.normal, relative(added.weights, corners, motion.x0)) - added.min_distance
+        target = feasible(motion, corners, target, before, separation)
     target += sagitta(motion, vertices, corners, MAX_SAGITTA * separation)
-    target += least
-    if near and wp.dot(normal, relative(weights, corners, vertices.x1)) < target:
+    target += added.min_distance
+    if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
         status.detection.too_near[0] = 1
         status.loop.projecting[0] = 1
         status.contact_iteration[world] = iteration
-    kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
-    add_constraint(
-        motion,
-        vertices,
-        constraints,
-        corners,
-        weights,
-        normal,
-        target,
-        friction,
-        slow,
-        kind,
-        contacts.within_tolerance[i],
-        contacts.toi[i],
-        multiplier,
-        least,
-    )
+    added.separation = target
+    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.within_tolerance = contacts.within_tolerance[i]
+    added.toi = toi
+    add_constraint(motion, vertices, added, constraints)
 
 
 @wp.kernel
 def collect_contacts(
+    # in
     motion: Motion,
-    vertices: Vertices,
-    vertex_face: Contacts,
-    edge_edge: Contacts,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
+    mesh: Connectivity,
+    first: PairQueue,
+    second: PairQueue,
     separation: wp.float64,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     can_search: bool,
+    # in and out
+    vertices: Vertices,
+    constraints: Constraints,
+    dividing: DividingPlanes,
+    status: SolveStatus,
 ):
-    """Counts the contacts of both kinds, and adds constraints for them; after the last projection, dividing planes.
+    """Adds constraints for the contacts of two kinds, and counts them; after the last projection, dividing planes.
 
-    Then it finds the first contact of each vertex as well. Does nothing if :mod:`.queueless` is to find all contacts,
+    Then it finds the first contact of each vertex as well. Does nothing if :mod:`.search` is to find all contacts
     because a queue overflowed: which contacts are among those that fit depends on the order of threads.
     """
     i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(motion, vertices, vertex_face, i, constraints, dividing, status, separation)
-    _collect_contact(motion, vertices, edge_edge, i, constraints, dividing, status, separation)
+    _collect_contact(motion, mesh, first, i, separation, vertices, constraints, dividing, status)
+    _collect_contact(motion, mesh, second, i, separation, vertices, constraints, dividing, status)
 
 
 @wp.kernel

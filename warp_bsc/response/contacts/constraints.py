@@ -1,92 +1,57 @@
-"""Contacts as constraints on the ends of paths; :mod:`.projection` solves them."""
+"""Constraints: contacts as conditions on the ends of paths, see :mod:`.solve.sweeps`, which solves them."""
 
 import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
-from ...kernels.pipeline.pairs import points_of_pair
 from ...kernels.pipeline.queues import take_slot_int
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
-from ..state.mesh import Connectivity
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
-from ..state.structs import Constraints, Motion, Vertices
-from ..state.vectors import ONE, ZERO, relative, to_double
-from ..tuning import RECOVERY, REST, ROUNDING, SHARE_OF_PATH, SLOW_PATH, SMALL_DISTANCE
-from .rules import are_on_body, inverse_mass_of, is_movable, met_at_start
-
-VERTEX_FACE_CONTACT, EDGE_EDGE_CONTACT, PLANE_CONTACT, VERTEX_FACE_PROXIMITY, EDGE_EDGE_PROXIMITY = (
-    wp.constant(i) for i in range(5)
-)
-"""Kinds of constraints: contacts of a vertex and a face, of two edges, of a vertex and a plane; proximities of both."""
-
-NO_CONSTRAINT = wp.constant(3)
-"""In place of the kind of a contact that has no constraint, in the key of a vertex's first contact."""
-
+from ..state.structs import Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
+from ..tuning import RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
+from .rules import are_on_body, inverse_mass_of
 
 TOUCH = wp.constant(wp.float64(1e-100))
-"""Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities."""
-
-TIME_UNITS = wp.constant(wp.float64(2.0**30))
-"""Units of time in a step; times in keys are integers of them."""
-
-RESTING = wp.constant(2)
-"""In place of 1 for slow: of near pairs at rest, which are divided before the next detection."""
+"""Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities. It is the
+smallest push rather than a flag, because velocities and angular momentum treat these contacts as those that pushed."""
+NEVER_SWEPT = wp.constant(-2)
+"""Last sweep of a constraint that was never active: no sweep comes right after it."""
 
 
 @wp.struct
-class Contacts:
-    """The contacts of one kind of pair, unsorted, as the last detection found them."""
+class Constraint:
+    """One of the :class:`.Constraints`, as :func:`add_constraint` takes it."""
 
-    mesh: Connectivity
-    kind: int  # VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX
-    edges: int  # 1 where they are of two edges, else 0
-    elements: wp.array2d[int]
-    pairs: wp.array[wp.vec2i]
-    counts: wp.array[wp.int64]
-    status: wp.array[wp.int8]
-    within_tolerance: wp.array[wp.bool]
-    toi: wp.array[wp.float64]
-    coordinates: wp.array[wp.vec3d]
-    normal: wp.array[wp.vec3d]
-
-
-@wp.func
-def update_first_contact(vertices: Vertices, vertex: int, time: wp.float64, kind: int, i: int):
-    """Makes contact ``i`` of a kind the first contact of a vertex, if it is earlier than the one so far.
-
-    Keys order contacts by time in their upper 32 bits, then by contact.
-    """
-    key = (wp.int64(wp.floor(TIME_UNITS * time)) << wp.int64(32)) | wp.int64(4 * i + kind)
-    wp.atomic_min(vertices.first_contact, vertex, key)
+    vertices: wp.vec4i
+    weights: wp.vec4d
+    normal: wp.vec3d
+    separation: wp.float64
+    min_distance: wp.float64
+    friction: float
+    kind: int
+    plane: int
+    within_tolerance: bool
+    toi: wp.float64
+    pace: int
+    multiplier: wp.vec3d
 
 
 @wp.func
-def truncated_path(x0: wp.vec3d, x1: wp.vec3d, time: wp.float64) -> wp.vec3d:
-    """Returns the path of a vertex truncated before its first contact, at ``time`` in [0, 1] [m]."""
-    return SHARE_OF_PATH * time * (x1 - x0)
+def kind_of_contact(kind: int) -> int:
+    """Returns the ContactKind of a contact of a kind of pair: points count as vertices and faces."""
+    return wp.where(kind == EDGE_EDGE, int(ContactKind.EDGE_EDGE), int(ContactKind.VERTEX_FACE))
 
 
 @wp.func
-def contact_vertices(contacts: Contacts, i: int) -> wp.vec4i:
-    """Returns the four vertices of a contact, those of its first element first."""
-    return points_of_pair(contacts.kind, contacts.elements, contacts.pairs[i])
-
-
-@wp.func
-def is_excluded(motion: Motion, contacts: Contacts, i: int, corners: wp.vec4i) -> bool:
-    """Returns whether a contact is none that the response resolves, see :mod:`.exclusion`."""
-    return not is_movable(motion, corners) or met_at_start(
-        motion, contacts.mesh, contacts.edges, contacts.pairs[i], corners, contacts.toi[i]
-    )
+def kind_of_pair(kind: int) -> int:
+    """Returns EDGE_EDGE for contacts and proximities of two edges, given a ContactKind, else VERTEX_FACE."""
+    of_edges = kind == ContactKind.EDGE_EDGE or kind == ContactKind.EDGE_EDGE_PROXIMITY
+    return wp.where(of_edges, EDGE_EDGE, VERTEX_FACE)
 
 
 @wp.func
 def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector from the second contact point to the first.
-
-    Args:
-        kind: The kind of pair.
-        c: The coordinates of the contact.
-    """
+    """Returns the weights of four vertices in the vector between contact points, by kind and coordinates of a pair."""
     if kind == EDGE_EDGE:
         return wp.vec4d(ONE - c[0], c[0], c[1] - ONE, -c[1])
     if kind == VERTEX_EDGE:
@@ -94,11 +59,6 @@ def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
     if kind == VERTEX_VERTEX:
         return wp.vec4d(ONE, -ONE, ZERO, ZERO)
     return wp.vec4d(ONE, -c[0], -c[1], -c[2])
-
-
-@wp.func
-def _side(motion: Motion, a: int, b: int) -> wp.float64:
-    return wp.length(to_double(motion.x0[a]) - to_double(motion.x0[b]))
 
 
 @wp.func
@@ -112,41 +72,41 @@ def longest_path(motion: Motion, corners: wp.vec4i) -> wp.float64:
 
 
 @wp.func
-def is_slow(motion: Motion, corners: wp.vec4i, kind: int) -> int:
-    """Returns 1 if two elements move so little for their size that one direction holds for the whole step, else 0.
+def pace_of(motion: Motion, corners: wp.vec4i, kind: int) -> int:
+    """Returns SLOW if the paths of two elements are short for their shortest side, else FAST; see :class:`.Pace`.
 
-    The size of points is their distance.
+    The side of two points is their distance.
     """
+    a, b, c, d = corners_of(motion.x0, corners)
+    size = ZERO
     if kind == VERTEX_VERTEX:
-        return wp.where(longest_path(motion, corners) <= SLOW_PATH * _side(motion, corners[0], corners[1]), 1, 0)
-    size = _side(motion, corners[2], corners[3])
-    if kind == EDGE_EDGE:
-        size = wp.min(size, _side(motion, corners[0], corners[1]))
+        size = wp.length(a - b)
+    elif kind == EDGE_EDGE:
+        size = wp.min(wp.length(c - d), wp.length(a - b))
     else:
-        size = wp.min(size, _side(motion, corners[1], corners[2]))
-    return wp.where(longest_path(motion, corners) <= SLOW_PATH * size, 1, 0)
+        size = wp.min(wp.length(c - d), wp.length(b - c))
+    return wp.where(longest_path(motion, corners) <= SLOW_PATH * size, int(Pace.SLOW), int(Pace.FAST))
 
 
 @wp.func
 def distances_at_start(motion: Motion, corners: wp.vec4i, kind: int):
-    """Returns the distance of a pair at the start, and the one it is to keep; see :func:`distances_of_pair` [m]."""
-    a = to_double(motion.x0[corners[0]])
-    b = to_double(motion.x0[corners[1]])
-    c = to_double(motion.x0[corners[2]])
-    d = to_double(motion.x0[corners[3]])
+    """Returns the distance of a pair at the start, and the one that it must keep; see :func:`distances_of_pair` [m]."""
+    a, b, c, d = corners_of(motion.x0, corners)
     return distances_of_pair(motion.distances, kind, corners, a, b, c, d)
 
 
 @wp.func
-def least_distance(constraints: Constraints, i: int) -> wp.float64:
-    """Returns the part of the separation of a constraint that is the minimum distance of its pair [m]."""
-    if constraints.least:
-        return constraints.least[i]
+def min_distance_of(constraints: Constraints, i: int) -> wp.float64:
+    """Returns the part of the separation of a constraint that its pair must keep [m]; 0 without minimum distances."""
+    if constraints.min_distance:
+        return constraints.min_distance[i]
     return ZERO
 
 
 @wp.func
-def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, least: wp.float64) -> bool:
+def is_pushing(
+    motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, min_distance: wp.float64
+) -> bool:
     """Returns whether two elements in contact would meet even if all that can be moved stood still.
 
     Dividing planes, which let vertices stand still, are then no way out.
@@ -160,7 +120,7 @@ def is_pushing(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, normal: wp.
             moves = moves or wp.length_sq(motion.x1[vertex] - x) > 0.0
             x = motion.x1[vertex]
         end += weights[j] * to_double(x)
-    return moves and wp.dot(normal, end) <= least
+    return moves and wp.dot(normal, end) <= min_distance
 
 
 @wp.func
@@ -177,7 +137,11 @@ def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
 def feasible(
     motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
 ) -> wp.float64:
-    """Returns the separation for slow elements: hardly more than at the start, as standing still should nearly do."""
+    """Returns the separation of slow elements [m]: hardly more than at the start, as standing still should nearly do.
+
+    Fast elements get ``target``, which is the most; ``start`` is the distance at the start. Both, like the result, are
+    without minimum distances.
+    """
     path = longest_path(motion, corners)
     before = start
     least = SMALL_DISTANCE * separation
@@ -188,21 +152,6 @@ def feasible(
         least = wp.min(least, wp.max(REST * path, rounding))
     recovered = wp.max(before + RECOVERY * path, least)
     return wp.min(target, wp.max(start, wp.min(separation, recovered)))
-
-
-@wp.func
-def feasible_in_contact(
-    motion: Motion,
-    corners: wp.vec4i,
-    weights: wp.vec4d,
-    normal: wp.vec3d,
-    target: wp.float64,
-    separation: wp.float64,
-    least: wp.float64,
-) -> wp.float64:
-    """Returns the separation beyond ``least`` for a contact of slow elements, where fast ones get ``target`` [m]."""
-    start = wp.dot(normal, relative(weights, corners, motion.x0)) - least
-    return feasible(motion, corners, target, start, separation)
 
 
 @wp.func
@@ -223,12 +172,7 @@ def gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
 
 @wp.func
 def approach_of(
-    motion: Motion,
-    vertices: Vertices,
-    corners: wp.vec4i,
-    weights: wp.vec4d,
-    normal: wp.vec3d,
-    separation: wp.float64,
+    motion: Motion, vertices: Vertices, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, separation: wp.float64
 ) -> wp.float64:
     """Returns the approach of contact points over the step as a share of their violation, in [0, 1]."""
     end = wp.dot(normal, relative(weights, corners, vertices.x1))
@@ -239,42 +183,29 @@ def approach_of(
 
 
 @wp.func
-def add_constraint(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    corners: wp.vec4i,
-    weights: wp.vec4d,
-    normal: wp.vec3d,
-    separation: wp.float64,
-    friction: float,
-    slow: int,
-    kind: int,
-    within_tolerance: bool,
-    toi: wp.float64,
-    multiplier: wp.vec3d,
-    least: wp.float64,
-) -> int:
-    """Adds a constraint with a position multiplier if it fits; counts it in any case, and returns its place."""
+def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constraints: Constraints):
+    """Adds a constraint if it fits; counts it in any case."""
     i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
-        constraints.vertices[i] = corners
-        constraints.weights[i] = weights
-        constraints.normal[i] = normal
-        constraints.separation[i] = separation
-        constraints.friction[i] = friction
-        constraints.pace[i] = slow
-        constraints.kind[i] = kind
-        constraints.within_tolerance[i] = within_tolerance
-        constraints.toi[i] = toi
-        constraints.approach[i] = approach_of(motion, vertices, corners, weights, normal, separation)
-        constraints.position_multiplier[i] = multiplier
+        constraints.vertices[i] = added.vertices
+        constraints.weights[i] = added.weights
+        constraints.normal[i] = added.normal
+        constraints.separation[i] = added.separation
+        constraints.friction[i] = added.friction
+        constraints.kind[i] = added.kind
+        constraints.plane[i] = added.plane
+        constraints.within_tolerance[i] = added.within_tolerance
+        constraints.toi[i] = added.toi
+        constraints.approach[i] = approach_of(
+            motion, vertices, added.vertices, added.weights, added.normal, added.separation
+        )
+        constraints.pace[i] = added.pace
+        constraints.position_multiplier[i] = added.multiplier
         constraints.velocity_multiplier[i] = wp.vec3d()
         constraints.previous_multiplier[i] = wp.vec3d()
-        constraints.last_sweep[i] = -2
-        if constraints.least:
-            constraints.least[i] = least
-    return i
+        constraints.last_sweep[i] = NEVER_SWEPT
+        if constraints.min_distance:
+            constraints.min_distance[i] = added.min_distance
 
 
 @wp.func
@@ -285,7 +216,7 @@ def moves_body(motion: Motion, constraints: Constraints, i: int) -> bool:
 
 @wp.func
 def has_pushed(constraints: Constraints, i: int) -> bool:
-    """Returns whether a constraint pushed its vertices apart."""
+    """Returns whether a constraint pushed its vertices apart, or is of a contact that was divided, see TOUCH."""
     return wp.dot(constraints.position_multiplier[i], constraints.normal[i]) > ZERO
 
 

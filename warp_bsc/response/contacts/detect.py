@@ -4,12 +4,12 @@ import warp as wp
 
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
-from ...detection.settings import Count, PairKind
+from ...detection.settings import Count
 from ..schedule import decide
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
-from .constraints import Contacts
 from .impacts import count_grazing
+from .queue import counted, queues_of
 from .search import find_contacts_without_queues
 
 
@@ -28,17 +28,14 @@ def _count_crossings(work):
 
 def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
     """Adds constraints for vertices that enter solids of planes; ``ahead`` of the first detection also those near."""
-    motion = work.motion
-    inputs = [motion.vertices, work.vertices, motion.planes, work.constraints, work.dividing, work.status]
-    work.launch(collect_penetrations, work.vertices_at_planes, [*inputs, work.separation, ahead])
+    inputs = [work.motion.vertices, work.motion.planes, work.separation, ahead]
+    work.launch(collect_penetrations, work.vertices_at_planes, inputs, _outputs(work))
 
 
 def detect(work: Workspace, *, only_changed: bool = False) -> None:
     """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again.
 
-    Args:
-        work: The workspace of the step.
-        only_changed: Whether only vertices that changed since the last detection are looked at.
+    With ``only_changed``, only vertices that changed since the last detection are looked at.
     """
     detector, motion, vertices = work.detector, work.motion.vertices, work.vertices
     changed = vertices.changed if only_changed else None
@@ -51,17 +48,15 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
         work.launch(drop_if_full, 1, [work.constraints, work.record, work.max_contacts])
-    of_elements, of_points = contacts_of(work)
+    queues, mesh = queues_of(detector), work.connectivity
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
-    for contacts in (of_elements, of_points) if of_points else (of_elements,):
-        inputs = [motion, vertices, *contacts, work.constraints, work.dividing, work.status, work.separation]
-        work.launch_over(collect_contacts, _queues(contacts), [*inputs, *overflow])
+    for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
+        inputs = [motion, mesh, *pair, work.separation, *overflow, *_outputs(work)]
+        work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
-        work.launch_over(count_grazing, _queues(of_elements), [motion, vertices, *of_elements, work.record])
-    if work.max_penetrations:
-        detect_penetrations(work, ahead=False)
-    work.launch(decide, 1, [work.constraints, *overflow], [work.status])
+        work.launch_over(count_grazing, counted(queues[:2]), [motion, vertices, mesh, *queues[:2], work.record])
+    _decide(work, overflow)
     if can_search:
         wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
 
@@ -70,31 +65,17 @@ def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase, motion = work.detector.broad_phase, work.motion.vertices
     broad_phase.fit(motion.x0, work.vertices.x1)
-    arguments = work.connectivity, motion, work.vertices, work.dividing, work.status, work.separation
-    find_contacts_without_queues(broad_phase, *arguments)
+    arrays = {"mesh": work.connectivity, "motion": motion, "vertices": work.vertices}
+    arrays |= {"dividing": work.dividing, "status": work.status}
+    find_contacts_without_queues(broad_phase, work.separation, **arrays)
+    _decide(work, overflow)
+
+
+def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
     work.launch(decide, 1, [work.constraints, *overflow], [work.status])
 
 
-def contacts_of(work: Workspace) -> tuple[list[Contacts], list[Contacts]]:
-    """Returns the contacts that the last detection found: vertex-face and edge-edge, and those of points."""
-    contacts = []
-    for narrow_phase, elements in elements_of(work):
-        of_kind, found = Contacts(), narrow_phase.contacts
-        of_kind.mesh, of_kind.elements = work.connectivity, elements
-        of_kind.kind, of_kind.edges = int(narrow_phase.kind), int(narrow_phase.kind == PairKind.EDGE_EDGE)
-        of_kind.counts, of_kind.pairs, of_kind.status = narrow_phase.counts, found.pairs, found.status
-        of_kind.within_tolerance, of_kind.toi = found.within_tolerance, found.toi
-        of_kind.coordinates, of_kind.normal = found.coordinates, found.normal
-        contacts.append(of_kind)
-    return contacts[:2], contacts[2:]
-
-
-def elements_of(work: Workspace) -> list[tuple]:
-    """Returns each narrow phase with the vertices of its second elements, those of points last."""
-    return [(n, work.detector.mesh.device_elements(n.kind)) for n in work.detector.narrow_phases]
-
-
-def _queues(contacts):
-    return [(of_kind.pairs, of_kind.counts, Count.CONTACTS) for of_kind in contacts]
+def _outputs(work):
+    return [work.vertices, work.constraints, work.dividing, work.status]

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...kernels.pipeline.pairs import firsts_of
 from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Vertices
 from ..state.vectors import HALF, ZERO, relative, to_double
@@ -10,7 +11,7 @@ from .closest import closest_direction, closest_vector
 from .rules import inverse_mass_of
 
 FAR = wp.constant(wp.float64(1.0e300))
-
+"""Farther than anything [m]."""
 INCOMPLETE = wp.constant(-2)
 """End of a list that lacks a plane."""
 
@@ -33,16 +34,10 @@ def add_plane(
     margin: wp.float64,
     half: wp.float64,
 ):
-    """Adds a plane to the lists of up to four vertices; where it does not fit, :func:`has_all_planes` says so.
+    """Adds a plane with a unit normal to the lists of up to four vertices, -1 for none; see :class:`.DividingPlanes`.
 
-    Args:
-        planes: The planes.
-        corners: The vertices, -1 for none. Those before ``split`` stay above the plane, the others below.
-        split: The first that stays below.
-        normal: Unit normal of the plane.
-        offset: Its coordinate along the normal [m].
-        margin: Least distance from it after projection, beside ``half`` [m].
-        half: Half of the distance that both sides keep from each other [m].
+    Vertices before ``split`` stay above the plane, the others below. Where it does not fit, their lists end in
+    INCOMPLETE.
     """
     plane = take_slot_int(planes.count)
     fits = plane < planes.normal.shape[0]
@@ -59,12 +54,18 @@ def add_plane(
 
 
 @wp.func
-def has_all_planes(planes: DividingPlanes, vertex: int) -> bool:
-    """Returns whether all contacts of a vertex have a plane: of those that touch at the start, there is none."""
+def has_planes(planes: DividingPlanes, vertex: int):
+    """Returns whether a vertex has planes, and whether it has one for each of its contacts.
+
+    Contacts of elements that touch at the start have none, nor do those whose plane did not fit.
+    """
+    if not planes.first:
+        return False, False
     node = planes.first[vertex]
+    has_any = node >= 0
     while node >= 0:
         node = planes.next[node]
-    return node != INCOMPLETE
+    return has_any, has_any and node != INCOMPLETE
 
 
 @wp.struct
@@ -120,9 +121,9 @@ def add_dividing_plane(
     motion: Motion,
     vertices: Vertices,
     corners: wp.vec4i,
-    edges: int,
+    kind: int,
     separation: wp.float64,
-    least: wp.float64,
+    min_distance: wp.float64,
     planes: DividingPlanes,
     is_contact: bool,
     may_stop: bool,
@@ -134,12 +135,12 @@ def add_dividing_plane(
     cannot bring together.
 
     Args:
-        motion: The motion of the step.
+        motion: The motion.
         vertices: The vertices as they were moved so far.
         corners: The vertices of both elements.
-        edges: 1 where these are edges, 0 for a vertex and a face.
+        kind: The kind of pair.
         separation: Distance that projection moves contacts apart [m].
-        least: Distance that the elements are to keep [m]: half of it is on either side.
+        min_distance: Distance that the elements must keep [m]: half of it is on either side.
         planes: The planes, which the new one is added to.
         is_contact: Whether the elements are in contact.
         may_stop: Whether elements get a plane that stops them although their closest points do not meet.
@@ -147,10 +148,10 @@ def add_dividing_plane(
     Returns:
         Whether the elements meet at the end, or nearly, without planes.
     """
-    normal = closest_direction(motion, corners, edges)
+    normal = closest_direction(motion, corners, kind)
     origin = to_double(motion.x0[corners[3]])
-    split = wp.where(edges == 1, 2, 1)
-    half = HALF * least
+    split = firsts_of(kind)
+    half = HALF * min_distance
     above = _side(motion, vertices, corners, 0, split, origin, normal, half)
     below = _side(motion, vertices, corners, split, 4, origin, -normal, half)
     distance = above.start + below.start
@@ -172,7 +173,7 @@ def add_dividing_plane(
     # last, what cannot be moved decides
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
     if not may_stop and (above.end < offset or -below.end > offset):
-        weights, _between = closest_vector(motion, corners, edges)
+        weights, _between = closest_vector(motion, corners, kind)
         if wp.dot(normal, relative(weights, corners, vertices.x1)) >= half + half + margin:
             return False
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin, half)

@@ -2,19 +2,18 @@
 
 import warp as wp
 
-from ...detection.settings import TOLERANCE, Count
+from ...detection.settings import TOLERANCE
 from ...kernels.gradients import with_gradients
-from ...kernels.pipeline.queues import is_filled
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import Impact
 from ..state.record import StepRecord
-from ..state.structs import Motion, Vertices
-from ..state.vectors import to_double
-from .constraints import EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT, Contacts, contact_vertices, is_excluded
+from ..state.structs import Connectivity, Motion, Vertices
+from ..state.vectors import corners_of
+from .constraints import kind_of_contact, kind_of_pair
+from .queue import PairQueue, has_pair, vertices_of
+from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
-_CONTACTS = wp.constant(int(Count.CONTACTS))
 
 
 @wp.func
@@ -28,46 +27,50 @@ def impact_of(
     coordinates: wp.vec3d,
     normal: wp.vec3d,
 ) -> Impact:
-    """Returns a contact as a differentiable function of the positions of its vertices."""
+    """Returns a contact of a ContactKind as a differentiable function of the positions of its vertices."""
     found = Impact()
     found.status = wp.where(within_tolerance, HIT, UNSURE)
     found.within_tolerance = wp.where(within_tolerance, 1, 0)
     found.toi = toi
     found.coordinates = coordinates
     found.normal = normal
-    return with_gradients(
-        wp.where(kind == EDGE_EDGE_CONTACT, EDGE_EDGE, VERTEX_FACE),
-        to_double(motion.x0[corners[0]]),
-        to_double(motion.x0[corners[1]]),
-        to_double(motion.x0[corners[2]]),
-        to_double(motion.x0[corners[3]]),
-        to_double(vertices.x1[corners[0]]),
-        to_double(vertices.x1[corners[1]]),
-        to_double(vertices.x1[corners[2]]),
-        to_double(vertices.x1[corners[3]]),
-        found,
-        _TOLERANCE,
-    )
+    a0, b0, c0, d0 = corners_of(motion.x0, corners)
+    a1, b1, c1, d1 = corners_of(vertices.x1, corners)
+    return with_gradients(kind_of_pair(kind), a0, b0, c0, d0, a1, b1, c1, d1, found, _TOLERANCE)
 
 
 @wp.func
-def _count_grazing(motion: Motion, vertices: Vertices, contacts: Contacts, i: int, record: StepRecord):
-    if not is_filled(i, contacts.pairs, contacts.counts, _CONTACTS) or int(contacts.status[i]) == FREE:
+def _count_grazing(
+    motion: Motion, vertices: Vertices, mesh: Connectivity, contacts: PairQueue, i: int, record: StepRecord
+):
+    if not has_pair(contacts, i) or int(contacts.status[i]) == FREE:
         return
-    corners = contact_vertices(contacts, i)
-    if is_excluded(motion, contacts, i, corners):
+    corners = vertices_of(contacts, i)
+    owner = owner_of(motion, corners)
+    if owner != ContactClass.OURS:
         return
-    kind = wp.where(contacts.edges == 1, EDGE_EDGE_CONTACT, VERTEX_FACE_CONTACT)
-    at = contacts.coordinates[i]
-    impact = impact_of(
-        motion, vertices, corners, kind, contacts.within_tolerance[i], contacts.toi[i], at, contacts.normal[i]
-    )
+    kind = contacts.kind
+    toi = contacts.toi[i]
+    if classify_contact(motion, mesh, kind, contacts.pairs[i], corners, owner, toi, True) != ContactClass.OURS:
+        return
+    coordinates = contacts.coordinates[i]
+    within = contacts.within_tolerance[i]
+    impact = impact_of(motion, vertices, corners, kind_of_contact(kind), within, toi, coordinates, contacts.normal[i])
     wp.atomic_add(record.counts.grazing, 0, impact.grazing)
 
 
 @wp.kernel(enable_backward=False)
-def count_grazing(motion: Motion, vertices: Vertices, vertex_face: Contacts, edge_edge: Contacts, record: StepRecord):
+def count_grazing(
+    # in
+    motion: Motion,
+    vertices: Vertices,
+    mesh: Connectivity,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
+    # out
+    record: StepRecord,
+):
     """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
     i = wp.tid()
-    _count_grazing(motion, vertices, vertex_face, i, record)
-    _count_grazing(motion, vertices, edge_edge, i, record)
+    _count_grazing(motion, vertices, mesh, vertex_face, i, record)
+    _count_grazing(motion, vertices, mesh, edge_edge, i, record)

@@ -1,4 +1,6 @@
-"""Which contacts the response resolves: rules by masses, bodies, crossings at the start, and hidden edges."""
+"""Which contacts the response resolves: rules by masses, bodies, crossings at the start, and occluded edges."""
+
+from enum import IntEnum
 
 import warp as wp
 from newton import ShapeFlags
@@ -7,10 +9,20 @@ from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
-from ..state.mesh import Connectivity
-from ..state.structs import Bodies, Motion
-from ..state.vectors import to_double
+from ..state.structs import Bodies, Connectivity, Motion
+from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
+
+_COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
+
+
+class ContactClass(IntEnum):
+    """What the response does with a contact."""
+
+    OURS = 0  # resolves it
+    CROSSED = 1  # excludes it, because its elements crossed or touched at the start: the inner solver parts them
+    OF_BODIES = 2  # counts it, and leaves it to the inner solver, because it is between bodies
+    NONE = 3  # ignores it: nothing can be moved, or bodies that touched at the start
 
 
 @wp.func
@@ -42,12 +54,9 @@ def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
     return False
 
 
-_COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
-
-
 @wp.func
 def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether the response can move one of four vertices: contacts of other pairs are not its own."""
+    """Returns whether the response can move one of two elements; of two bodies, only if it keeps them apart."""
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True
@@ -120,62 +129,71 @@ def crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bo
 
 
 @wp.func
-def touched_at_start(motion: Motion, kind: int, corners: wp.vec4i, bound: wp.float64) -> bool:
-    """Returns whether the elements of a pair touched at the start of the step, exactly.
-
-    A lower bound alone does not say so: it is 0 for a contact soon after the start as well, and for a small distance.
-
-    Args:
-        motion: The motion.
-        kind: The kind of pair.
-        corners: The vertices of the pair.
-        bound: A lower bound of the time of impact, or of the distance at the start: if it is more than 0, they did
-            not touch.
-    """
-    if bound > wp.float64(0.0):
-        return False
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-    x = motion.x0
-    return meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
-
-
-@wp.func
-def crossed_at_start(motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i) -> bool:
-    """Returns whether a contact is one of elements that certainly crossed at the start of the step.
+def crossed_at_start(motion: Motion, mesh: Connectivity, kind: int, pair: wp.vec2i) -> bool:
+    """Returns whether a contact belongs to elements that certainly crossed at the start of the step.
 
     A vertex that passes through a face changes which of the vertex's edges cross that face; an edge that passes through
     another changes which of the faces at either edge the other crosses. So the contact of a vertex and a face belongs
     to a crossing if one of the vertex's edges crosses that face, and the contact of two edges if one of them crosses a
-    face of the other. Such contacts are how crossing surfaces come apart.
-
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        edges: 1 where the contact is of edges.
-        pair: The elements of the contact.
+    face of the other. Crossing surfaces come apart by these contacts. Points cross nothing.
     """
-    if edges == 1:
+    if kind == EDGE_EDGE:
         for side in range(2):
-            edge = pair[side]
             other = pair[1 - side]
             for i in range(mesh.edge_faces.first[other], mesh.edge_faces.first[other + 1]):
-                if crosses_face(motion, mesh, edge, mesh.edge_faces.items[i]):
+                if crosses_face(motion, mesh, pair[side], mesh.edge_faces.items[i]):
                     return True
-        return False
-    vertex = pair[0]
-    for i in range(mesh.vertex_edges.first[vertex], mesh.vertex_edges.first[vertex + 1]):
-        if crosses_face(motion, mesh, mesh.vertex_edges.items[i], pair[1]):
-            return True
+    if kind == VERTEX_FACE:
+        for i in range(mesh.vertex_edges.first[pair[0]], mesh.vertex_edges.first[pair[0] + 1]):
+            if crosses_face(motion, mesh, mesh.vertex_edges.items[i], pair[1]):
+                return True
     return False
 
 
 @wp.func
-def met_at_start(
-    motion: Motion, mesh: Connectivity, edges: int, pair: wp.vec2i, corners: wp.vec4i, toi: wp.float64
-) -> bool:
-    """Returns whether the elements of a contact touched or crossed at the start: it is left to the inner solver."""
-    kind = wp.where(edges == 1, EDGE_EDGE, VERTEX_FACE)
-    return touched_at_start(motion, kind, corners, toi) or crossed_at_start(motion, mesh, edges, pair)
+def owner_of(motion: Motion, corners: wp.vec4i) -> int:
+    """Returns the ContactClass of a contact as far as it follows from its vertices: OURS, OF_BODIES or NONE."""
+    if is_movable(motion, corners):
+        return ContactClass.OURS
+    if bodies_meet(motion, corners):
+        return ContactClass.OF_BODIES
+    return ContactClass.NONE
+
+
+@wp.func
+def classify_contact(
+    motion: Motion,
+    mesh: Connectivity,
+    kind: int,
+    pair: wp.vec2i,
+    corners: wp.vec4i,
+    owner: int,
+    bound: wp.float64,
+    may_cross: bool,
+) -> int:
+    """Returns the ContactClass of a contact.
+
+    Args:
+        motion: The motion.
+        mesh: Its connectivity.
+        kind: The kind of pair.
+        pair: Its elements.
+        corners: Its vertices.
+        owner: What :func:`owner_of` returns for them.
+        bound: A lower bound of the time of impact, or of the distance at the start. Above 0, the elements did not touch
+            at the start; at 0, which it also is for contacts soon after the start, an exact test decides.
+        may_cross: False if nothing that can be moved crosses at the start.
+    """
+    met = bool(False)
+    if not bound > ZERO:
+        x = motion.x0
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        met = meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
+    if not met and (may_cross or owner != ContactClass.OURS):
+        met = crossed_at_start(motion, mesh, kind, pair)
+    if not met:
+        return owner
+    return wp.where(owner == ContactClass.OURS, int(ContactClass.CROSSED), int(ContactClass.NONE))
 
 
 @wp.func
@@ -188,19 +206,12 @@ def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
 def are_occluded(
     motion: Motion, mesh: Connectivity, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64
 ) -> bool:
-    """Returns whether one of two edges, of which a body moves one, is not what the other meets first along a normal.
+    """Returns whether a face next to one of two edges shields it from the other along the normal, at a time in [0, 1].
 
-    This is so if a face at the edge reaches farther along the normal than the edge: the edges of a triangulated flat
-    face, or those of a sheet that the side of a box has run into from above. To push along such a normal would hold
-    what slides. Sheets may bend around a body by 30 degrees to either side, bodies do not bend.
-
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        edges: The edges.
-        corners: Their vertices.
-        normal: Unit vector from the second to the first.
-        time: When, in [0, 1].
+    Only pairs with an edge of a body that can be moved are occluded. The face reaches farther along the normal than
+    the edge: at the edges of a triangulated flat face, or at those of a sheet that the side of a box has run into from
+    above. A push along this normal would hold what slides. Sheets may bend around a body by 30 degrees to either side,
+    bodies do not bend.
     """
     if not are_on_body(motion, corners):
         return False

@@ -18,21 +18,22 @@ from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_V
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
 from ..schedule import SolveStatus, count_contact
-from ..state.mesh import Connectivity
-from ..state.structs import DividingPlanes, Motion, Vertices
-from .constraints import NO_CONSTRAINT, distances_at_start, update_first_contact
+from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Vertices
+from ..state.vectors import ZERO
+from .collect import mark_changed
+from .constraints import distances_at_start
 from .dividing_planes import add_dividing_plane
-from .rules import bodies_meet, crossed_at_start, is_movable, met_at_start, touched_at_start
+from .first_contact import update_first_contact
+from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
-
 _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
 """The pair of a point and another cell, behind those of :func:`_pairs_of_faces`."""
 
 
 @wp.struct
 class _Arguments:
-    """What a thread needs in order to find the contacts of two faces and to act on them."""
+    """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
     mesh: Connectivity
@@ -52,82 +53,66 @@ def _next(corner: int) -> int:
 def _resolve(
     arguments: _Arguments,
     kind: int,
+    pair: wp.vec2i,
     corners: wp.vec4i,
-    movable: bool,
-    met: bool,
+    owner: int,
+    bound: wp.float64,
     toi: wp.float64,
-    least: wp.float64,
+    min_distance: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     motion = arguments.motion
-    if met:
-        wp.atomic_add(arguments.status.detection.excluded, 0, wp.where(movable, 1, 0))
-        return
-    if not movable:
+    found = classify_contact(motion, arguments.mesh, kind, pair, corners, owner, bound, True)
+    if found == ContactClass.CROSSED:
+        wp.atomic_add(arguments.status.detection.excluded, 0, 1)
+    if found == ContactClass.OF_BODIES:
         wp.atomic_add(arguments.status.detection.of_bodies, 0, 1)
-        for j in range(4):
-            arguments.vertices.changed[corners[j]] = 1
+        mark_changed(arguments.vertices, corners)
+    if found != ContactClass.OURS:
         return
     count_contact(arguments.status, motion.world[corners[0]])
-    edges = wp.where(kind == EDGE_EDGE, 1, 0)
     separation = arguments.separation
-    add_dividing_plane(motion, arguments.vertices, corners, edges, separation, least, arguments.dividing, True, True)
+    vertices = arguments.vertices
+    add_dividing_plane(motion, vertices, corners, kind, separation, min_distance, arguments.dividing, True, True)
+    mark_changed(vertices, corners)
     for j in range(4):
-        arguments.vertices.changed[corners[j]] = 1
-        update_first_contact(arguments.vertices, corners[j], toi, NO_CONSTRAINT, 0)
+        update_first_contact(vertices, corners[j], toi, ContactKind.NONE, 0)
+
+
+@wp.func
+def _ends(x0: wp.array[wp.vec3], x1: wp.array[wp.vec3], v: wp.vec4i):
+    """Returns the positions of four vertices at the start, then at the end."""
+    return x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
 
 
 @wp.func
 def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
     """Resolves a pair if it comes nearer than it may."""
     motion = arguments.motion
-    movable = is_movable(motion, corners)
-    if not movable and not bodies_meet(motion, corners):
+    owner = owner_of(motion, corners)
+    if owner == ContactClass.NONE:
         return
-    a0 = motion.x0[corners[0]]
-    b0 = motion.x0[corners[1]]
-    c0 = motion.x0[corners[2]]
-    d0 = motion.x0[corners[3]]
-    a1 = arguments.vertices.x1[corners[0]]
-    b1 = arguments.vertices.x1[corners[1]]
-    c1 = arguments.vertices.x1[corners[2]]
-    d1 = arguments.vertices.x1[corners[3]]
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.vertices.x1, corners)
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     most = distance_of_corners(kind, corners, motion.distances.radius)
     relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
     if clears_at_once(relative, scaled):
         return
-    start, least = distances_at_start(motion, corners, kind)
-    result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, least, ROUNDOFF, True, _TOLERANCE)
-    if result.status == FREE:
-        return
-    met = touched_at_start(motion, kind, corners, start)
-    if not met and kind <= EDGE_EDGE:
-        met = crossed_at_start(motion, arguments.mesh, wp.where(kind == EDGE_EDGE, 1, 0), pair)
-    _resolve(arguments, kind, corners, movable, met, result.toi, least)
+    start, kept = distances_at_start(motion, corners, kind)
+    result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, _TOLERANCE)
+    if result.status != FREE:
+        _resolve(arguments, kind, pair, corners, owner, start, result.toi, kept)
 
 
 @wp.func
 def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
     """Resolves a pair if it is in contact."""
     motion = arguments.motion
-    movable = is_movable(motion, corners)
-    if not movable and not bodies_meet(motion, corners):
+    owner = owner_of(motion, corners)
+    if owner == ContactClass.NONE:
         return
-    x0 = motion.x0
-    x1 = arguments.vertices.x1
-    relative = relative_motion(
-        kind,
-        x0[corners[0]],
-        x0[corners[1]],
-        x0[corners[2]],
-        x0[corners[3]],
-        x1[corners[0]],
-        x1[corners[1]],
-        x1[corners[2]],
-        x1[corners[3]],
-        ROUNDOFF,
-    )
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.vertices.x1, corners)
+    relative = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
     y = coplanarity(relative)
     if certified_sign_cubic(y.k, y.bound) != 0:
         return
@@ -135,11 +120,8 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
     if status == FREE:
         return
     result = impact(relative, y, status, _TOLERANCE)
-    if result.status == FREE:
-        return
-    edges = wp.where(kind == EDGE_EDGE, 1, 0)
-    met = met_at_start(motion, arguments.mesh, edges, pair, corners, result.toi)
-    _resolve(arguments, kind, corners, movable, met, result.toi, wp.float64(0.0))
+    if result.status != FREE:
+        _resolve(arguments, kind, pair, corners, owner, result.toi, result.toi, ZERO)
 
 
 @wp.func
@@ -171,19 +153,6 @@ def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
 
 
 @wp.func
-def _visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
-    mesh = arguments.faces
-    while found != wp.uint32(0):
-        other = first + lowest_set_bit(found)
-        found = found & (found - wp.uint32(1))
-        left = _pairs_of_faces(mesh, place, other)
-        while left != 0:  # one body for all, which is large
-            kind, pair, corners = _pair_of_bit(mesh, place, other, lowest_set_bit(wp.uint32(left)))
-            left = left & (left - 1)
-            _decide_pair(arguments, kind, pair, corners)
-
-
-@wp.func
 def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     """Returns kind, elements and vertices of a pair of a point and another cell, at two places; kind -1 if none."""
     p = mesh.faces[point, 0]
@@ -195,45 +164,40 @@ def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     return -1, wp.vec2i(), wp.vec4i()
 
 
-@wp.func
-def _visit_at_distances(place: int, first: int, found: wp.uint32, arguments: _Arguments):
-    mesh = arguments.faces
-    while found != wp.uint32(0):
-        other = first + lowest_set_bit(found)
-        found = found & (found - wp.uint32(1))
-        left = _pairs_of_faces(mesh, place, other)
-        point = int(-1)
-        if mesh.order[place] >= mesh.point_start:
-            point = place
-        elif mesh.order[other] >= mesh.point_start:
-            point = other
-        if point >= 0 and place != other:
-            left = left | _POINTS
-        while left != 0:
-            bit = lowest_set_bit(wp.uint32(left))
-            left = left & (left - 1)
-            kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
-            if bit == _POINT_BIT:
-                kind, pair, corners = _point_pair(mesh, point, place + other - point)
-            if kind >= 0:
-                _decide_distance(arguments, kind, pair, corners)
-
-
 @functools.cache
 def _kernel(keep_distances: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
-    return traversal_kernel(_visit_at_distances if keep_distances else _visit, _Arguments)
+    decide = _decide_distance if keep_distances else _decide_pair
+
+    @wp.func
+    def visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
+        mesh = arguments.faces
+        while found != wp.uint32(0):
+            other = first + lowest_set_bit(found)
+            found = found & (found - wp.uint32(1))
+            left = _pairs_of_faces(mesh, place, other)
+            point = int(-1)
+            if wp.static(keep_distances):
+                if mesh.order[place] >= mesh.point_start:
+                    point = place
+                elif mesh.order[other] >= mesh.point_start:
+                    point = other
+                if point >= 0 and place != other:
+                    left = left | _POINTS
+            while left != 0:  # one body for all, which is large
+                bit = lowest_set_bit(wp.uint32(left))
+                left = left & (left - 1)
+                kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
+                if wp.static(keep_distances):
+                    if bit == _POINT_BIT:
+                        kind, pair, corners = _point_pair(mesh, point, place + other - point)
+                if kind >= 0:
+                    decide(arguments, kind, pair, corners)
+
+    return traversal_kernel(visit, _Arguments)
 
 
-def find_contacts_without_queues(
-    broad_phase: BroadPhaseHierarchy,
-    mesh: Connectivity,
-    motion: Motion,
-    vertices: Vertices,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-    separation: float,
-) -> None:
+def find_contacts_without_queues(broad_phase: BroadPhaseHierarchy, separation: float, **arrays) -> None:
     """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
 
     Counts them, adds dividing planes as far as they fit, and finds the first contact of each vertex. Allocates nothing
@@ -241,15 +205,11 @@ def find_contacts_without_queues(
 
     Args:
         broad_phase: The broad phase, fitted to all of the motion.
-        mesh: The connectivity of its mesh.
-        motion: The motion that is predicted.
-        vertices: The vertices as they are moved.
-        dividing: The dividing planes.
-        status: The solve status.
         separation: Distance that projection moves contacts apart [m].
+        arrays: ``mesh``, ``motion``, ``vertices``, ``dividing`` and ``status`` of the step.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.mesh, arguments.motion = broad_phase.hierarchy, mesh, motion
-    arguments.vertices, arguments.dividing, arguments.status = vertices, dividing, status
-    arguments.separation = wp.float64(separation)
-    broad_phase.traverse(_kernel(bool(motion.distances.radius)), arguments)
+    arguments.faces, arguments.separation = broad_phase.hierarchy, wp.float64(separation)
+    for name, struct in arrays.items():
+        setattr(arguments, name, struct)
+    broad_phase.traverse(_kernel(bool(arguments.motion.distances.radius)), arguments)

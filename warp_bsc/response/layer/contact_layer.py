@@ -25,8 +25,8 @@ from ..._one_thread import one_at_a_time
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ...detection.settings import Count
 from ..adjoint.arrays import attach_gradients, launch_adjoint
+from ..contacts.queue import PairQueue, queues_of
 from ..integration.private import paused_tape
 from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
@@ -37,7 +37,6 @@ from ..state.structs import Motion
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from .kernels import (
     Layer,
-    Pairs,
     add_pushes,
     add_pushes_of_planes,
     add_shares,
@@ -66,7 +65,7 @@ class _PushedStep:
 
     motion: Motion
     planes: MovingPlanes
-    pairs: list[Pairs]
+    pairs: list[PairQueue]
     shares: wp.array
     dt: float
 
@@ -247,7 +246,7 @@ class ContactLayer(WrappedSolver):
         self._set_end(end, dt)
         self._detect()
         motion, planes, layer, detector = self._motion.vertices, self._motion.planes, self._layer, self._detector
-        pairs = [self._pairs_of(narrow_phase) for narrow_phase in detector.narrow_phases]
+        pairs = queues_of(detector)
         for of_kind in pairs:
             self._launch_over(sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
         inputs = [motion, planes, layer, detector.counters.array, detector.capacities]
@@ -294,11 +293,11 @@ class ContactLayer(WrappedSolver):
         """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
-            copy = Pairs()
-            copy.kind, copy.elements = of_kind.kind, of_kind.elements
+            copy = PairQueue()
+            copy.kind, copy.count, copy.elements = of_kind.kind, of_kind.count, of_kind.elements
             count = len(of_kind.pairs)
             if not self.mesh.device.is_capturing:
-                count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+                count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
             if count:
                 copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
                 copies.append(copy)
@@ -312,12 +311,6 @@ class ContactLayer(WrappedSolver):
             setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
         return _PushedStep(motion, planes, copies, wp.clone(self._shares), dt)
 
-    def _pairs_of(self, narrow_phase):
-        pairs = Pairs()
-        pairs.kind, pairs.elements = int(narrow_phase.kind), self.mesh.device_elements(narrow_phase.kind)
-        pairs.pairs, pairs.counts = narrow_phase.contacts.pairs, narrow_phase.counts
-        return pairs
-
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
 
@@ -325,7 +318,7 @@ class ContactLayer(WrappedSolver):
         """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
         count = len(of_kind.pairs)
         if self.mesh.device.is_cpu:
-            count = min(count, int(of_kind.counts.numpy()[int(Count.CONTACTS)]))
+            count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
         self._launch(kernel, count, inputs)
 
     @one_at_a_time

@@ -4,41 +4,25 @@ import warp as wp
 
 from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
-from ...detection.settings import Count
-from ...kernels.closest import closest_coordinates
-from ...kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
-from ...kernels.pipeline.queues import is_filled
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
+from ...kernels.polynomials import EDGE_EDGE
+from ..contacts.closest import closest_vector, closest_weights
 from ..contacts.constraints import contact_friction
+from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
 from ..schedule import has_overflowed
-from ..state.fixed_sum import with_delta
+from ..state.fixed_sum import add_to_sum, from_units, sum_of, to_units, with_delta
 from ..state.planes import MovingPlanes, signed_distance
 from ..state.structs import Motion
 from ..state.vectors import ONE, ZERO, to_double, to_single
 from ..tuning import PARALLEL_IN_LAYER
 
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-
-_UNITS = wp.constant(wp.float64(2.0**40))
-"""Units in a metre and in 1; sums are of integers in these units, so that they are the same in any order."""
-
 _ROOT_OF_2 = wp.constant(2.0**0.5)
 
 
 @wp.struct
-class Pairs:
-    """The pairs of one kind that may be in the layer."""
-
-    kind: int
-    elements: wp.array2d[int]
-    pairs: wp.array[wp.vec2i]
-    counts: wp.array[wp.int64]
-
-
-@wp.struct
 class Layer:
-    """The layer and what is at its bottom."""
+    """Thickness, minimum distances and restitution of the layer."""
 
     thickness: wp.float64  # [m]
     distances: MinDistances  # of pairs [m]
@@ -66,40 +50,18 @@ def _between(x0: wp.vec3, x1: wp.vec3, theta: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def _weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between the closest points of two elements."""
-    if kind == EDGE_EDGE:
-        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
-        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
-    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
-    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
-
-
-@wp.func
-def _vector(weights: wp.vec4d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3d:
-    return weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
-
-
-@wp.func
-def _is_on_the_same_side(motion: Motion, kind: int, corners: wp.vec4i, normal: wp.vec3d) -> bool:
-    """Returns whether two elements were on the same sides of each other at the start: not if they have passed."""
-    a = to_double(motion.x0[corners[0]])
-    b = to_double(motion.x0[corners[1]])
-    c = to_double(motion.x0[corners[2]])
-    d = to_double(motion.x0[corners[3]])
-    return wp.dot(normal, _vector(_weights(kind, a, b, c, d), a, b, c, d)) > ZERO
-
-
-@wp.func
 def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i):
-    """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not."""
+    """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not.
+
+    Elements are in contact only if they are on the same sides of each other as at the start: not if they have passed.
+    """
     _kappa, theta = _gains(layer.restitution[0])
     a = _between(motion.x0[corners[0]], motion.x1[corners[0]], theta)
     b = _between(motion.x0[corners[1]], motion.x1[corners[1]], theta)
     c = _between(motion.x0[corners[2]], motion.x1[corners[2]], theta)
     d = _between(motion.x0[corners[3]], motion.x1[corners[3]], theta)
-    weights = _weights(kind, a, b, c, d)
-    vector = _vector(weights, a, b, c, d)
+    weights = closest_weights(kind, a, b, c, d)
+    vector = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
     distance = wp.length(vector)
     depth = layer.thickness + distance_of_corners(kind, corners, layer.distances.radius) - distance
     if depth <= ZERO or distance <= ZERO:
@@ -107,7 +69,8 @@ def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i)
     normal = vector / distance
     if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(motion, corners):
         return weights, normal, ZERO
-    if not _is_on_the_same_side(motion, kind, corners, normal):
+    _weights, at_start = closest_vector(motion, corners, kind)
+    if not wp.dot(normal, at_start) > ZERO:  # nor if it is not a number
         return weights, normal, ZERO
     if kind == EDGE_EDGE:
         u = b - a
@@ -127,8 +90,8 @@ def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: Layer, plan
         return normal, ZERO
     before, error = signed_distance(planes.start[plane], motion.x0[vertex])
     after, _error = signed_distance(end, motion.x1[vertex])
-    least = layer.distances.radius[vertex] + layer.distances.of_planes
-    depth = layer.thickness + least - after - theta * (before - after)
+    min_distance = layer.distances.radius[vertex] + layer.distances.of_planes
+    depth = layer.thickness + min_distance - after - theta * (before - after)
     if not (depth > ZERO and before >= -error):
         return normal, ZERO
     return normal, depth
@@ -136,8 +99,20 @@ def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: Layer, plan
 
 @wp.func
 def _share_of(layer: Layer, depth: wp.float64) -> wp.float64:
-    """Returns what a contact of this depth counts where contacts divide the mass of a vertex."""
+    """Returns the share of a contact of this depth where contacts divide the mass of a vertex."""
     return (depth / layer.thickness) * (depth / layer.thickness)
+
+
+@wp.func
+def _shares_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int):
+    """Returns the four vertices of a pair, and its shares of their masses, 0 if it is not in contact."""
+    corners = vertices_of(queue, i)
+    weights, _normal, depth = _contact_of_pair(motion, layer, queue.kind, corners)
+    shares = wp.vec4d()
+    if depth > ZERO:
+        for j in range(4):
+            shares[j] = wp.abs(weights[j]) * _share_of(layer, depth)
+    return corners, shares
 
 
 @wp.func
@@ -158,7 +133,7 @@ def _push(
         normal: The normal.
         depth: The depth [m].
         path: Of the first contact point relative to the second [m].
-        resistance: The sum over its vertices of inverse mass, weight, and what all contacts of the vertex count [1/kg].
+        resistance: The sum over its vertices of inverse mass, weight, and the shares of all contacts [1/kg].
         friction: The coefficient.
     """
     kappa, _theta = _gains(layer.restitution[0])
@@ -173,41 +148,40 @@ def _push(
 
 
 @wp.func
-def _resistance(motion: Motion, corners: wp.vec4i, weights: wp.vec4d, shares: wp.array[wp.float64]) -> wp.float64:
+def _push_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int, shares: wp.array[wp.float64]):
+    """Returns the four vertices of a pair, how much its push moves each [1/kg], and the push, 0 if there is none."""
+    corners = vertices_of(queue, i)
+    weights, normal, depth = _contact_of_pair(motion, layer, queue.kind, corners)
     resistance = ZERO
     for j in range(4):
         vertex = corners[j]
         resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
-    return resistance
-
-
-@wp.func
-def _push_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i, shares: wp.array[wp.float64]):
-    """Returns the weights of four vertices in a contact and its push, 0 if there is none."""
-    weights, normal, depth = _contact_of_pair(motion, layer, kind, corners)
-    resistance = _resistance(motion, corners, weights, shares)
+    mobilities = wp.vec4d()
     if depth <= ZERO or resistance <= ZERO:
-        return weights, wp.vec3d()
+        return corners, mobilities, wp.vec3d()
     path = wp.vec3d()
     for j in range(4):
         vertex = corners[j]
         path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    return weights, _push(motion, layer, normal, depth, path, resistance, friction)
+    push = _push(motion, layer, normal, depth, path, resistance, friction)
+    for j in range(4):
+        mobilities[j] = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
+    return corners, mobilities, push
 
 
 @wp.func
-def _push_of_plane(
+def _change_by_plane(
     motion: Motion, planes: MovingPlanes, layer: Layer, plane: int, vertex: int, shares: wp.array[wp.float64]
 ) -> wp.vec3d:
-    """Returns the push of a plane on a vertex, 0 if there is none."""
+    """Returns what the push of a plane moves a vertex by [m], 0 if there is none."""
     normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
     resistance = wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
     if depth <= ZERO or resistance <= ZERO:
         return wp.vec3d()
     path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
     friction = contact_friction(motion.friction[vertex], planes.friction[plane])
-    return _push(motion, layer, normal, depth, path, resistance, friction)
+    return wp.float64(motion.inverse_mass[vertex]) * _push(motion, layer, normal, depth, path, resistance, friction)
 
 
 @wp.kernel(enable_backward=False)
@@ -219,32 +193,42 @@ def place_vertices_between(motion: Motion, layer: Layer, y: wp.array[wp.vec3]):
 
 
 @wp.kernel(enable_backward=False)
-def sum_shares(motion: Motion, layer: Layer, of_kind: Pairs, sums: wp.array[wp.int64]):
-    """Adds what contacts count, by their weights, to the sums of their vertices."""
+def sum_shares(motion: Motion, layer: Layer, queue: PairQueue, sums: wp.array[wp.int64]):
+    """Adds the shares of contacts to the sums of their vertices."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
-        return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
-    if depth > ZERO:
+    if has_pair(queue, i):
+        corners, shares = _shares_of_pair(motion, layer, queue, i)
         for j in range(4):
-            wp.atomic_add(sums, corners[j], wp.int64(wp.rint(_UNITS * wp.abs(weights[j]) * _share_of(layer, depth))))
+            wp.atomic_add(sums, corners[j], to_units(shares[j]))
+
+
+@wp.kernel
+def add_shares(motion: Motion, layer: Layer, queue: PairQueue, sums: wp.array[wp.float64]):
+    """Adds as :func:`sum_shares`, differentiably."""
+    i = wp.tid()
+    if has_pair(queue, i):
+        corners, shares = _shares_of_pair(motion, layer, queue, i)
+        for j in range(4):
+            wp.atomic_add(sums, corners[j], shares[j])
 
 
 @wp.kernel(enable_backward=False)
 def finish_shares(
+    # in
     motion: Motion,
     planes: MovingPlanes,
     layer: Layer,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
+    # in and out
     sums: wp.array[wp.int64],
+    # out
     shares: wp.array[wp.float64],
     layerless_steps: wp.array[wp.int64],
 ):
-    """Adds what contacts with planes count, and writes the sums; zeros if pairs are missing, so that nothing pushes."""
+    """Adds the shares of contacts with planes, and writes the sums; zeros if pairs are missing: then nothing pushes."""
     vertex = wp.tid()
-    share = wp.float64(sums[vertex]) / _UNITS
+    share = from_units(sums[vertex])
     sums[vertex] = wp.int64(0)
     for plane in range(planes.end.shape[0]):
         _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
@@ -256,45 +240,60 @@ def finish_shares(
     shares[vertex] = share
 
 
+@wp.kernel
+def add_shares_of_planes(motion: Motion, planes: MovingPlanes, layer: Layer, sums: wp.array[wp.float64]):
+    """Adds as :func:`finish_shares`, differentiably, with a thread for each vertex and plane."""
+    vertex, plane = wp.tid()
+    _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+    wp.atomic_add(sums, vertex, _share_of(layer, depth))
+
+
 @wp.kernel(enable_backward=False)
-def sum_pushes(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]):
-    """Adds what contacts move vertices by to their sums."""
+def sum_pushes(
+    motion: Motion, layer: Layer, queue: PairQueue, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]
+):
+    """Adds what contacts move vertices by to the sums of these."""
     i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
-        return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
-    for j in range(4):
-        vertex = corners[j]
-        share = weights[j] * wp.float64(motion.inverse_mass[vertex])
-        for axis in range(3):
-            wp.atomic_add(sums, vertex, axis, wp.int64(wp.rint(_UNITS * share * push[axis])))
+    if has_pair(queue, i):
+        corners, mobilities, push = _push_of_pair(motion, layer, queue, i, shares)
+        for j in range(4):
+            add_to_sum(sums, corners[j], 0, mobilities[j] * push)
+
+
+@wp.kernel
+def add_pushes(
+    motion: Motion, layer: Layer, queue: PairQueue, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
+):
+    """Adds as :func:`sum_pushes`, differentiably."""
+    i = wp.tid()
+    if has_pair(queue, i):
+        corners, mobilities, push = _push_of_pair(motion, layer, queue, i, shares)
+        for j in range(4):
+            wp.atomic_add(changes, corners[j], to_single(mobilities[j] * push))
 
 
 @wp.kernel(enable_backward=False)
 def move_particles(
+    # in
     motion: Motion,
     planes: MovingPlanes,
     layer: Layer,
     shares: wp.array[wp.float64],
     dt: float,
+    # in and out
     sums: wp.array2d[wp.int64],
+    # out
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
 ):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
     vertex = wp.tid()
-    moved = bool(False)
     for plane in range(planes.end.shape[0]):
-        push = _push_of_plane(motion, planes, layer, plane, vertex, shares)
-        for axis in range(3):
-            sums[vertex, axis] += wp.int64(wp.rint(_UNITS * wp.float64(motion.inverse_mass[vertex]) * push[axis]))
-    for axis in range(3):
-        moved = moved or sums[vertex, axis] != wp.int64(0)
-    if moved and motion.is_not_finite[vertex] == 0:
+        add_to_sum(sums, vertex, 0, _change_by_plane(motion, planes, layer, plane, vertex, shares))
+    change = sum_of(sums, vertex, 0)
+    if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
-        for axis in range(3):
-            motion.velocity[vertex][axis] += float(wp.float64(sums[vertex, axis]) / (_UNITS * wp.float64(dt)))
+        motion.velocity[vertex] += to_single(change / wp.float64(dt))
         particle_q[vertex] = motion.x1[vertex]
         particle_qd[vertex] = motion.velocity[vertex]
     for axis in range(3):
@@ -302,47 +301,12 @@ def move_particles(
 
 
 @wp.kernel
-def add_shares(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64]):
-    """Computes what :func:`sum_shares` does."""
-    i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
-        return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, _normal, depth = _contact_of_pair(motion, layer, of_kind.kind, corners)
-    if depth > ZERO:
-        for j in range(4):
-            wp.atomic_add(shares, corners[j], wp.abs(weights[j]) * _share_of(layer, depth))
-
-
-@wp.kernel
-def add_shares_of_planes(motion: Motion, planes: MovingPlanes, layer: Layer, shares: wp.array[wp.float64]):
-    """Computes what :func:`finish_shares` adds, with a thread for each vertex and plane."""
-    vertex, plane = wp.tid()
-    _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
-    wp.atomic_add(shares, vertex, _share_of(layer, depth))
-
-
-@wp.kernel
-def add_pushes(motion: Motion, layer: Layer, of_kind: Pairs, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]):
-    """Computes what :func:`sum_pushes` does."""
-    i = wp.tid()
-    if not is_filled(i, of_kind.pairs, of_kind.counts, _CONTACTS):
-        return
-    corners = points_of_pair(of_kind.kind, of_kind.elements, of_kind.pairs[i])
-    weights, push = _push_of_pair(motion, layer, of_kind.kind, corners, shares)
-    for j in range(4):
-        share = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
-        wp.atomic_add(changes, corners[j], to_single(share * push))
-
-
-@wp.kernel
 def add_pushes_of_planes(
     motion: Motion, planes: MovingPlanes, layer: Layer, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
 ):
-    """Computes what :func:`move_particles` adds, with a thread for each particle and plane."""
+    """Adds as :func:`move_particles`, differentiably, with a thread for each particle and plane."""
     vertex, plane = wp.tid()
-    push = _push_of_plane(motion, planes, layer, plane, vertex, shares)
-    wp.atomic_add(changes, vertex, to_single(wp.float64(motion.inverse_mass[vertex]) * push))
+    wp.atomic_add(changes, vertex, to_single(_change_by_plane(motion, planes, layer, plane, vertex, shares)))
 
 
 @wp.kernel(enable_backward=False)

@@ -1,1 +1,1 @@
-"""Solves constraints: positions, velocities, bodies, dividing planes and truncation."""
+"""Solves constraints: sweeps on positions and velocities, bodies, division, truncation and freezing."""

@@ -1,4 +1,4 @@
-"""Angular momentum: a rigid turn of all that collided removes what the position multipliers added to it.
+"""Angular momentum: kernels for a rigid turn of all that collided, which removes what position multipliers added.
 
 Only in worlds in which everything that collided is free: elsewhere angular momentum is not conserved.
 """
@@ -10,19 +10,14 @@ import warp as wp
 from ..state.fixed_sum import with_delta
 from ..state.poses import centre_of, inertia_at
 from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Constraints, Motion, Vertices, has_final_velocity
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
-from ..state.workspace import Workspace
+from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
 
 wp.set_module_options({"enable_backward": False})
 
-
 Moments = wp.types.vector(length=11, dtype=wp.float64)
-
 _Torque = wp.types.vector(length=3, dtype=wp.int64)
-
 _Sums = wp.types.vector(length=14, dtype=wp.int64)
-
 _UNITS = wp.constant(wp.float64(2.0**32))
 """Units in one kg, m and s; sums are of integers in these units, so that they are the same in any order."""
 
@@ -120,24 +115,29 @@ def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, th
 
 
 @wp.func
-def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
-    """Returns what a vertex adds to the sums of its world, from :data:`MASS` on."""
-    mass = ONE / wp.float64(motion.inverse_mass[vertex])
-    x = to_double(vertices.x1[vertex])
-    change = to_double(vertices.velocity[vertex]) - to_double(motion.velocity[vertex])
+def _moments(mass: wp.float64, x: wp.vec3d, half: wp.float64, inertia: wp.mat33d, square: wp.float64) -> Moments:
+    """Returns the moments of a mass with its centre at ``x``: second moments about the centre are half - inertia."""
     return Moments(
         mass,
         mass * x[0],
         mass * x[1],
         mass * x[2],
-        mass * x[0] * x[0],
-        mass * x[1] * x[1],
-        mass * x[2] * x[2],
-        mass * x[1] * x[2],
-        mass * x[2] * x[0],
-        mass * x[0] * x[1],
-        mass * wp.dot(change, change),
+        mass * x[0] * x[0] + half - inertia[0, 0],
+        mass * x[1] * x[1] + half - inertia[1, 1],
+        mass * x[2] * x[2] + half - inertia[2, 2],
+        mass * x[1] * x[2] - inertia[1, 2],
+        mass * x[2] * x[0] - inertia[2, 0],
+        mass * x[0] * x[1] - inertia[0, 1],
+        square,
     )
+
+
+@wp.func
+def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
+    """Returns what a vertex adds to the sums of its world, from :data:`MASS` on."""
+    mass = ONE / wp.float64(motion.inverse_mass[vertex])
+    change = to_double(vertices.velocity[vertex]) - to_double(motion.velocity[vertex])
+    return _moments(mass, to_double(vertices.x1[vertex]), ZERO, wp.mat33d(), mass * wp.dot(change, change))
 
 
 @wp.kernel
@@ -173,7 +173,6 @@ def body_moments(motion: Motion, vertices: Vertices, body: int):
     mass = wp.float64(motion.bodies.mass[body])
     x = vertices.bodies.centre[body]
     inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
-    half = wp.float64(0.5) * wp.trace(inertia)  # the second moments are half - inertia, without products
     predicted = motion.bodies.velocity[body]
     linear = to_double(wp.spatial_top(predicted))
     angular = to_double(wp.spatial_bottom(predicted))
@@ -182,20 +181,9 @@ def body_moments(motion: Motion, vertices: Vertices, body: int):
     moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
     torque = mass * wp.cross(moved, linear)
     torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
-    total = Moments(
-        mass,
-        mass * x[0],
-        mass * x[1],
-        mass * x[2],
-        mass * x[0] * x[0] + half - inertia[0, 0],
-        mass * x[1] * x[1] + half - inertia[1, 1],
-        mass * x[2] * x[2] + half - inertia[2, 2],
-        mass * x[1] * x[2] - inertia[1, 2],
-        mass * x[2] * x[0] - inertia[2, 0],
-        mass * x[0] * x[1] - inertia[0, 1],
-        mass * wp.length_sq(change) + wp.dot(turn, inertia * turn),
-    )
-    return torque, total
+    half = HALF * wp.trace(inertia)
+    square = mass * wp.length_sq(change) + wp.dot(turn, inertia * turn)
+    return torque, _moments(mass, x, half, inertia, square)
 
 
 @wp.kernel
@@ -228,16 +216,10 @@ def _turn_of(torque: wp.vec3d, total: Moments):
         total[8] - mass * centre[2] * centre[0],
         total[9] - mass * centre[0] * centre[1],
     )
-    inertia = wp.mat33d(
-        squares[1] + squares[2],
-        -products[2],
-        -products[1],
-        -products[2],
-        squares[0] + squares[2],
-        -products[0],
-        -products[1],
-        -products[0],
-        squares[0] + squares[1],
+    inertia = wp.matrix_from_rows(
+        wp.vec3d(squares[1] + squares[2], -products[2], -products[1]),
+        wp.vec3d(-products[2], squares[0] + squares[2], -products[0]),
+        wp.vec3d(-products[1], -products[0], squares[0] + squares[1]),
     )
     if wp.determinant(inertia) <= ZERO:
         return wp.vec3d(), wp.vec3d()
@@ -247,15 +229,8 @@ def _turn_of(torque: wp.vec3d, total: Moments):
 
 
 @wp.func
-def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d) -> wp.vec3d:
-    """Returns the change of velocity at ``x`` by a rigid turn of a world that removes a torque [m/s]."""
-    turn, centre = _turn_of(torque, total)
-    return wp.cross(turn, x - centre)
-
-
-@wp.func
-def body_change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
-    """Returns the changes of the linear and angular velocity of a body with its centre of mass at ``x``."""
+def change_by_turn(torque: wp.vec3d, total: Moments, x: wp.vec3d):
+    """Returns the change of velocity at ``x`` by the turn of a world that removes a torque [m/s], and that turn."""
     turn, centre = _turn_of(torque, total)
     return wp.cross(turn, x - centre), turn
 
@@ -280,7 +255,7 @@ def turn_vertices(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]
     if not turns(motion, vertices, vertex) or sums[world, HELD] != wp.int64(0):
         return
     torque, total = _totals(sums, world)
-    change = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
+    change, _turn = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
     vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)
 
 
@@ -292,19 +267,8 @@ def turn_bodies(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
     if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
         return
     torque, total = _totals(sums, world)
-    change, turn = body_change_by_turn(torque, total, vertices.bodies.centre[body])
+    change, turn = change_by_turn(torque, total, vertices.bodies.centre[body])
     velocity = vertices.bodies.velocity[body]
     linear = to_double(wp.spatial_top(velocity)) + change
     angular = to_double(wp.spatial_bottom(velocity)) + turn
     vertices.bodies.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
-
-
-def restore_angular_momentum(work: Workspace) -> None:
-    """Turns all that collided in each world where nothing is held, which removes the torque that contacts added."""
-    inputs, threads = [work.motion.vertices, work.vertices], work.summing_threads
-    work.turn.zero_()
-    for kernel, arguments in ((sum_torques, [work.constraints]), (sum_moments, [work.particle_count])):
-        work.launch(kernel, threads, [*inputs, *arguments, threads, work.turn])
-    work.launch_over_bodies(sum_body_moments, work.turn)
-    work.launch_over_particles(turn_vertices, [*inputs, work.turn])
-    work.launch_over_bodies(turn_bodies, work.turn)

@@ -1,4 +1,4 @@
-"""Rigid bodies: what constraints do to the pose and velocity of a body, whose vertices follow as one.
+"""Rigid bodies: the changes of poses and velocities by constraints; the vertices of a body follow its pose.
 
 A constraint acts on a body at the contact point: the inverse mass along a normal n is 1/m + (r x n) I^-1 (r x n), with
 the arm r from the centre of mass. Each constraint adds a change of the centre and a turn to the sums of its bodies, as
@@ -8,7 +8,7 @@ pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of
 
 import warp as wp
 
-from ..state.fixed_sum import _UNITS, sums_of
+from ..state.fixed_sum import add_to_sum, sums_of
 from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
 from ..state.structs import NEVER, PROJECTED, Bodies, Constraints, Motion, MovedBodies, Vertices, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
@@ -17,7 +17,6 @@ wp.set_module_options({"enable_backward": False})
 
 WHOLE_PATH = wp.constant(wp.int64(2**30))
 """The share of a path that is not cut, in units of TIME_UNITS."""
-
 FREEZES = wp.constant(wp.int64(-1))
 """In place of a share: the body is frozen."""
 
@@ -64,17 +63,12 @@ def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints
 
 @wp.func
 def body_inverse_masses(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    x: wp.array[wp.vec3],
-    relaxation: wp.float64,
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
 ):
     """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
 
-    The inverse mass of a body is a matrix. The two numbers are those of a matrix without products of the normal with
-    other directions that exceeds it, so that sweeps converge.
+    The inverse mass of a body is a matrix. The two numbers belong to a larger one, without products of the normal with
+    other directions, so that sweeps converge.
     """
     normal = constraints.normal[i]
     along = ZERO
@@ -136,14 +130,13 @@ def add_body_delta(
     for side in range(2):
         body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
         if body >= 0:
-            for axis in range(3):
-                wp.atomic_add(sums, body, axis, wp.int64(wp.rint(_UNITS * shift[axis])))
-                wp.atomic_add(sums, body, 3 + axis, wp.int64(wp.rint(_UNITS * turn[axis])))
+            add_to_sum(sums, body, 0, shift)
+            add_to_sum(sums, body, 3, turn)
 
 
 @wp.func
 def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
-    """Makes the pose of a body that where impulses act."""
+    """Sets the centre and inverse inertia of a body, where impulses act, to those of its pose."""
     pose = moved.pose[body]
     moved.centre[body] = centre_of(bodies, body, pose)
     moved.inverse_inertia[body] = inverse_inertia_at(bodies, body, pose)
@@ -151,7 +144,7 @@ def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
 
 @wp.kernel
 def begin_bodies(motion: Motion, vertices: Vertices):
-    """Initializes the bodies by what is predicted of them, and clears everything else."""
+    """Initializes the bodies by their prediction, and clears everything else."""
     body = wp.tid()
     moved = vertices.bodies
     moved.pose[body] = motion.bodies.end[body]
@@ -168,18 +161,30 @@ def begin_bodies(motion: Motion, vertices: Vertices):
     moved.outcome[body] = 0
 
 
+@wp.func
+def move_body(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Moves a body by the sum of its changes by constraints, if it has active ones; returns whether it has."""
+    moved = vertices.bodies
+    moves = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    if moves:
+        pose = motion.bodies.end[body]
+        shift, turn = sums_of(moved.delta_x, body)
+        if wp.length_sq(shift) + wp.length_sq(turn) > ZERO:  # else it keeps every bit of its pose
+            pose = turned_pose(motion.bodies, body, pose, shift, turn)
+        moved.pose[body] = pose
+    return moves
+
+
 @wp.kernel
 def move_bodies(motion: Motion, vertices: Vertices, last: bool):
-    """Moves each body by the sum of what its constraints did to it in a sweep; ``last`` empties its active set."""
+    """Moves each body by the sum of its changes by constraints; the ``last`` sweep empties its active set."""
     body = wp.tid()
     moved = vertices.bodies
-    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
-    moved.moved[body] = wp.where(active, 1, 0)
+    moves = move_body(motion, vertices, body)
+    moved.moved[body] = wp.where(moves, 1, 0)
     if last:
         moved.active[body] = 0
-    if active:
-        shift, turn = sums_of(moved.delta_x, body)
-        moved.pose[body] = turned_pose(motion.bodies, body, motion.bodies.end[body], shift, turn)
+    if moves:
         moved.outcome[body] = moved.outcome[body] | PROJECTED
 
 
@@ -195,19 +200,23 @@ def place_vertices(motion: Motion, vertices: Vertices):
 
 @wp.kernel
 def move_to_end(motion: Motion, vertices: Vertices):
-    """Makes the poses at the end of the step those where impulses act."""
+    """Makes impulses act on bodies in their poses at the end of the step."""
     body = wp.tid()
     if motion.bodies.inverse_mass[body] > 0.0:
         _set_centre(motion.bodies, vertices.bodies, body)
 
 
 @wp.func
-def changed_velocity(predicted: wp.spatial_vector, sums: wp.array2d[wp.int64], body: int) -> wp.spatial_vector:
-    """Returns the velocity of a body by the one that was predicted, and the sum of what constraints did to it."""
-    linear, angular = sums_of(sums, body)
-    linear += to_double(wp.spatial_top(predicted))
-    angular += to_double(wp.spatial_bottom(predicted))
-    return wp.spatial_vector(to_single(linear), to_single(angular))
+def change_body_velocity(motion: Motion, vertices: Vertices, body: int) -> bool:
+    """Changes the velocity of a body as :func:`.velocities.change_velocity` that of a vertex."""
+    moved = vertices.bodies
+    is_free = motion.bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
+    if is_free:
+        linear, angular = sums_of(moved.delta_v, body)
+        linear += to_double(wp.spatial_top(motion.bodies.velocity[body]))
+        angular += to_double(wp.spatial_bottom(motion.bodies.velocity[body]))
+        moved.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
+    return is_free
 
 
 @wp.kernel
@@ -215,16 +224,15 @@ def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
     """Changes the velocity of each body that was not truncated; ``last`` empties its active set."""
     body = wp.tid()
     moved = vertices.bodies
-    active = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    if moved.active[body] != 0:
+        change_body_velocity(motion, vertices, body)
     if last:
         moved.active[body] = 0
-    if active and not has_final_velocity(moved.outcome[body]):
-        moved.velocity[body] = changed_velocity(motion.bodies.velocity[body], moved.delta_v, body)
 
 
 @wp.kernel
 def set_vertex_velocities(motion: Motion, vertices: Vertices):
-    """Makes the velocities of vertices those of their bodies."""
+    """Sets the velocities of vertices to those of their bodies."""
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:

@@ -1,26 +1,25 @@
-"""Truncation: paths are cut before the first contact, or vertices and bodies are frozen at their start."""
+"""Division and truncation of paths that projection did not free of contacts; what still collides then is frozen.
+
+A vertex is moved onto its sides of dividing planes, and a body back along its path until its vertices are. Where a
+contact has no plane, and in recorded steps, the path is cut before the first contact. Frozen vertices end at their
+start.
+"""
 
 import warp as wp
 
-from ..contacts.constraints import (
-    EDGE_EDGE_CONTACT,
-    EDGE_EDGE_PROXIMITY,
-    NO_CONSTRAINT,
-    PLANE_CONTACT,
-    RESTING,
+from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
+from ..contacts.dividing_planes import add_dividing_plane, has_planes
+from ..contacts.first_contact import (
     TIME_UNITS,
-    TOUCH,
-    VERTEX_FACE_PROXIMITY,
-    Contacts,
-    contact_vertices,
-    has_pushed,
-    least_distance,
-    moves_body,
+    contact_index,
+    contact_kind,
+    contact_time,
+    packed_vertex,
+    share_before,
     truncated_path,
 )
-from ..contacts.detect import contacts_of
-from ..contacts.dividing_planes import add_dividing_plane, has_all_planes
-from ..schedule import SolveStatus, divides_all_proximities, divides_proximities
+from ..contacts.queue import PairQueue, queues_of, vertices_of
+from ..schedule import SolveStatus, divides_all_proximities, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.structs import (
@@ -31,13 +30,14 @@ from ..state.structs import (
     TRUNCATED,
     UNCONSTRAINED,
     Constraints,
+    ContactKind,
     DividingPlanes,
     Motion,
+    Pace,
     Vertices,
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
-from ..tuning import SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -46,14 +46,16 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def divide_proximities(
+    # in
     motion: Motion,
+    status: SolveStatus,
+    separation: wp.float64,
+    # in and out
     vertices: Vertices,
     constraints: Constraints,
     dividing: DividingPlanes,
-    status: SolveStatus,
-    separation: wp.float64,
 ):
-    """Adds dividing planes for proximities, see :func:`.constraints.divides_proximities`.
+    """Adds dividing planes for proximities, see :func:`.schedule.divides_proximities`.
 
     In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
     A constraint whose elements would meet changes velocities too.
@@ -62,35 +64,23 @@ def divide_proximities(
     if i >= constraints.count[0]:
         return
     kind = constraints.kind[i]
-    if kind != VERTEX_FACE_PROXIMITY and kind != EDGE_EDGE_PROXIMITY:
+    if kind != ContactKind.VERTEX_FACE_PROXIMITY and kind != ContactKind.EDGE_EDGE_PROXIMITY:
         return
     corners = constraints.vertices[i]
     if not divides_proximities(status, motion.world[corners[0]]) or moves_body(motion, constraints, i):
         return
-    edges = wp.where(kind == EDGE_EDGE_PROXIMITY, 1, 0)
     all_pairs = divides_all_proximities(status)
-    if not all_pairs and constraints.pace[i] != RESTING:
+    if not all_pairs and constraints.pace[i] != Pace.RESTING:
         return
-    least = least_distance(constraints, i)
-    meets = add_dividing_plane(motion, vertices, corners, edges, separation, least, dividing, False, all_pairs)
+    kept = min_distance_of(constraints, i)
+    pair_kind = kind_of_pair(kind)
+    meets = add_dividing_plane(motion, vertices, corners, pair_kind, separation, kept, dividing, False, all_pairs)
     if meets and not has_pushed(constraints, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):
             vertex = corners[j]
             if motion.inverse_mass[vertex] > 0.0:
                 vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
-
-
-@wp.func
-def share_before(time: wp.float64) -> wp.float64:
-    """Returns the share of the path of a body that is left before a contact, at ``time`` in [0, 1]."""
-    return SHARE_OF_PATH * time
-
-
-@wp.func
-def first_contact_of_body(key: wp.int64, vertex: int) -> wp.int64:
-    """Returns a key that orders the first contacts of the vertices of a body by time, then by vertex."""
-    return ((key >> wp.int64(32)) << wp.int64(32)) | wp.int64(vertex)
 
 
 @wp.kernel
@@ -101,41 +91,44 @@ def find_body_shares(
 
     The vertices go straight here, but in an arc where the body turns: if one ends below its plane for that and
     collides, the next iteration cuts the path again. Where a contact has no plane, the path ends before that contact.
-    After ``max_truncations`` iterations, a body that still collides is frozen. If the step is recorded, first contacts
-    are left for :func:`.kernels.record_body_truncations`.
+    If the step is recorded, first contacts are left for :func:`record_body_truncations`.
     """
     vertex = motion.bodies.particle_count + wp.tid()
-    key = vertices.first_contact[vertex]
+    packed = vertices.first_contact[vertex]
     body = motion.bodies.of_vertex[vertex]
-    if key == NEVER or body < 0:
+    if packed == NEVER or body < 0:
         return
     if is_recording(record):
-        wp.atomic_min(vertices.bodies.first_contact, body, first_contact_of_body(key, vertex))
+        wp.atomic_min(vertices.bodies.first_contact, body, packed_vertex(packed, vertex))
     else:
         vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
         return
-    if status.loop.iteration[0] > status.max_iterations + status.max_truncations:
+    if is_freezing(status):
         wp.atomic_min(vertices.bodies.share, body, FREEZES)
         return
     share = ONE
-    divides = bool(False)
-    complete = bool(False)
-    if dividing.first:
-        divides = dividing.first[vertex] >= 0
-        complete = divides and has_all_planes(dividing, vertex)
+    divides, complete = has_planes(dividing, vertex)
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, share_before(wp.float64(key >> wp.int64(32)) / TIME_UNITS))
-    if not complete or int(key & wp.int64(3)) == NO_CONSTRAINT:
+        share = wp.min(share, share_before(contact_time(packed)))
+    if not complete or contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
 
 
+@wp.func
+def _freeze_body(motion: Motion, vertices: Vertices, body: int):
+    """Puts a body back in its pose at the start, without velocity."""
+    vertices.bodies.pose[body] = motion.bodies.start[body]
+    vertices.bodies.velocity[body] = wp.spatial_vector()
+    vertices.bodies.outcome[body] = vertices.bodies.outcome[body] | FROZEN
+
+
 @wp.kernel
 def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.float64):
-    """Moves each body whose path is to be cut back along it, or freezes it in its pose at the start."""
+    """Moves each body whose path is cut back along it, or freezes it in its pose at the start."""
     body = wp.tid()
     moved = vertices.bodies
     share = moved.share[body]
@@ -145,13 +138,11 @@ def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.f
     moved.moved[body] = wp.where(share < WHOLE_PATH and not frozen, 1, 0)
     if moved.moved[body] == 0:
         return
-    start = motion.bodies.start[body]
     if share == FREEZES:
-        moved.pose[body] = start
-        moved.velocity[body] = wp.spatial_vector()
-        moved.outcome[body] = moved.outcome[body] | FROZEN
+        _freeze_body(motion, vertices, body)
         wp.atomic_add(status.loop.newly_frozen, 0, 1)
         return
+    start = motion.bodies.start[body]
     end = pose_between(motion.bodies, body, start, moved.pose[body], wp.float64(share) / TIME_UNITS)
     moved.pose[body] = end
     outcome = moved.outcome[body] | TRUNCATED
@@ -162,28 +153,16 @@ def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.f
     moved.outcome[body] = (outcome | DIVIDED) - DIVIDED
 
 
-@wp.kernel
-def freeze_undetected_bodies(motion: Motion, vertices: Vertices, status: SolveStatus):
-    """Freezes all bodies if a detection was incomplete, as :func:`.kernels.freeze_undetected` does vertices."""
-    body = wp.tid()
-    frozen = status.results.undetected[0] == 1 and motion.bodies.inverse_mass[body] > 0.0
-    vertices.bodies.moved[body] = wp.where(frozen, 1, 0)
-    if frozen:
-        vertices.bodies.pose[body] = motion.bodies.start[body]
-        vertices.bodies.velocity[body] = wp.spatial_vector()
-        vertices.bodies.outcome[body] = vertices.bodies.outcome[body] | FROZEN
-
-
 @wp.func
 def _record_truncation(
     vertices: Vertices,
-    record: StepRecord,
     vertex: int,
     body: int,
     cuts: bool,
-    key: wp.int64,
-    vertex_face: Contacts,
-    edge_edge: Contacts,
+    packed: wp.int64,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
+    record: StepRecord,
 ):
     """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
     entry = wp.atomic_add(record.counts.truncations, 0, 1)
@@ -194,24 +173,22 @@ def _record_truncation(
     record.body[entry] = body
     if body >= 0:
         record.pose[entry] = vertices.bodies.pose[body]
-    first = int(key & wp.int64(0xFFFFFFFF))
-    if first & 3 == EDGE_EDGE_CONTACT:
-        _record_contact(record, entry, vertex, cuts, key, edge_edge)
+    if contact_kind(packed) == ContactKind.EDGE_EDGE:
+        _record_contact(vertex, cuts, packed, edge_edge, entry, record)
     else:
-        _record_contact(record, entry, vertex, cuts, key, vertex_face)
+        _record_contact(vertex, cuts, packed, vertex_face, entry, record)
 
 
 @wp.func
-def _record_contact(record: StepRecord, entry: int, vertex: int, cuts: bool, key: wp.int64, contacts: Contacts):
+def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
     """Records the contact that a path is truncated before."""
-    first = int(key & wp.int64(0xFFFFFFFF))
-    kind = wp.where(cuts, first & 3, NO_CONTACT)
-    i = first >> 2
+    kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
+    i = contact_index(packed)
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = wp.float64(key >> wp.int64(32)) / TIME_UNITS
-    if kind != PLANE_CONTACT and kind != NO_CONTACT:
-        record.contact[entry] = contact_vertices(contacts, i)
+    record.toi[entry] = contact_time(packed)
+    if kind != ContactKind.PLANE and kind != NO_CONTACT:
+        record.contact[entry] = vertices_of(contacts, i)
         record.within_tolerance[entry] = contacts.within_tolerance[i]
         record.toi[entry] = contacts.toi[i]
         record.coordinates[entry] = contacts.coordinates[i]
@@ -236,16 +213,26 @@ def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes,
         vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
 
 
+@wp.func
+def _freeze_vertex(motion: Motion, vertices: Vertices, vertex: int):
+    """Puts a vertex back to its start, without velocity."""
+    vertices.x1[vertex] = motion.x0[vertex]
+    vertices.velocity[vertex] = wp.vec3()
+    vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+
+
 @wp.kernel
 def truncate_vertices(
+    # in
     motion: Motion,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
+    dt: wp.float64,
+    # in and out
     vertices: Vertices,
+    dividing: DividingPlanes,
     status: SolveStatus,
     record: StepRecord,
-    dividing: DividingPlanes,
-    vertex_face: Contacts,
-    edge_edge: Contacts,
-    dt: wp.float64,
 ):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
@@ -253,92 +240,89 @@ def truncate_vertices(
     ``max_truncations`` iterations vertices that still collide are frozen.
     """
     vertex = wp.tid()
-    key = vertices.first_contact[vertex]
-    if key == NEVER:
+    packed = vertices.first_contact[vertex]
+    if packed == NEVER:
         if dividing.first:
             _keep_on_sides(motion, vertices, dividing, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
         return
-    time = wp.float64(key >> wp.int64(32)) / TIME_UNITS
-    cuts = status.loop.iteration[0] <= status.max_iterations + status.max_truncations
-    if is_recording(record) and (cuts or vertices.outcome[vertex] & FROZEN == 0):
-        _record_truncation(vertices, record, vertex, -1, cuts, key, vertex_face, edge_edge)
+    cuts = not is_freezing(status)
     outcome = vertices.outcome[vertex]
-    if cuts:
-        x0 = motion.x0[vertex]
-        end = vertices.x1[vertex]
-        divides = bool(False)
-        complete = bool(False)
-        if dividing.first:
-            divides = dividing.first[vertex] >= 0
-            complete = divides and has_all_planes(dividing, vertex)
-        if divides:
-            end, truncated = position_on_sides(dividing, vertex, x0, end)
-            outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
-        if not complete:
-            path = truncated_path(to_double(x0), to_double(end), time)
-            end = to_single(to_double(x0) + path)
-            outcome = outcome | TRUNCATED
-            if not divides:
-                vertices.velocity[vertex] = to_single(path / dt)
-        if divides and int(key & wp.int64(3)) == NO_CONSTRAINT:
-            vertices.velocity[vertex] = (end - x0) / float(dt)
-            outcome = outcome | UNCONSTRAINED
-        vertices.x1[vertex] = end
-        vertices.changed[vertex] = 1
-        vertices.outcome[vertex] = outcome
-    elif outcome & FROZEN == 0:
-        vertices.x1[vertex] = motion.x0[vertex]
-        vertices.changed[vertex] = 1
-        vertices.velocity[vertex] = wp.vec3()
-        vertices.outcome[vertex] = outcome | FROZEN
+    if not cuts and outcome & FROZEN != 0:
+        return
+    if is_recording(record):
+        _record_truncation(vertices, vertex, -1, cuts, packed, vertex_face, edge_edge, record)
+    vertices.changed[vertex] = 1
+    if not cuts:
+        _freeze_vertex(motion, vertices, vertex)
         wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        return
+    x0 = motion.x0[vertex]
+    end = vertices.x1[vertex]
+    divides, complete = has_planes(dividing, vertex)
+    if divides:
+        end, truncated = position_on_sides(dividing, vertex, x0, end)
+        outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+    if not complete:
+        path = truncated_path(to_double(x0), to_double(end), contact_time(packed))
+        end = to_single(to_double(x0) + path)
+        outcome = outcome | TRUNCATED
+        if not divides:
+            vertices.velocity[vertex] = to_single(path / dt)
+    if divides and contact_kind(packed) == ContactKind.NONE:
+        vertices.velocity[vertex] = (end - x0) / float(dt)
+        outcome = outcome | UNCONSTRAINED
+    vertices.x1[vertex] = end
+    vertices.outcome[vertex] = outcome
 
 
 @wp.kernel
 def record_body_truncations(
-    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: Contacts, edge_edge: Contacts
+    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: PairQueue, edge_edge: PairQueue
 ):
-    """Records the pose of each body whose path is to be truncated before the first contact of its vertices."""
+    """Records the pose of each body whose path is truncated next, before the first contact of its vertices."""
     vertex = motion.bodies.particle_count + wp.tid()
-    key = vertices.first_contact[vertex]
-    if key == NEVER:
+    packed = vertices.first_contact[vertex]
+    if packed == NEVER:
         return
     vertices.first_contact[vertex] = NEVER
     body = motion.bodies.of_vertex[vertex]
     if body < 0 or motion.bodies.inverse_mass[body] == 0.0 or vertices.bodies.outcome[body] & FROZEN != 0:
         return
-    if vertices.bodies.first_contact[body] == first_contact_of_body(key, vertex):
-        cuts = vertices.bodies.share[body] >= wp.int64(0)
-        _record_truncation(vertices, record, vertex, body, cuts, key, vertex_face, edge_edge)
+    if vertices.bodies.first_contact[body] == packed_vertex(packed, vertex):
+        cuts = vertices.bodies.share[body] != FREEZES
+        _record_truncation(vertices, vertex, body, cuts, packed, vertex_face, edge_edge, record)
 
 
 @wp.kernel
 def freeze_undetected(motion: Motion, vertices: Vertices, status: SolveStatus):
-    """Freezes all vertices if a detection was incomplete, because a buffer overflowed."""
+    """Freezes all vertices if the last detection was incomplete."""
     vertex = wp.tid()
     if status.results.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = motion.x0[vertex]
-        vertices.velocity[vertex] = wp.vec3()
-        vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+        _freeze_vertex(motion, vertices, vertex)
+
+
+@wp.kernel
+def freeze_undetected_bodies(motion: Motion, vertices: Vertices, status: SolveStatus):
+    """Freezes all bodies if the last detection was incomplete."""
+    body = wp.tid()
+    frozen = status.results.undetected[0] == 1 and motion.bodies.inverse_mass[body] > 0.0
+    vertices.bodies.moved[body] = wp.where(frozen, 1, 0)
+    if frozen:
+        _freeze_body(motion, vertices, body)
 
 
 def divide(work: Workspace, dt: float) -> None:
-    """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them.
-
-    Args:
-        work: The workspace of the step.
-        dt: Length of the step [s].
-    """
+    """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
     work.reserve_truncations()
     motion, vertices, status, record = work.motion.vertices, work.vertices, work.status, work.record
-    contacts = contacts_of(work)[0]
+    contacts = queues_of(work.detector)[:2]
     if not work.differentiable:
-        inputs = [motion, vertices, work.constraints, work.dividing, status, work.separation]
+        inputs = [motion, status, work.separation, vertices, work.constraints, work.dividing]
         work.launch_over_constraints(divide_proximities, inputs)
-    work.launch_over_particles(truncate_vertices, [motion, vertices, status, record, work.dividing, *contacts, dt])
+    work.launch_over_particles(truncate_vertices, [motion, *contacts, dt, vertices, work.dividing, status, record])
     work.launch_over_shape_vertices(find_body_shares, status, work.dividing, record)
     if work.recorder is not None:
         work.launch_over_shape_vertices(record_body_truncations, record, *contacts)

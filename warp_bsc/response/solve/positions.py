@@ -1,43 +1,36 @@
-"""Projection of positions: Jacobi sweeps over the constraints that move vertices and bodies."""
+"""Projection of positions: sweeps over the constraints that move vertices and bodies."""
 
 import warp as wp
 
-from ..contacts.constraints import EDGE_EDGE_PROXIMITY, PLANE_CONTACT, RESTING, gap, least_distance
+from ..contacts.constraints import gap, min_distance_of
 from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
-from ..state.record import StepRecord, is_recording, record_entry
-from ..state.structs import PROJECTED, Constraints, Motion, Vertices
-from ..state.vectors import ONE, ZERO, relative
+from ..state.record import StepRecord
+from ..state.structs import PROJECTED, Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.vectors import ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, RELAXATION, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
-from .bodies import add_body_delta, move_bodies, place_vertices
+from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from .bodies import move_bodies, place_vertices
 from .sweeps import (
     activate,
     add_delta,
-    effective_inverse_masses,
+    after_sweep,
     finish_sweep,
     is_held_by_friction,
     max_sweeps,
     momentum_of,
-    multiplier_after,
+    path_of,
+    position_multiplier_after,
     repeat,
     tolerance_of,
-    with_momentum,
 )
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
-def _path(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
-    weights = constraints.weights[i]
-    corners = constraints.vertices[i]
-    return relative(weights, corners, vertices.x1) - relative(weights, corners, motion.x0)
-
-
 @wp.kernel
 def activate_position_constraints(
-    motion: Motion, vertices: Vertices, constraints: Constraints, status: SolveStatus, tolerance: wp.float64
+    motion: Motion, status: SolveStatus, tolerance: wp.float64, vertices: Vertices, constraints: Constraints
 ):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
@@ -48,103 +41,79 @@ def activate_position_constraints(
     i = wp.tid()
     if i >= constraints.count[0]:
         return
-    world = motion.world[constraints.vertices[i][0]]
-    resting_edges = constraints.kind[i] == EDGE_EDGE_PROXIMITY and constraints.pace[i] == RESTING
+    corners = constraints.vertices[i]
+    world = motion.world[corners[0]]
+    resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
     if resting_edges and is_dividing(status, world, status.loop.iteration[0]):
-        start = relative(constraints.weights[i], constraints.vertices[i], motion.x0)
-        least = least_distance(constraints, i)
-        if wp.dot(constraints.normal[i], start) - least >= CLOSE_EDGES * (constraints.separation[i] - least):
+        kept = min_distance_of(constraints, i)
+        start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
+        if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
             return
     past = status.loop.sweep[0] >= max_sweeps(motion, constraints, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
+    normal = constraints.normal[i]
+    separation = constraints.separation[i]
     distance = gap(vertices, constraints, i)
-    if constraints.kind[i] == PLANE_CONTACT:  # whose separation is an offset
-        predicted = wp.dot(constraints.normal[i], relative(constraints.weights[i], constraints.vertices[i], motion.x1))
-        if predicted < constraints.separation[i]:
-            tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (constraints.separation[i] - predicted))
+    if constraints.kind[i] == ContactKind.PLANE:  # whose separation is an offset
+        predicted = wp.dot(normal, relative(constraints.weights[i], corners, motion.x1))
+        if predicted < separation:
+            tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (separation - predicted))
     else:
-        tolerance = wp.min(
-            tolerance, TOLERANCE_OF_DISTANCE * (constraints.separation[i] - least_distance(constraints, i))
-        )
+        tolerance = wp.min(tolerance, TOLERANCE_OF_DISTANCE * (separation - min_distance_of(constraints, i)))
     tolerance = tolerance_of(motion, constraints, i, tolerance)
     active = distance < -tolerance
-    if not active and is_reversible(status, constraints.pace[i] != 0):
+    if not active and is_reversible(status, constraints.pace[i] != Pace.FAST):
         multiplier = constraints.position_multiplier[i]
         if wp.length_sq(multiplier) > ZERO:
             friction = wp.float64(constraints.friction[i])
-            path = _path(motion, vertices, constraints, i)
-            active = distance > tolerance or not is_held_by_friction(
-                multiplier, constraints.normal[i], path, friction, tolerance
-            )
+            path = path_of(motion, vertices, constraints, i)
+            active = distance > tolerance or not is_held_by_friction(multiplier, normal, path, friction, tolerance)
     if active:
         activate(motion, vertices, constraints, i)
 
 
-@wp.func
-def position_multiplier_after(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, pushes_only: bool
-) -> wp.vec3d:
-    """Returns the position multiplier of a constraint after a sweep, without momentum."""
-    old = constraints.position_multiplier[i]
-    relaxation = wp.where(pushes_only, RELAXATION, ONE)
-    along, across = effective_inverse_masses(motion, vertices, constraints, i, motion.x1, relaxation)
-    if along <= ZERO:
-        return old
-    excess = gap(vertices, constraints, i)
-    if pushes_only and excess >= ZERO:
-        return old
-    path = _path(motion, vertices, constraints, i)
-    friction = wp.float64(constraints.friction[i])
-    return multiplier_after(old, constraints.normal[i], excess, path, along, across, friction)
-
-
 @wp.kernel
 def project_positions(
-    motion: Motion, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
+    motion: Motion, status: SolveStatus, vertices: Vertices, constraints: Constraints, record: StepRecord
 ):
-    """Updates the position multipliers of the active set, in one Jacobi sweep.
-
-    The mass of a vertex is split among its active constraints (Tonge et al. 2012), which converges, and conserves
-    momentum, because a contact changes its two sides oppositely and equally. Momentum of the multipliers (Nesterov;
-    Mazhar et al. 2015) carries it through a stack in few sweeps.
-    """
+    """Updates the position multipliers of the active set, in one Jacobi sweep."""
     place = wp.tid()
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    pushes_only = not is_reversible(status, constraints.pace[i] != 0)
+    pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
     last_sweep = max_sweeps(motion, constraints, status, i, status.slow_position_sweeps) - 1
     momentum = momentum_of(constraints, status, i, last_sweep)
     if pushes_only:
         violated = gap(vertices, constraints, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
-    old = constraints.position_multiplier[i]
-    if is_recording(record):
-        record_entry(record, place, i, old, constraints.previous_multiplier[i], momentum)
     multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
-    new = with_momentum(multiplier, constraints.previous_multiplier[i], momentum)
-    constraints.previous_multiplier[i] = multiplier
+    old = constraints.position_multiplier[i]
+    new = after_sweep(constraints, record, place, old, multiplier, momentum)
     constraints.position_multiplier[i] = new
-    add_delta(motion, constraints, i, new - old, vertices.particle_delta_x)
-    if motion.bodies.of_vertex:
-        add_body_delta(motion, vertices, constraints, i, new - old, motion.x1, vertices.bodies.delta_x)
+    sums = vertices.particle_delta_x
+    add_delta(motion, vertices, constraints, i, new - old, motion.x1, sums, vertices.bodies.delta_x)
+
+
+@wp.func
+def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+    """Moves a vertex by the sum of its changes by constraints, if it can be moved; returns whether it can."""
+    moves = motion.inverse_mass[vertex] > 0.0
+    if moves:
+        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+    return moves
 
 
 @wp.kernel
 def update_positions(
-    motion: Motion, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord, last: bool
+    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
 ):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    if vertex == 0:
-        finish_sweep(constraints, status, record, last)
-    if vertices.active[vertex] == 0:
+    if not finish_sweep(vertices, constraints, status, record, last, vertex):
         return
-    if last:
-        vertices.active[vertex] = 0
-    if motion.inverse_mass[vertex] > 0.0:
-        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+    if move_vertex(motion, vertices, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
@@ -152,11 +121,9 @@ def update_positions(
 def project(work: Workspace, tolerance: float = 1.0) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met.
 
-    Args:
-        work: The workspace of the step.
-        tolerance: Tolerance as a share of that of a whole step.
+    The tolerance is a share of that of a whole step.
     """
-    repeat(work, lambda first, last: _sweep(work, first, last, tolerance))
+    repeat(work.status, work.reserve_entries, lambda first, last: _sweep(work, first, last, tolerance))
 
 
 def leave_planes(work: Workspace) -> None:
@@ -172,11 +139,12 @@ def _leave_planes(work):
 
 def _sweep(work, first, last, tolerance):
     """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    inputs = [work.motion.vertices, work.vertices, work.constraints, work.status]
+    motion, changed = work.motion.vertices, [work.vertices, work.constraints]
     if first:
-        work.launch_over_constraints(activate_position_constraints, [*inputs, tolerance * work.tolerance])
-    inputs.append(work.record)
-    work.launch_over_active_set(project_positions, inputs)
-    work.launch_over_particles(update_positions, [*inputs, last], at_least_once=True)
+        inputs = [motion, work.status, tolerance * work.tolerance]
+        work.launch_over_constraints(activate_position_constraints, [*inputs, *changed])
+    work.launch_over_active_set(project_positions, [motion, work.status, *changed, work.record])
+    inputs = [motion, last, *changed, work.status, work.record]
+    work.launch_over_particles(update_positions, inputs, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

@@ -1,11 +1,12 @@
-"""Dividing planes: what projection cannot keep apart, a plane between the two elements keeps apart for certain.
+"""Projects vertices onto their sides of dividing planes, which keep elements apart that sweeps left in contact.
 
 If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
-at all times of a linear motion. After the last projection, near pairs at rest get a plane across the shortest vector
-between their elements at the start, and every vertex of the two is projected onto its side; but no pair that moves or
-turns together without meeting, which a plane would stop, as it stands still. If contacts are left, they get planes, and
-so do all near pairs. Vertices that stand still are on their sides, so that there is a solution for the vertices of all
-pairs at once, each by itself. What slides along a plane goes on sliding, unlike what is truncated.
+at all times of a linear motion. A plane lies across the shortest vector between two elements at the start, and each of
+their vertices is projected onto its side. The start of every vertex is on its sides, so that a solution exists for all
+pairs at once, and each vertex finds it by itself. Elements that slide along a plane go on sliding.
+
+After the last projection, proximities at rest get planes, but no pair that moves or turns together without meeting: a
+plane does not move, and would stop it. If contacts are left, they get planes, and so do all proximities.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -21,12 +22,10 @@ from ..tuning import MAX_PLANE_STEPS, WEDGE
 
 wp.set_module_options({"enable_backward": False})
 
-
 _PARALLEL = wp.constant(wp.float64(1.0e-14))
 """Squared sine up to which a normal counts as one within the span of others."""
-
-
 _SMALLEST = wp.constant(float(2.0**-149))
+"""The smallest number in single precision."""
 
 
 @wp.func
@@ -89,8 +88,8 @@ def _steps_towards(normals: wp.mat33d, count: int, normal: wp.vec3d):
 def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
     """Returns the nearest position above the planes of a vertex, whatever their order (Goldfarb and Idnani 1983).
 
-    The planes that the position lies on are at most three, the active ones. The plane that it is farthest below joins
-    them; what pushes the wrong way then leaves. If rounding prevents an end, the position is near, but not above all.
+    The position lies on at most three planes, the active ones. The plane that it is farthest below joins them; planes
+    that then pull leave. If rounding prevents an end, the position is near, but not above all planes.
     """
     normals = wp.mat33d()
     multipliers = wp.vec3d()

@@ -5,30 +5,44 @@ import warp as wp
 from .vectors import to_double, to_single
 
 _UNITS = wp.constant(wp.float64(2.0**40))
-"""Units in a metre; sums are of integers in these units, so that they are the same in any order."""
+"""Units in 1, a metre, a radian, and in these per second."""
 
 
 @wp.func
-def _add(sums: wp.array2d[wp.int64], vertex: int, x: wp.vec3d):
+def to_units(x: wp.float64) -> wp.int64:
+    """Returns a number in units, rounded."""
+    return wp.int64(wp.rint(_UNITS * x))
+
+
+@wp.func
+def from_units(units: wp.int64) -> wp.float64:
+    """Returns the number that an integer in units stands for."""
+    return wp.float64(units) / _UNITS
+
+
+@wp.func
+def add_to_sum(sums: wp.array2d[wp.int64], i: int, column: int, x: wp.vec3d):
+    """Adds a vector to three columns of the sums of a vertex or body, from ``column`` on."""
     for axis in range(3):
-        wp.atomic_add(sums, vertex, axis, wp.int64(wp.rint(_UNITS * x[axis])))
+        wp.atomic_add(sums, i, column + axis, to_units(x[axis]))
+
+
+@wp.func
+def sum_of(sums: wp.array2d[wp.int64], i: int, column: int) -> wp.vec3d:
+    """Returns what :func:`add_to_sum` has added."""
+    total = wp.vec3d()
+    for axis in range(3):
+        total[axis] = from_units(sums[i, column + axis])
+    return total
 
 
 @wp.func
 def with_delta(x: wp.vec3, sums: wp.array2d[wp.int64], vertex: int) -> wp.vec3:
     """Returns a position or velocity plus the sum of what constraints did to it."""
-    y = to_double(x)
-    for axis in range(3):
-        y[axis] += wp.float64(sums[vertex, axis]) / _UNITS
-    return to_single(y)
+    return to_single(to_double(x) + sum_of(sums, vertex, 0))
 
 
 @wp.func
 def sums_of(sums: wp.array2d[wp.int64], body: int):
     """Returns the linear and the angular part of the sums of a body."""
-    linear = wp.vec3d()
-    angular = wp.vec3d()
-    for axis in range(3):
-        linear[axis] = wp.float64(sums[body, axis]) / _UNITS
-        angular[axis] = wp.float64(sums[body, 3 + axis]) / _UNITS
-    return linear, angular
+    return sum_of(sums, body, 0), sum_of(sums, body, 3)

@@ -10,6 +10,7 @@ from ..._arguments import checked_distance, checked_distances
 from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
 from ..tuning import SEGMENTS
+from .structs import Incidence
 
 _STRAIGHT = 0.9
 """Length of a spring, as a share of that of two others between its ends, from which it runs along them."""
@@ -50,24 +51,6 @@ class Planes(NamedTuple, Generic[_Array]):
     body: _Array
     shape: _Array
     world: _Array
-
-
-@wp.struct
-class Incidence:
-    """The elements that each element belongs to: those of element ``i`` are ``items[first[i]:first[i + 1]]``."""
-
-    first: wp.array[int]
-    items: wp.array[int]
-
-
-@wp.struct
-class Connectivity:
-    """The elements of a mesh, and the elements that each belongs to."""
-
-    faces: wp.array2d[int]
-    edges: wp.array2d[int]
-    vertex_edges: Incidence
-    edge_faces: Incidence
 
 
 class ModelMesh(CollisionMesh):

@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from ..state.vectors import ZERO
-from .vectors import to_double
+from .vectors import ONE, ZERO, to_double
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
-
+"""Bound on the rounding error of a signed distance, as a share of the sum of its terms."""
 _TINY = wp.constant(wp.float64(1e-300))
+"""More than what underflow loses [m]."""
 
 
 @wp.struct
@@ -54,4 +54,4 @@ def signed_distance(plane: wp.vec4d, x: wp.vec3):
 @wp.func
 def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
     """Returns when a vertex enters a solid, in [0, 1], from its signed distances at the start and end of a step."""
-    return wp.min(wp.max(before, ZERO) / wp.max(before - after, _TINY), wp.float64(1.0))
+    return wp.min(wp.max(before, ZERO) / wp.max(before - after, _TINY), ONE)

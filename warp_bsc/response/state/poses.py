@@ -2,9 +2,8 @@
 
 import warp as wp
 
-from ..state.vectors import ONE, ZERO
 from .structs import Bodies
-from .vectors import to_double, to_single
+from .vectors import HALF, ONE, ZERO, to_double, to_single
 
 _SMALL = wp.constant(wp.float64(1e-12))
 """Squared angle [rad^2] up to which turns are by series, which have derivatives at 0 as well."""
@@ -20,12 +19,12 @@ def _rotation(pose: wp.transform) -> wp.quatd:
 def _turned(rotation: wp.quatd, turn: wp.vec3d) -> wp.quatd:
     """Returns a rotation followed by a turn about a fixed axis, given as axis times angle [rad]."""
     square = wp.length_sq(turn)
-    half = wp.float64(0.5) - square / wp.float64(48.0)  # sine of half the angle by the angle
+    half = HALF - square / wp.float64(48.0)  # sine of half the angle by the angle
     cosine = ONE - square / wp.float64(8.0)
     if square > _SMALL:
         angle = wp.sqrt(square)
-        half = wp.sin(wp.float64(0.5) * angle) / angle
-        cosine = wp.cos(wp.float64(0.5) * angle)
+        half = wp.sin(HALF * angle) / angle
+        cosine = wp.cos(HALF * angle)
     return wp.quatd(half * turn[0], half * turn[1], half * turn[2], cosine) * rotation
 
 

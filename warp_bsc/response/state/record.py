@@ -99,14 +99,6 @@ def end_sweep(record: StepRecord, active: int):
 
 
 @wp.func
-def begin_iteration(record: StepRecord, iteration: int, constraints: int):
-    """Stores the offsets of an iteration."""
-    record.sweep_offsets[iteration] = record.counts.sweeps[0]
-    record.constraint_offsets[iteration] = constraints
-    record.truncation_offsets[iteration] = record.counts.truncations[0]
-
-
-@wp.func
 def truncation_at(record: StepRecord, iteration: int, i: int) -> int:
     """Returns the place of a truncation of an iteration; -1 after its last."""
     entry = record.truncation_offsets[iteration] + i
@@ -168,4 +160,18 @@ def record_offsets(constraints: Constraints, status: SolveStatus, record: StepRe
     last = status.max_iterations + status.max_truncations + 1
     iteration = status.loop.iteration[0]
     if after == 1 or iteration <= last:
-        begin_iteration(record, wp.min(iteration, last) + after, constraints.count[0])
+        i = wp.min(iteration, last) + after
+        record.sweep_offsets[i] = record.counts.sweeps[0]
+        record.constraint_offsets[i] = constraints.count[0]
+        record.truncation_offsets[i] = record.counts.truncations[0]
+
+
+@wp.kernel
+def check_complete(constraints: Constraints, record: StepRecord, complete: wp.array[int]):
+    """Sets ``complete`` to 1 if everything that a step did fits in these constraints and its record, else to 0."""
+    counts = record.counts
+    fits = constraints.count[0] <= constraints.vertices.shape[0] and counts.dropped[0] == 0
+    fits = fits and counts.sweeps[0] <= record.sweep_ends.shape[0]
+    fits = fits and counts.entries[0] <= record.constraint.shape[0]
+    fits = fits and counts.truncations[0] <= record.vertex.shape[0]
+    complete[0] = wp.where(fits, 1, 0)

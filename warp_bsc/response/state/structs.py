@@ -1,17 +1,37 @@
-"""Device data of the response: the motion that comes in, the vertices and constraints worked on, and the status."""
+"""Arrays of the response as structs: the predicted motion, the vertices and bodies that it moves, and constraints."""
+
+from enum import IntEnum
 
 import warp as wp
 
 from ...detection.approach_phase import MinDistances
 
+
+class ContactKind(IntEnum):
+    """Kinds of contacts and of constraints."""
+
+    VERTEX_FACE = 0
+    EDGE_EDGE = 1
+    PLANE = 2
+    VERTEX_FACE_PROXIMITY = 3
+    EDGE_EDGE_PROXIMITY = 4
+    NONE = 5  # of a contact that has no constraint
+
+
+class Pace(IntEnum):
+    """How fast the elements of a constraint are for their size."""
+
+    FAST = 0
+    SLOW = 1  # one direction holds for the whole step
+    RESTING = 2  # of slow proximities at rest, which are divided before the next detection
+
+
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
-"""Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity, dividing planes moved it,
-its path was cut, it was left where it was, it was left there because its predicted position was not finite, it was
-divided from contacts without constraints."""
-
+"""Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity; dividing planes moved it;
+its path was cut; it was frozen at its start; it was left there because its prediction was not finite; it was divided
+from contacts without constraints."""
 NEVER = wp.constant(wp.int64(2**62))
-"""The key of a vertex without a contact, see :attr:`Vertices.first_contact`."""
-
+"""In place of the packed contact of a vertex without one, see :attr:`Vertices.first_contact`."""
 SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
 """Columns of the sums of a world: their number; the number of moments, which are mass, mass by position, its six second
 moments, and mass by the squared change of velocity; where they begin, behind the torque; and the column that is not 0
@@ -19,8 +39,26 @@ if a contact is with something that is not free."""
 
 
 @wp.struct
+class Incidence:
+    """The elements that each element belongs to: those of element ``i`` are ``items[first[i]:first[i + 1]]``."""
+
+    first: wp.array[int]
+    items: wp.array[int]
+
+
+@wp.struct
+class Connectivity:
+    """The elements of a mesh, and the elements that each belongs to."""
+
+    faces: wp.array2d[int]
+    edges: wp.array2d[int]
+    vertex_edges: Incidence
+    edge_faces: Incidence
+
+
+@wp.struct
 class Bodies:
-    """The rigid bodies, and the motion that the inner solver wants of them; empty if the response moves none.
+    """The rigid bodies and their predicted motion; empty if the response moves none.
 
     Velocities are those of centres of mass, as in ``newton.State.body_qd``.
     """
@@ -53,28 +91,28 @@ class MovedBodies:
     centre: wp.array[wp.vec3d]  # of mass, where impulses act: as predicted, and in the end as moved [m]
     inverse_inertia: wp.array[wp.mat33d]  # there, in the frame of the world
     active: wp.array[int]  # active constraints of the body
-    moved: wp.array[int]  # 1 if its vertices are to follow
+    moved: wp.array[int]  # 1 if its vertices follow
     delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
     delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
-    share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see bodies.find_body_shares
-    first_contact: wp.array[wp.int64]  # of its vertices, see bodies.first_contact_of_body
+    share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see division.find_body_shares
+    first_contact: wp.array[wp.int64]  # of its vertices, packed by first_contact.packed_vertex
     loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
 
 
 @wp.struct
 class Motion:
-    """The motion that the inner solver wants, and properties of its vertices. The response only reads it."""
+    """The predicted motion, and properties of its vertices. The response only reads it."""
 
     x0: wp.array[wp.vec3]  # positions at the start of the step [m]
     x1: wp.array[wp.vec3]  # predicted positions at its end [m]
     velocity: wp.array[wp.vec3]  # predicted velocities at its end [m/s]
-    is_not_finite: wp.array[int]  # 1 where what was predicted is not finite: the vertex stands
+    is_not_finite: wp.array[int]  # 1 where the prediction is not finite: the vertex stays at its start
     inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved by itself
     friction: wp.array[float]  # coefficient
     world: wp.array[int]
     bodies: Bodies
-    distances: MinDistances  # that pairs are to keep; empty if they only must not touch
+    distances: MinDistances  # of pairs; empty if pairs only must not touch
     interrupted: wp.array[int]  # by world, then of any: 1 where the program moved a movable particle between steps
 
 
@@ -85,9 +123,9 @@ class Vertices:
     x1: wp.array[wp.vec3]  # positions at the end of the step [m]
     velocity: wp.array[wp.vec3]  # velocities at its end [m/s]
     active: wp.array[int]  # active constraints that move the vertex
-    particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see projection.add_delta
+    particle_delta_x: wp.array2d[wp.int64]  # position changes summed over constraints, see sweeps.add_delta
     particle_delta_v: wp.array2d[wp.int64]  # velocity changes summed over constraints
-    first_contact: wp.array[wp.int64]  # key of its first contact, see constraints.update_first_contact
+    first_contact: wp.array[wp.int64]  # see first_contact.packed_contact
     changed: wp.array[int]  # 1 if it may have other contacts than those that the last detection found
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED
     bodies: MovedBodies
@@ -105,18 +143,18 @@ class Constraints:
     weights: wp.array[wp.vec4d]  # of the vertices in the vector from the second contact point to the first
     normal: wp.array[wp.vec3d]
     separation: wp.array[wp.float64]  # along the normal [m]
-    least: wp.array[wp.float64]  # part of it that is the minimum distance [m]; empty without minimum distances
+    min_distance: wp.array[wp.float64]  # part of it that the pair must keep [m]; empty without minimum distances
     friction: wp.array[float]  # coefficient
-    kind: wp.array[int]  # of contact, plane or proximity, see constraints.VERTEX_FACE_CONTACT and following
+    kind: wp.array[int]  # a ContactKind
     plane: wp.array[int]  # of a contact with a plane
     within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
     toi: wp.array[wp.float64]  # time of impact
     approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
-    pace: wp.array[int]  # see constraints.Pace
+    pace: wp.array[int]  # a Pace
     position_multiplier: wp.array[wp.vec3d]  # [kg m]
     velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
     previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum
-    last_sweep: wp.array[int]  # in which it was active last
+    last_sweep: wp.array[int]  # in which it was active last, or NEVER_SWEPT
     active_set: wp.array[int]  # indices of the active constraints
     active_count: wp.array[wp.int64]
 
@@ -128,41 +166,8 @@ def has_final_velocity(outcome: int) -> bool:
     return cut or outcome & (FROZEN | NOT_FINITE | UNCONSTRAINED) != 0
 
 
-def allocate_vertices(count, device) -> Vertices:
-    """Returns vertices without contacts."""
-    vertices = Vertices()
-    for name in ("x1", "velocity"):
-        setattr(vertices, name, wp.zeros(count, dtype=wp.vec3, device=device))
-    for name in ("active", "changed", "outcome"):
-        setattr(vertices, name, wp.zeros(count, dtype=int, device=device))
-    for name in ("particle_delta_x", "particle_delta_v"):
-        setattr(vertices, name, wp.zeros((count, 3), dtype=wp.int64, device=device))
-    vertices.first_contact = wp.full(count, int(NEVER), dtype=wp.int64, device=device)
-    return vertices
-
-
-def allocate_bodies(count, device) -> MovedBodies:
-    """Returns bodies that nothing has moved."""
-    bodies = MovedBodies()
-    for name, var in MovedBodies.vars.items():
-        shape = (count, 6) if var.type.ndim == 2 else count
-        setattr(bodies, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
-    return bodies
-
-
-def allocate_constraints(capacity, device, *, keep_distances: bool = False) -> Constraints:
-    """Returns constraints, none yet, with this capacity."""
-    constraints = Constraints()
-    for name, var in Constraints.vars.items():
-        setattr(constraints, name, wp.empty(capacity, dtype=var.type.dtype, device=device))
-    if not keep_distances:
-        constraints.least = wp.empty(0, dtype=wp.float64, device=device)
-    constraints.count = wp.zeros(1, dtype=int, device=device)
-    constraints.active_count = wp.zeros(1, dtype=wp.int64, device=device)
-    return constraints
-
-
 NO_NODE = wp.constant(-1)
+"""In place of a node: the end of a list."""
 
 
 @wp.struct
@@ -183,18 +188,39 @@ class DividingPlanes:
     kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
 
 
+def allocate(struct_type: type, size: int, device: wp.Device, **sizes):
+    """Returns a struct whose arrays are zeros of a size, those named in ``sizes`` of their own sizes."""
+    struct = struct_type()
+    for name, var in struct_type.vars.items():
+        if hasattr(var.type, "dtype"):  # not a struct
+            setattr(struct, name, wp.zeros(sizes.get(name, size), dtype=var.type.dtype, device=device))
+    return struct
+
+
+def allocate_vertices(count: int, device: wp.Device) -> Vertices:
+    """Returns vertices without contacts."""
+    vertices = allocate(Vertices, count, device, particle_delta_x=(count, 3), particle_delta_v=(count, 3))
+    vertices.first_contact.fill_(int(NEVER))
+    return vertices
+
+
+def allocate_bodies(count: int, device: wp.Device) -> MovedBodies:
+    """Returns bodies that nothing has moved."""
+    return allocate(MovedBodies, count, device, delta_x=(count, 6), delta_v=(count, 6))
+
+
+def allocate_constraints(capacity: int, device: wp.Device, *, keep_distances: bool = False) -> Constraints:
+    """Returns constraints, none yet, with this capacity."""
+    min_distances = capacity if keep_distances else 0
+    return allocate(Constraints, capacity, device, count=1, active_count=1, min_distance=min_distances)
+
+
 def allocate_dividing_planes(
     vertices: int, capacity: int, device: wp.Device, *, keep_distances: bool = False
 ) -> DividingPlanes:
     """Returns lists without planes for this many vertices, with a capacity for all planes together."""
-    planes = DividingPlanes()
-    planes.count = wp.zeros(1, dtype=int, device=device)
-    planes.normal = wp.empty(capacity, dtype=wp.vec3d, device=device)
-    planes.offset = wp.empty(capacity, dtype=wp.float64, device=device)
-    planes.half = wp.empty(capacity if keep_distances else 0, dtype=wp.float64, device=device)
-    planes.margin = wp.empty(capacity, dtype=float, device=device)
-    planes.split = wp.empty(capacity, dtype=wp.int8, device=device)
-    planes.next = wp.empty(4 * capacity, dtype=int, device=device)
-    planes.first = wp.full(vertices, int(NO_NODE), dtype=int, device=device)
-    planes.kept = wp.full(vertices, int(NO_NODE), dtype=int, device=device)
+    sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
+    planes = allocate(DividingPlanes, capacity, device, **sizes, half=capacity if keep_distances else 0)
+    planes.first.fill_(int(NO_NODE))
+    planes.kept.fill_(int(NO_NODE))
     return planes

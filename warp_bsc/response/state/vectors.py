@@ -19,6 +19,12 @@ def to_single(x: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
+def corners_of(x: wp.array[wp.vec3], corners: wp.vec4i):
+    """Returns the positions of four vertices in double precision."""
+    return to_double(x[corners[0]]), to_double(x[corners[1]]), to_double(x[corners[2]]), to_double(x[corners[3]])
+
+
+@wp.func
 def relative(weights: wp.vec4d, corners: wp.vec4i, x: wp.array[wp.vec3]) -> wp.vec3d:
     """Returns the vector from the second contact point to the first, or its velocity."""
     result = wp.vec3d()

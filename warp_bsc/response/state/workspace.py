@@ -11,7 +11,7 @@ from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
 from ..schedule import SolveStatus, allocate_status, clear_status
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
-from .mesh import Connectivity, ModelMesh
+from .mesh import ModelMesh
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -19,6 +19,7 @@ from .structs import (
     NO_NODE,
     NOT_FINITE,
     SUMS,
+    Connectivity,
     Constraints,
     DividingPlanes,
     Motion,

@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from ..contacts.constraints import PLANE_CONTACT, approach_of
+from ..contacts.constraints import NEVER_SWEPT, approach_of
 from ..schedule import SolveStatus
 from ..state.motion import moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
-from ..state.structs import Constraints, Motion, Vertices
+from ..state.structs import Constraints, ContactKind, Motion, Vertices
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,8 +14,6 @@ _NOT_PROJECTED = wp.constant(-2)
 """Iteration of the last contact of a world that takes no substeps: no iteration projects its vertices."""
 _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 """Separation of a constraint that no motion violates, so that it never acts [m]."""
-_NO_SWEEP = wp.constant(-2)
-"""Last sweep of a constraint that has been active in none; sweep -1 would be the one before the first."""
 
 
 @wp.kernel
@@ -166,8 +164,8 @@ def reset_constraints(
     constraints.position_multiplier[i] = wp.vec3d()
     constraints.velocity_multiplier[i] = wp.vec3d()
     constraints.previous_multiplier[i] = wp.vec3d()
-    constraints.last_sweep[i] = _NO_SWEEP
-    if i < detected[0] and constraints.kind[i] == PLANE_CONTACT:
+    constraints.last_sweep[i] = NEVER_SWEPT
+    if i < detected[0] and constraints.kind[i] == ContactKind.PLANE:
         constraints.separation[i] = _NEVER_VIOLATED
         return
     corners = constraints.vertices[i]

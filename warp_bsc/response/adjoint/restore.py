@@ -1,0 +1,406 @@
+"""The kernels of an adjoint that are not differentiated: they restore a step from its record, and gather gradients.
+
+A launch over vertices and bodies has a thread for each vertex, then one for each body if the response can move bodies.
+"""
+
+import enum
+
+import warp as wp
+
+from ..schedule import SolveStatus
+from ..solve.bodies import change_body_velocity, move_body
+from ..solve.positions import move_vertex
+from ..solve.sweeps import add_delta, count_active
+from ..solve.velocities import change_velocity
+from ..state.fixed_sum import sums_of
+from ..state.planes import MovingPlanes
+from ..state.record import StepRecord, truncation_at
+from ..state.structs import Constraints, Motion, Vertices
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Cursor:
+    """Where the adjoint is in the record of a step; each field is an array of one element."""
+
+    iteration: wp.array[int]  # of detect and project
+    first_sweep: wp.array[int]  # of that iteration
+    current_sweep: wp.array[int]  # or -1
+    next_sweep: wp.array[int]  # to go back through
+    more_sweeps: wp.array[int]  # 1 if there is one
+    more_iterations: wp.array[int]  # 1 while there are iterations to go back through
+
+
+@wp.struct
+class RestoredStep:
+    """A recorded step, restored as it was at the cursor."""
+
+    motion: Motion
+    planes: MovingPlanes
+    vertices: Vertices
+    constraints: Constraints
+    status: SolveStatus
+    record: StepRecord
+    cursor: Cursor
+    restitution: wp.array[float]
+    separation: wp.float64  # smallest separation of constraints [m]
+    dt: wp.float64  # length of the step [s]
+
+
+@wp.struct
+class BodyGradients:
+    """Gradients with respect to bodies, and to changes of them by constraints, at the cursor."""
+
+    pose: wp.array[wp.transform]
+    velocity: wp.array[wp.spatial_vector]
+    shift: wp.array[wp.spatial_vectord]  # with respect to changes of centres, and turns
+    velocity_change: wp.array[wp.spatial_vectord]  # with respect to what constraints add to velocities
+
+
+@wp.struct
+class Gradients:
+    """Gradients with respect to positions and velocities at the cursor."""
+
+    x1: wp.array[wp.vec3]
+    velocity: wp.array[wp.vec3]
+    more_x1: wp.array[wp.vec3]  # added to x1 once everything has read it
+    more_velocity: wp.array[wp.vec3]
+    velocity_change: wp.array[wp.vec3]  # with respect to what constraints add to velocities
+    on_bodies: wp.array[wp.vec3]  # with respect to positions or velocities of vertices of bodies
+    bodies: BodyGradients
+
+
+class Move(enum.IntEnum):
+    """Where a cursor moves."""
+
+    END = 0  # behind the sweeps on velocities
+    SWEEPS = 1  # behind the sweeps on positions of its iteration
+    DETECTION = 2  # to the detection ahead of its iteration, after which the iteration before ends
+
+
+@wp.func
+def entry_of(record: StepRecord, sweep: int, place: int) -> int:
+    """Returns the entry of the constraint at a place of a sweep's active set; -1 if the set is smaller."""
+    if sweep < 0:
+        return -1
+    entry = place
+    if sweep > 0:
+        entry += record.sweep_ends[sweep - 1]
+    return wp.where(entry < record.sweep_ends[sweep], entry, -1)
+
+
+@wp.func
+def is_movable(motion: Motion, body: int) -> bool:
+    """Returns whether the response can move a body in this step."""
+    return motion.bodies.inverse_mass[body] > 0.0
+
+
+@wp.kernel
+def begin_gradients(
+    # in
+    motion: Motion,
+    undetected: wp.array[int],
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    # out
+    gradients: Gradients,
+    x0: wp.array[wp.vec3],
+    starts: wp.array[wp.transform],
+):
+    """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
+
+    Threads are over vertices and bodies.
+    """
+    vertex = wp.tid()
+    body = vertex - motion.x0.shape[0]
+    if body >= 0:
+        pose = body_q[body]
+        twist = body_qd[body]
+        if undetected[0] == 1 and is_movable(motion, body):
+            starts[body] = pose
+            pose = wp.transform(wp.vec3(), wp.quat())
+            twist = wp.spatial_vector()
+        gradients.bodies.pose[body] = pose
+        gradients.bodies.velocity[body] = twist
+        return
+    x1 = wp.vec3()
+    velocity = wp.vec3()
+    if vertex < particle_q.shape[0]:
+        x1 = particle_q[vertex]
+        velocity = particle_qd[vertex]
+    x0[vertex] = wp.vec3()
+    if undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
+        x0[vertex] = x1
+        x1 = wp.vec3()
+        velocity = wp.vec3()
+    gradients.x1[vertex] = x1
+    gradients.velocity[vertex] = velocity
+
+
+@wp.kernel
+def move_cursor(step: RestoredStep, move: int, complete: wp.array[int]):
+    """Moves the cursor, and sets the iteration of the status to the one that computed what is there.
+
+    There is nothing to go back through in a record that is not ``complete``.
+    """
+    record = step.record
+    cursor = step.cursor
+    iteration = cursor.iteration[0]
+    first = cursor.first_sweep[0]
+    last = cursor.next_sweep[0]
+    if complete[0] == 0:
+        first = 0
+        last = -1
+    elif move == Move.END:
+        iteration = wp.min(step.status.loop.iteration[0], step.status.max_iterations + step.status.max_truncations + 1)
+        step.status.loop.iteration[0] = iteration
+        cursor.more_iterations[0] = 1
+        first = record.sweep_offsets[iteration + 1]
+        last = record.counts.sweeps[0] - 1
+    elif move == Move.SWEEPS:
+        first = record.sweep_offsets[iteration]
+        last = record.sweep_offsets[iteration + 1] - 1
+    else:
+        iteration -= 1
+        step.status.loop.iteration[0] = wp.max(iteration, 0)
+        cursor.more_iterations[0] = wp.where(iteration >= 0, 1, 0)
+    cursor.iteration[0] = iteration
+    cursor.first_sweep[0] = first
+    cursor.current_sweep[0] = -1
+    cursor.next_sweep[0] = last
+    cursor.more_sweeps[0] = wp.where(last >= first, 1, 0)
+
+
+@wp.func
+def _step_back(cursor: Cursor):
+    """Makes the next sweep the current one, and the one before it the next."""
+    sweep = cursor.next_sweep[0]
+    exists = sweep >= cursor.first_sweep[0]
+    cursor.current_sweep[0] = wp.where(exists, sweep, -1)
+    cursor.next_sweep[0] = wp.where(exists, sweep - 1, sweep)
+    cursor.more_sweeps[0] = wp.where(cursor.next_sweep[0] >= cursor.first_sweep[0], 1, 0)
+
+
+@wp.kernel
+def restore_multipliers(
+    # in
+    step: RestoredStep,
+    x: wp.array[wp.vec3],
+    # in and out
+    multiplier: wp.array[wp.vec3d],
+    sums: wp.array2d[wp.int64],
+    body_sums: wp.array2d[wp.int64],
+):
+    """Restores multipliers as they were before a sweep, and the sums of what they changed, at positions ``x``."""
+    record = step.record
+    constraints = step.constraints
+    sweep = step.cursor.next_sweep[0]
+    entry = entry_of(record, sweep, wp.tid())
+    if sweep < step.cursor.first_sweep[0] or entry < 0:
+        return
+    i = record.constraint[entry]
+    old = record.multiplier[entry]
+    add_delta(step.motion, step.vertices, constraints, i, old - multiplier[i], x, sums, body_sums)
+    multiplier[i] = old
+    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
+    count_active(step.motion, step.vertices, constraints, i)
+
+
+@wp.kernel
+def restore_positions(step: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
+    """Restores positions and poses as they were before a sweep, and adds up the gradients of positions.
+
+    Threads are over vertices and bodies. Writes the sums of the changes of poses to ``sums``.
+    """
+    vertex = wp.tid()
+    body = vertex - step.motion.x0.shape[0]
+    if body >= 0:
+        move_body(step.motion, step.vertices, body)
+        shift, turn = sums_of(step.vertices.bodies.delta_x, body)
+        sums[body] = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+        return
+    if vertex == 0:
+        _step_back(step.cursor)
+    gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
+    gradients.more_x1[vertex] = wp.vec3()
+    if step.vertices.active[vertex] != 0:
+        move_vertex(step.motion, step.vertices, vertex)
+
+
+@wp.kernel
+def restore_velocities(step: RestoredStep, gradients: Gradients):
+    """Restores velocities as they were before a sweep, and adds up their gradients, over vertices and bodies."""
+    vertex = wp.tid()
+    body = vertex - step.motion.x0.shape[0]
+    if body >= 0:
+        change = wp.spatial_vectord()
+        if change_body_velocity(step.motion, step.vertices, body):
+            for i in range(6):
+                change[i] = wp.float64(gradients.bodies.velocity[body][i])
+        gradients.bodies.velocity_change[body] = change
+        return
+    if vertex == 0:
+        _step_back(step.cursor)
+    gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
+    gradients.more_velocity[vertex] = wp.vec3()
+    is_free = change_velocity(step.motion, step.vertices, vertex)
+    gradients.velocity_change[vertex] = wp.where(is_free, gradients.velocity[vertex], wp.vec3())
+
+
+@wp.kernel
+def restore_unturned(motion: Motion, vertices: Vertices):
+    """Restores velocities as they were before the turn that restores angular momentum, over vertices and bodies."""
+    vertex = wp.tid()
+    body = vertex - motion.x0.shape[0]
+    if body >= 0:
+        change_body_velocity(motion, vertices, body)
+    else:
+        change_velocity(motion, vertices, vertex)
+
+
+@wp.kernel
+def restore_paths(
+    # in
+    step: RestoredStep,
+    # in and out
+    gradients: Gradients,
+    # out
+    end: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    pose: wp.array[wp.transform],
+    twist: wp.array[wp.spatial_vector],
+):
+    """Restores paths before truncation; the gradients of their vertices and bodies move to the last four arguments."""
+    record = step.record
+    entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
+    if entry < 0:
+        return
+    vertex = record.vertex[entry]
+    body = record.body[entry]
+    if vertex >= 0:
+        end[entry] = gradients.x1[vertex]
+        velocity[entry] = gradients.velocity[vertex]
+        gradients.x1[vertex] = wp.vec3()
+        gradients.velocity[vertex] = wp.vec3()
+        step.vertices.x1[vertex] = record.end[entry]
+    elif body >= 0:
+        pose[entry] = gradients.bodies.pose[body]
+        twist[entry] = gradients.bodies.velocity[body]
+        gradients.bodies.pose[body] = wp.transform(wp.vec3(), wp.quat())
+        gradients.bodies.velocity[body] = wp.spatial_vector()
+        step.vertices.bodies.pose[body] = record.pose[entry]
+
+
+@wp.kernel
+def collect_gradients_on_bodies(
+    motion: Motion, gradients: Gradients, of_vertices: wp.array[wp.vec3], more: wp.array[wp.vec3]
+):
+    """Moves the gradients with respect to vertices of bodies to ``gradients.on_bodies``."""
+    vertex = motion.bodies.particle_count + wp.tid()
+    body = motion.bodies.of_vertex[vertex]
+    collected = wp.vec3()
+    if body >= 0 and is_movable(motion, body):
+        collected = of_vertices[vertex] + more[vertex]
+        of_vertices[vertex] = wp.vec3()
+        more[vertex] = wp.vec3()
+    gradients.on_bodies[vertex] = collected
+
+
+@wp.func
+def _missing(complete: wp.array[int]) -> float:
+    """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
+    return wp.where(complete[0] == 0, wp.nan, float(0.0))
+
+
+@wp.kernel
+def finish_gradients(
+    # in
+    motion: Motion,
+    gradients: Gradients,
+    complete: wp.array[int],
+    x0: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    # in and out
+    predicted_x1: wp.array[wp.vec3],
+    predicted_velocity: wp.array[wp.vec3],
+    friction: wp.array[float],
+    start_q: wp.array[wp.vec3],
+    particle_inv_mass: wp.array[float],
+    restitution: wp.array[float],
+    # out
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+):
+    """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
+
+    Those of vertices of shapes remain gradients with respect to what was predicted of them.
+    """
+    particle = wp.tid()
+    missing = _missing(complete)
+    x1 = gradients.x1[particle] + gradients.more_x1[particle] + predicted_x1[particle]
+    velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + predicted_velocity[particle]
+    friction[particle] = friction[particle] + missing
+    if particle == 0 and restitution:
+        restitution[0] = restitution[0] + missing
+    if particle >= particle_q.shape[0]:
+        predicted_x1[particle] = x1
+        predicted_velocity[particle] = velocity
+        return
+    if particle_inv_mass and motion.inverse_mass[particle] > 0.0:
+        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle] + missing
+    particle_q[particle] = x1 + wp.vec3(missing)
+    particle_qd[particle] = velocity + wp.vec3(missing)
+    start_q[particle] = start_q[particle] + x0[particle] + wp.vec3(missing)
+
+
+@wp.kernel
+def finish_body_gradients(
+    # in
+    motion: Motion,
+    gradients: BodyGradients,
+    complete: wp.array[int],
+    motion_starts: wp.array[wp.transform],
+    motion_ends: wp.array[wp.transform],
+    motion_velocities: wp.array[wp.spatial_vector],
+    motion_inverse_masses: wp.array[float],
+    # in and out
+    starts: wp.array[wp.transform],
+    ends: wp.array[wp.transform],
+    velocities: wp.array[wp.spatial_vector],
+    inverse_masses: wp.array[float],
+    inverse_inertias: wp.array[wp.mat33],
+    masses: wp.array[float],
+    inertias: wp.array[wp.mat33],
+):
+    """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
+
+    Where the response moves no bodies, only those of poses change.
+    """
+    body = wp.tid()
+    missing = _missing(complete)
+    start = starts[body] + motion_starts[body]
+    end = motion_ends[body]
+    if motion.bodies.of_vertex:
+        velocity = gradients.velocity[body] + motion_velocities[body]
+        for i in range(6):
+            velocity[i] = velocity[i] + missing
+        velocities[body] = velocity
+        if is_movable(motion, body):
+            if inverse_masses:
+                inverse_masses[body] = inverse_masses[body] + motion_inverse_masses[body] + missing
+            if inverse_inertias:
+                inverse_inertias[body] = inverse_inertias[body] + missing * wp.identity(3, dtype=float)
+            if masses:
+                masses[body] = masses[body] + missing
+            if inertias:
+                inertias[body] = inertias[body] + missing * wp.identity(3, dtype=float)
+    else:
+        end = end + ends[body]
+    for i in range(7):
+        start[i] = start[i] + missing
+        end[i] = end[i] + missing
+    starts[body] = start
+    ends[body] = end

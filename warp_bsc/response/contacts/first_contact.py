@@ -1,0 +1,60 @@
+"""The first contact of a vertex as one number, and the path that is left before it."""
+
+import warp as wp
+
+from ..state.structs import Vertices
+from ..tuning import SHARE_OF_PATH
+
+TIME_UNITS = wp.constant(wp.float64(2.0**30))
+"""Units of time in a step; packed contacts hold whole units."""
+_BELOW_TIME = wp.constant(wp.int64(0xFFFFFFFF))
+"""Bits of a packed contact below its time: the lowest three are its kind, the others its index."""
+
+
+@wp.func
+def packed_contact(time: wp.float64, kind: int, i: int) -> wp.int64:
+    """Returns contact ``i`` of a ContactKind as one number, which orders contacts by time, then by index and kind."""
+    units = wp.int64(wp.floor(TIME_UNITS * time))
+    return (units << wp.int64(32)) | (wp.int64(8) * wp.int64(i) + wp.int64(kind))
+
+
+@wp.func
+def packed_vertex(packed: wp.int64, vertex: int) -> wp.int64:
+    """Returns a number that orders the first contacts of the vertices of a body by time, then by vertex."""
+    return ((packed >> wp.int64(32)) << wp.int64(32)) | wp.int64(vertex)
+
+
+@wp.func
+def contact_time(packed: wp.int64) -> wp.float64:
+    """Returns the time of a packed contact, in [0, 1]."""
+    return wp.float64(packed >> wp.int64(32)) / TIME_UNITS
+
+
+@wp.func
+def contact_kind(packed: wp.int64) -> int:
+    """Returns the ContactKind of a packed contact."""
+    return int(packed & wp.int64(7))
+
+
+@wp.func
+def contact_index(packed: wp.int64) -> int:
+    """Returns the index of a packed contact among those of its kind."""
+    return int((packed & _BELOW_TIME) >> wp.int64(3))
+
+
+@wp.func
+def update_first_contact(vertices: Vertices, vertex: int, time: wp.float64, kind: int, i: int):
+    """Makes contact ``i`` of a ContactKind the first contact of a vertex, if it is earlier than the one so far."""
+    wp.atomic_min(vertices.first_contact, vertex, packed_contact(time, kind, i))
+
+
+@wp.func
+def share_before(time: wp.float64) -> wp.float64:
+    """Returns the share of a path that is left before its first contact, at ``time`` in [0, 1]."""
+    return SHARE_OF_PATH * time
+
+
+@wp.func
+def truncated_path(x0: wp.vec3d, x1: wp.vec3d, time: wp.float64) -> wp.vec3d:
+    """Returns the path of a vertex truncated before its first contact, at ``time`` in [0, 1] [m]."""
+    return share_before(time) * (x1 - x0)
