@@ -10,7 +10,7 @@ from newton.solvers import SolverBase
 from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
 from .layer.contact_layer import ContactLayer
-from .solver_ccd import SolverCCD
+from .stage import CollisionStage
 
 
 class CapturedSteps:
@@ -60,8 +60,8 @@ class CapturedSteps:
             check_instance(x, "state", (newton.State, wp.array), "a list of states and arrays")
         self._lock = Occupied("CapturedSteps")
         self._steps, self._solver, self._device = steps, solver, solver.model.device
-        self._report = solver.report if isinstance(solver, SolverCCD) else None
-        layer = solver.solver if isinstance(solver, SolverCCD) else solver
+        self._report = solver.report if isinstance(solver, CollisionStage) else None
+        layer = solver.solver if isinstance(solver, CollisionStage) else solver
         self._layer = layer if isinstance(layer, ContactLayer) else None
         self._state = list(state)
         if self._report is not None:

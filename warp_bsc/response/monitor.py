@@ -7,9 +7,8 @@ from newton.solvers import SolverBase
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
 from .integration.wrapped_solver import StateArrays
-from .options import checked_min_distance, checked_radii, default_separation
+from .options import checked_min_distance, checked_radii, default_separation, friction_of
 from .stage import CollisionStage
-from .state.friction import Friction
 from .state.mesh import ModelMesh
 from .step import inspect
 from .write_back import finish_inspection
@@ -56,7 +55,7 @@ class CollisionMonitor(CollisionStage):
         if keeps_distances:
             mesh.keep_distances(min_distance, radii, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
-        friction = Friction(mesh, nothing[:1], nothing)
+        friction = friction_of(mesh, nothing[:1], nothing)
         self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):

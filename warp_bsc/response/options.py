@@ -177,18 +177,23 @@ def _checked_coefficients(value, name, lengths, most, limits, model):
     return value if isinstance(value, wp.array) else wp.array(values, dtype=float, device=model.device)
 
 
-def friction_of(mesh: ModelMesh, of_particles: wp.array) -> Friction:
-    """Returns the coefficients of vertices and of infinite planes, those of shapes by their materials.
+def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | None = None) -> Friction:
+    """Returns the coefficients of vertices and of infinite planes; by default those of shapes are of their materials.
 
     Raises:
         ValueError: If the friction of a shape is negative or no number.
     """
     model = mesh.model
-    of_shapes = model.shape_material_mu
-    if of_shapes is None:
-        of_shapes = wp.zeros(0, dtype=float, device=mesh.device)
+    given = model.shape_material_mu if of_shapes is None else of_shapes
+    of_shapes = wp.zeros(0, dtype=float, device=mesh.device) if given is None else given
     values = of_shapes.numpy()
     for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
         if not values[shape] >= 0.0:
             raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
-    return Friction(mesh, of_particles, of_shapes)
+    return Friction(
+        of_particles,
+        of_shapes,
+        particle_count=model.particle_count,
+        vertex_shapes=mesh.device_shape_vertices.shape,
+        plane_shapes=mesh.device_planes.shape,
+    )

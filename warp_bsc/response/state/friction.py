@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from .mesh import ModelMesh
-
 
 @wp.kernel
 def _write_friction(
@@ -37,17 +35,28 @@ class Friction:
         of_shapes: The coefficients of shapes from which they are read, as ``newton.Model.shape_material_mu``.
     """
 
-    def __init__(self, mesh: ModelMesh, of_particles: wp.array[float], of_shapes: wp.array[float]):
+    def __init__(
+        self,
+        of_particles: wp.array[float],
+        of_shapes: wp.array[float],
+        *,
+        particle_count: int,
+        vertex_shapes: wp.array[int],
+        plane_shapes: wp.array[int],
+    ):
         """Reads the coefficients for the first time.
 
         Args:
-            mesh: The mesh.
             of_particles: Coefficients of particles, shape [1] or [particle_count].
             of_shapes: Coefficients of shapes, shape [shape_count].
+            particle_count: Number of particles, whose vertices come first.
+            vertex_shapes: Shape of each other vertex.
+            plane_shapes: Shape of each infinite plane.
         """
-        self._mesh, self.of_particles, self.of_shapes = mesh, of_particles, of_shapes
-        self.vertices = wp.zeros(mesh.vertex_count, dtype=float, device=mesh.device)
-        self.planes = wp.zeros(len(mesh.planes.shape), dtype=float, device=mesh.device)
+        self.of_particles, self.of_shapes, device = of_particles, of_shapes, of_particles.device
+        self._inputs = [of_particles, of_shapes, particle_count, vertex_shapes, plane_shapes]
+        self.vertices = wp.zeros(particle_count + len(vertex_shapes), dtype=float, device=device)
+        self.planes = wp.zeros(len(plane_shapes), dtype=float, device=device)
         self.read()
 
     def read(self) -> None:
@@ -60,7 +69,5 @@ class Friction:
         self._launch(outputs, adjoint=True, adj_inputs=5 * [None], adj_outputs=outputs)
 
     def _launch(self, outputs, **options):
-        mesh, size = self._mesh, max(map(len, outputs))
-        inputs = [self.of_particles, self.of_shapes, mesh.model.particle_count]
-        inputs += [mesh.device_shape_vertices.shape, mesh.device_planes.shape]
-        wp.launch(_write_friction, size, inputs=inputs, outputs=outputs, device=mesh.device, **options)
+        size, device = max(map(len, outputs)), self.vertices.device
+        wp.launch(_write_friction, size, inputs=self._inputs, outputs=outputs, device=device, **options)
