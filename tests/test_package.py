@@ -64,7 +64,7 @@ LIBRARIES = {
     "argparse": {"cli"},
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
-    "trimesh": {"bench", "usd"},
+    "trimesh": {"bench", "response", "usd"},
     "warp": {"kernels", "detection", "response", "bench", "cli", "_private_names"},
 }
 """Who may import a library: packages, or single files."""

@@ -147,6 +147,7 @@ def test_triangles_of_round_shapes_are_no_deeper_than_said(device):
     builder.add_shape_sphere(-1, radius=0.2)
     builder.add_shape_capsule(-1, radius=0.1, half_height=0.4)
     builder.add_shape_cylinder(-1, radius=0.1, half_height=0.4)
+    builder.add_shape_cylinder(-1, radius=0.1, half_height=0.2, barrel_radius=0.2)
     builder.add_shape_cone(-1, radius=0.3, half_height=0.2)
     builder.add_shape_ellipsoid(-1, rx=0.1, ry=0.2, rz=0.4)
     builder.add_shape_box(-1, hx=0.1, hy=0.2, hz=0.3)
@@ -158,7 +159,7 @@ def test_triangles_of_round_shapes_are_no_deeper_than_said(device):
     for shape, kind in enumerate(map(GeoType, model.shape_type.numpy())):
         faces = mesh.faces[mesh.shape_vertices.shape[mesh.faces[:, 0] - 1] == shape]
         center = x[faces].mean(axis=1)
-        a, b, _ = scale[shape]
+        a, b, c = scale[shape]
         r = np.linalg.norm(center[:, :2], axis=1)
         if kind == GeoType.SPHERE:
             depth = a - np.linalg.norm(center, axis=1)
@@ -166,7 +167,8 @@ def test_triangles_of_round_shapes_are_no_deeper_than_said(device):
             beyond = np.maximum(np.abs(center[:, 2]) - b, 0.0)
             depth = a - np.hypot(r, beyond)
         elif kind == GeoType.CYLINDER:
-            depth = np.minimum(a - r, b - np.abs(center[:, 2]))
+            side = c - np.hypot(r - a + np.sqrt(c * c - b * b), center[:, 2]) if c > 0.0 else a - r
+            depth = np.minimum(side, b - np.abs(center[:, 2]))
         elif kind == GeoType.CONE:
             side = (a * (b - center[:, 2]) / (2.0 * b) - r) * np.cos(np.arctan2(a, 2.0 * b))
             depth = np.minimum(side, center[:, 2] + b)

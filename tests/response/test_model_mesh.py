@@ -145,6 +145,46 @@ def test_small_and_large_shapes_are_closed():
     assert len(mesh.faces) == 2 * (2 * 32 + 2 * 14 * 32)  # two fans and 14 bands each
 
 
+@pytest.mark.parametrize("segments", [4, 16, 32, 96])
+@pytest.mark.parametrize("name", ["sphere", "ellipsoid", "capsule", "cylinder", "barrel", "cone"])
+def test_round_shapes_have_their_segments_and_vertices_on_the_surface(name, segments):
+    kind, options, _, volume = SHAPES[name]
+    builder = newton.ModelBuilder()
+    getattr(builder, f"add_shape_{kind}")(-1, **options)
+    mesh = ModelMesh(builder.finalize(), segments=segments)
+    x = mesh.shape_vertices.position.astype(float)
+    solid = trimesh.Trimesh(x, mesh.faces, process=False)
+    assert mesh.segments == segments and solid.is_watertight and solid.is_winding_consistent
+    half = segments // 2
+    rings = {"sphere": half - 1, "ellipsoid": half - 1, "capsule": half, "cylinder": 2, "barrel": half + 1, "cone": 1}
+    assert len(x) == 2 + rings[name] * segments
+    assert 0.0 < volume - solid.volume < 20.0 / segments**2 * volume
+    r, z = np.hypot(x[:, 0], x[:, 1]), np.abs(x[:, 2])
+    if name == "sphere":
+        off = np.linalg.norm(x, axis=1) - 0.3
+    elif name == "ellipsoid":
+        off = np.linalg.norm(x / [0.2, 0.3, 0.4], axis=1) - 1.0
+    elif name == "capsule":
+        off = np.hypot(r, np.maximum(z - 0.3, 0.0)) - 0.2
+    elif name == "cylinder":
+        off = np.where(r > 0.0, r - 0.2, z - 0.3)
+    elif name == "barrel":
+        off = np.where(r > 0.0, np.hypot(r - 0.2, z) - 0.3, z - 0.3)
+    else:
+        off = np.where(r > 0.0, r - 0.2, z - 0.3)
+    np.testing.assert_allclose(off, 0.0, atol=1e-6)
+
+
+def test_segments_are_checked():
+    model = newton.ModelBuilder().finalize()
+    with pytest.raises(ValueError, match="segments must be a multiple of four, not 30"):
+        ModelMesh(model, segments=30)
+    with pytest.raises(ValueError, match="segments"):
+        ModelMesh(model, segments=0)
+    with pytest.raises(TypeError, match="segments"):
+        ModelMesh(model, segments=32.0)
+
+
 def test_equal_shapes_are_tessellated_once(monkeypatch):
     calls = []
     tessellate = model_mesh._tessellate

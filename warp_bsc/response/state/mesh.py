@@ -6,12 +6,14 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
-from ..._arguments import checked_distance, checked_distances
+from ..._arguments import checked_distance, checked_distances, checked_integer
 from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
 from ..tuning import SEGMENTS
 from .structs import Incidence
 
+MAX_SEGMENTS = 1024
+"""Most triangles around a round shape; a sphere has about the square of them."""
 _STRAIGHT = 0.9
 """Length of a spring, as a share of that of two others between its ends, from which it runs along them."""
 
@@ -66,6 +68,7 @@ class ModelMesh(CollisionMesh):
 
     Attributes:
         model: The model.
+        segments: Triangles around a round shape.
         shape_vertices: The vertices from ``model.particle_count`` on, NumPy arrays.
         planes: The infinite planes, NumPy arrays.
         inverse_masses: Inverse masses [1/kg] of all vertices, Warp array of float, shape [vertex_count].
@@ -77,7 +80,7 @@ class ModelMesh(CollisionMesh):
         distances: Minimum distances of pairs, None if pairs only must not touch.
     """
 
-    def __init__(self, model: Model, *, strands: bool = False):
+    def __init__(self, model: Model, *, strands: bool = False, segments: int = SEGMENTS):
         """Tessellates the shapes and puts the mesh on the model's device.
 
         Args:
@@ -85,11 +88,18 @@ class ModelMesh(CollisionMesh):
             strands: Whether springs without faces take part as edges, and particles without springs as points. Only a
                 minimum distance keeps these apart from each other. A spring that runs along two others, to resist
                 bending, takes no part.
+            segments: Triangles around a round shape, a multiple of four, 4 to 1024. The mesh of a sphere of radius r
+                lies up to 10 r / segments^2 below the sphere.
 
         Raises:
+            TypeError: If ``segments`` is no integer.
+            ValueError: If ``segments`` is out of range or no multiple of four.
             NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
                 cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
         """
+        self.segments = checked_integer(segments, "segments", 4, MAX_SEGMENTS)
+        if segments % 4:
+            raise ValueError(f"segments must be a multiple of four, not {segments}")
         particle_world = host_array(model.particle_world)
         if model.world_count == 1:
             particle_world = np.zeros_like(particle_world)
@@ -108,7 +118,8 @@ class ModelMesh(CollisionMesh):
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
             if key not in tessellations:
-                tessellations[key] = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
+                arguments = model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments
+                tessellations[key] = _tessellate(*arguments)
             shape_positions, shape_faces = tessellations[key]
             shape_positions = transform[shape, :3] + _rotate(transform[shape, 3:], shape_positions)
             for world in range(model.world_count) if shape_world[shape] < 0 else [shape_world[shape]]:
@@ -329,7 +340,7 @@ def _strands(model, faces):
     return springs[kept], np.flatnonzero(bare)
 
 
-def _tessellate(model, shape, shape_type, scale):
+def _tessellate(model, shape, shape_type, scale, segments):
     """Returns the surface of a shape: positions in its frame [m], float64, shape [n, 3], and faces, shape [m, 3].
 
     No two vertices are in one place. Raises NotImplementedError if there are no triangles for the type.
@@ -344,19 +355,21 @@ def _tessellate(model, shape, shape_type, scale):
         case GeoType.BOX:
             return _weld(Mesh.create_box(x, y, z, **_BARE))
         case GeoType.SPHERE:
-            return _revolve(_capsule_profile(x, 0.0))
+            return _revolve(_capsule_profile(x, 0.0, segments), segments)
         case GeoType.ELLIPSOID:
-            positions, faces = _revolve(_capsule_profile(1.0, 0.0))
+            positions, faces = _revolve(_capsule_profile(1.0, 0.0, segments), segments)
             return positions * (x, y, z), faces
         case GeoType.CAPSULE:
-            return _revolve(_capsule_profile(x, y))
+            return _revolve(_capsule_profile(x, y, segments), segments)
         case GeoType.CYLINDER:
-            height = np.linspace(-y, y, SEGMENTS // 2 + 1 if z > 0.0 else 2)
-            # the side of a barrel is an arc of radius z
-            bulge = np.sqrt(z * z - height * height) - np.sqrt(z * z - y * y) if z > 0.0 else np.zeros(2)
-            return _revolve(np.concatenate([[[0.0, -y]], np.stack([x + bulge, height], axis=1), [[0.0, y]]]))
+            side = np.array([[x, -y], [x, y]])
+            if z > 0.0:  # a barrel, whose side is an arc of radius z
+                angle = np.linspace(-1.0, 1.0, segments // 2 + 1)[1:-1] * np.arcsin(y / z)
+                arc = np.column_stack([x - np.sqrt(z * z - y * y) + z * np.cos(angle), z * np.sin(angle)])
+                side = np.concatenate([side[:1], arc, side[1:]])
+            return _revolve(np.concatenate([[[0.0, -y]], side, [[0.0, y]]]), segments)
         case GeoType.CONE:
-            return _revolve(np.array([[0.0, -y], [x, -y], [0.0, y]]))
+            return _revolve(np.array([[0.0, -y], [x, -y], [0.0, y]]), segments)
     raise NotImplementedError(
         f"shape {shape} ({model.shape_label[shape]!r}) of type {shape_type.name} collides with particles, but has no "
         "triangles to collide with: use a mesh, or clear its flag COLLIDE_PARTICLES"
@@ -372,35 +385,29 @@ def _weld(mesh):
     return positions, vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
 
 
-def _capsule_profile(radius, half_height):
+def _capsule_profile(radius, half_height, segments):
     """Returns radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
-    angle = np.linspace(0.0, np.pi / 2.0, SEGMENTS // 4 + 1)
+    angle = np.linspace(0.0, np.pi / 2.0, segments // 4 + 1)
     lower = np.stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)], axis=1)
     upper = lower[::-1] * (1.0, -1.0)
     return np.concatenate([lower, upper if half_height > 0.0 else upper[1:]])
 
 
-def _revolve(profile):
-    """Returns the surface that a profile makes when it turns around the z axis.
+def _revolve(profile, segments):
+    """Returns the surface that a profile makes when it turns around the z axis, as :func:`_tessellate` does.
 
     Args:
         profile: Radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
-
-    Returns:
-        Positions [m], float64, shape [2 + (n - 2) * SEGMENTS, 3], and faces, counter-clockwise from outside, shape
-        [2 * (n - 2) * SEGMENTS, 3].
+        segments: Number of segments.
     """
-    angle = 2.0 * np.pi / SEGMENTS * np.arange(SEGMENTS)
-    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(SEGMENTS)], axis=1)
-    rings = circle * profile[1:-1, None][:, :, [0, 0, 1]]
-    poles = np.array([[[0.0, 0.0, height]] for height in profile[[0, -1], 1]])
-    positions = np.concatenate([poles[0], rings.reshape(-1, 3), poles[1]])
-    # a row of vertices for each point of the profile, those of the poles all one
-    vertex = np.arange(len(profile) * SEGMENTS).reshape(-1, SEGMENTS) - SEGMENTS + 1
-    vertex = np.clip(vertex, 0, len(positions) - 1)
-    a, d = vertex[:-1], vertex[1:]
-    b, c = np.roll(a, -1, axis=1), np.roll(d, -1, axis=1)
-    return positions, np.concatenate([np.stack([a, b, c], axis=2)[1:], np.stack([a, c, d], axis=2)[:-1]]).reshape(-1, 3)
+    from trimesh import creation  # noqa: PLC0415 (slow)
+
+    # trimesh drops triangles and merges vertices by absolute sizes: revolve a unit profile, and scale its rings
+    unit = np.column_stack([np.ones(len(profile)), np.arange(len(profile))])
+    unit[[0, -1], 0] = 0.0
+    surface = creation.revolve(unit, sections=segments)
+    radius, height = profile[surface.vertices[:, 2].astype(int)].T
+    return np.column_stack([surface.vertices[:, :2] * radius[:, None], height]), np.array(surface.faces)
 
 
 def _rotate(quaternion, vectors):

@@ -14,7 +14,7 @@ from newton import BodyFlags, GeoType
 
 from ..integration.private import contacts_with, soft_contact_arrays, soft_contact_counters, struct_fields
 from ..state.mesh import ModelMesh, are_infinite_planes
-from ..tuning import SHAPE_SAGITTA
+from ..tuning import SEGMENTS, SHAPE_SAGITTA
 
 wp.set_module_options({"enable_backward": False})
 
@@ -147,7 +147,7 @@ class InnerContacts:
         self._model, self._device = mesh.model, mesh.device
         self._stage = stage = _Stage()
         model = mesh.model
-        stage.depth = wp.array(_depths(model), dtype=float, device=mesh.device)
+        stage.depth = wp.array(_depths(model, mesh.segments), dtype=float, device=mesh.device)
         stage.is_plane = wp.array(are_infinite_planes(model), dtype=bool, device=mesh.device)
         stage.takes_part = wp.array(_takes_part(mesh), dtype=bool, device=mesh.device)
         stage.shape_body = model.shape_body
@@ -240,10 +240,10 @@ def _as_struct(arrays):
     return soft
 
 
-def _depths(model):
+def _depths(model, segments=SEGMENTS):
     """Returns how deep below the surface of each shape a particle may rest on its triangles [m].
 
-    The triangles of a round shape lie below its surface, so that what rests on them has not entered it.
+    The triangles of a round shape lie below its surface, so that a particle that rests on them has not entered it.
     """
     kind, scale = model.shape_type.numpy(), model.shape_scale.numpy().astype(np.float64)
     x, y, z = scale.T
@@ -251,7 +251,7 @@ def _depths(model):
     radius = np.where(np.isin(kind, (GeoType.SPHERE, GeoType.CAPSULE, GeoType.CONE)), x, 0.0)
     radius = np.where(kind == GeoType.CYLINDER, x + bulge, radius)
     radius = np.where(kind == GeoType.ELLIPSOID, scale.max(axis=1), radius)
-    return SHAPE_SAGITTA * radius
+    return SHAPE_SAGITTA * (SEGMENTS / segments) ** 2 * radius
 
 
 def _takes_part(mesh):
