@@ -6,6 +6,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from newton.solvers.experimental.coupled import CouplingInterface
 from newton_scenes import Rollout
 
 import warp_bsc as bsc
@@ -378,6 +379,19 @@ def test_gradients_in_a_graph_are_those_without(device):
         assert scene.solver.report.gradients.lost_steps + scene.solver.solver.skipped_steps == 0
         gradients.append(scene.velocity.grad.numpy())
     np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-5)
+
+
+def test_a_layer_has_the_hooks_of_its_solver_for_couplers(device, monkeypatch):
+    builder = newton.ModelBuilder()
+    add_square(builder, 2, 0.03, (0.0, 0.0, 0.1), **SOFT)
+    builder.color()
+    inner = newton.solvers.SolverVBD(builder.finalize(device=device))
+    layer = bsc.ContactLayer(inner)
+    names = [name for name in dir(CouplingInterface) if name.startswith("coupling_")]
+    assert len(names) > 5
+    for name in names:
+        monkeypatch.setattr(inner, name, lambda name=name: name)
+        assert getattr(layer, name)() == name
 
 
 def test_wrong_use(device):

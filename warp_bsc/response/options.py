@@ -184,8 +184,11 @@ def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | N
         ValueError: If the friction of a shape is negative or no number.
     """
     model = mesh.model
-    given = model.shape_material_mu if of_shapes is None else of_shapes
-    of_shapes = wp.zeros(0, dtype=float, device=mesh.device) if given is None else given
+    if of_shapes is None:
+        of_shapes = model.shape_material_mu
+    if of_shapes is None:
+        of_shapes = wp.zeros(0, dtype=float, device=mesh.device)
+    assert of_shapes is not None
     values = of_shapes.numpy()
     for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
         if not values[shape] >= 0.0:

@@ -10,7 +10,6 @@ from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .integration.coupling_interface import CouplingHooks
 from .integration.private import paused_tape
-from .integration.wrapped_solver import WrappedSolver
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
@@ -21,7 +20,7 @@ from .step import prepare
 from .write_back import count_step
 
 
-class CollisionStage(WrappedSolver, CouplingHooks):
+class CollisionStage(CouplingHooks):
     """A stage behind another solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are.
 
     Attributes:

@@ -2,7 +2,6 @@
 
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
-from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..state.motion import ModelMotion, continues
@@ -10,6 +9,7 @@ from ..state.poses import inertia_at
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
 from ..substeps.inner_contacts import InnerContacts
+from .wrapped_solver import WrappedSolver
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,10 +82,12 @@ def _add_impulses(
 
 def _is_default(solver, hook):
     """Returns whether a hook of a solver is the default of the interface."""
+    while isinstance(solver, WrappedSolver):
+        solver = solver.solver
     return getattr(type(solver), hook, None) in (None, getattr(CouplingInterface, hook))
 
 
-class CouplingHooks(CouplingInterface):
+class CouplingHooks(WrappedSolver):
     """Makes a stage with an inner ``solver`` an entry of ``newton.solvers.experimental.coupled``.
 
     Hooks are those of the inner solver, or the defaults of the interface if it has none, with two additions:
@@ -115,14 +117,9 @@ class CouplingHooks(CouplingInterface):
         solver: The inner solver.
     """
 
-    solver: SolverBase
-
     _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
     _inner_contacts: InnerContacts | None = None  # None where the inner solver gets all contacts
-
-    def _hook(self, name):
-        return getattr(self.solver if isinstance(self.solver, CouplingInterface) else super(), name)
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation.
@@ -159,22 +156,6 @@ class CouplingHooks(CouplingInterface):
         if impulses is not None and not _is_default(self.solver, hook):  # the default includes changes of velocities
             inputs = [impulses, proxy, options["dt"]]
             wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
-
-
-def _delegate(name):
-    """Returns a hook that is that of the inner solver."""
-
-    def hook(self, *arguments, **options):
-        return self._hook(name)(*arguments, **options)
-
-    hook.__name__ = name
-    hook.__doc__ = "Delegates to the inner solver."
-    return hook
-
-
-for _name in dir(CouplingInterface):
-    if _name.startswith("coupling_") and _name not in vars(CouplingHooks):
-        setattr(CouplingHooks, _name, _delegate(_name))
 
 
 class _Coupled:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import newton
 import warp as wp
 from newton.solvers import SolverBase
+from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..._arguments import check_instance
 from ..._one_thread import Occupied
@@ -26,8 +27,8 @@ class StateArrays(NamedTuple):
         return cls(*(getattr(state, name) for name in cls._fields))
 
 
-class WrappedSolver(SolverBase):
-    """Wraps a solver; attributes that it does not have are those of the inner solver.
+class WrappedSolver(SolverBase, CouplingInterface):
+    """Wraps a solver; attributes that it does not have are those of the inner solver, and so are hooks of couplers.
 
     Attributes:
         solver: The inner solver.
@@ -62,6 +63,10 @@ class WrappedSolver(SolverBase):
     def contacts(self, value):
         self.solver.contacts = value
 
+    def _hook(self, name):
+        """Returns a hook of the inner solver, or the default of the interface."""
+        return getattr(self.solver if isinstance(self.solver, CouplingInterface) else super(), name)
+
     def __deepcopy__(self, memo):
         """Raises a TypeError: buffers on the device, and graphs that write to them, cannot be copied."""
         raise TypeError(f"a {type(self).__name__} cannot be copied: put a new one behind a solver of the same model")
@@ -83,6 +88,16 @@ def _delegated_method(name):
     return method
 
 
+def _delegated_hook(name):
+    """Returns a hook of the coupling interface that is that of the inner solver."""
+
+    @functools.wraps(getattr(CouplingInterface, name))
+    def hook(self, *arguments, **options):
+        return self._hook(name)(*arguments, **options)
+
+    return hook
+
+
 def _delegated_property(name):
     """Returns a property that is that of the inner solver."""
     return property(lambda self: getattr(self.solver, name), doc=getattr(SolverBase, name).__doc__)
@@ -99,3 +114,6 @@ for _name in (
     setattr(WrappedSolver, _name, _delegated_method(_name))
 for _name in ("collision_frequency", "collision_frequency_type", "supported_observables"):
     setattr(WrappedSolver, _name, _delegated_property(_name))
+for _name in dir(CouplingInterface):
+    if _name.startswith("coupling_"):
+        setattr(WrappedSolver, _name, _delegated_hook(_name))
