@@ -56,6 +56,7 @@ PACKAGES = {
 LIBRARIES = {
     "newton": {
         "response",
+        "warp_bsc/_private_names/of_newton.py",
         "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/newton_process.py",  # runs them
     },

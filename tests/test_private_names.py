@@ -7,21 +7,21 @@ import warnings
 import pytest
 import warp as wp
 
-from warp_bsc import _private_names as private
+from warp_bsc._private_names import of_newton, of_warp, versions
 from warp_bsc.detection.host_function import run_on_host
 
 
 @pytest.fixture
-def versions(monkeypatch):
+def installed(monkeypatch):
     """Sets the version of a package that seems to be installed."""
 
     def set_version(package, version):
         monkeypatch.setattr(importlib.import_module(package), "__version__", version)
 
-    for cached in (private.warn_if_untested, private._warn_of_one_thread):
+    for cached in (versions.warn_if_untested, of_warp._warn_of_one_thread):
         cached.cache_clear()
     yield set_version
-    for cached in (private.warn_if_untested, private._warn_of_one_thread):
+    for cached in (versions.warn_if_untested, of_warp._warn_of_one_thread):
         cached.cache_clear()
 
 
@@ -30,26 +30,26 @@ def increment(values: wp.array[int]):
     values[wp.tid()] += 1
 
 
-@pytest.mark.parametrize("package", private.TESTED_VERSIONS)
-def test_installed_versions_are_tested_ones(versions, package):
+@pytest.mark.parametrize("package", versions.TESTED_VERSIONS)
+def test_installed_versions_are_tested_ones(installed, package):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        private.warn_if_untested(package)
+        versions.warn_if_untested(package)
 
 
-@pytest.mark.parametrize("package", private.TESTED_VERSIONS)
-def test_an_untested_version_warns_once(versions, package):
-    versions(package, "99.1.0")
+@pytest.mark.parametrize("package", versions.TESTED_VERSIONS)
+def test_an_untested_version_warns_once(installed, package):
+    installed(package, "99.1.0")
     with pytest.warns(UserWarning, match=rf"{package}, and was tested with its versions .*, not with 99.1.0"):
-        private.warn_if_untested(package)
+        versions.warn_if_untested(package)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        private.warn_if_untested(package)
+        versions.warn_if_untested(package)
 
 
 def test_the_graph_that_the_cpu_captures():
     with wp.ScopedCapture("cpu") as capture:
-        graph = private.cpu_graph()
+        graph = of_warp.cpu_graph()
     assert graph is capture.graph
     assert graph.apic is False
 
@@ -57,35 +57,35 @@ def test_the_graph_that_the_cpu_captures():
 def test_without_the_graph_of_the_cpu_a_capture_is_refused(monkeypatch):
     monkeypatch.setattr(wp._src.context.runtime, "_apic_graph", object())
     with pytest.raises(RuntimeError, match="does not say which graph the CPU captures: run this outside graphs"):
-        private.cpu_graph()
+        of_warp.cpu_graph()
 
 
 def test_functions_on_the_host_need_the_graph(monkeypatch):
     with wp.ScopedCapture("cpu"), monkeypatch.context() as patch:
-        patch.setattr(private.wp._src.context, "runtime", types.SimpleNamespace())
+        patch.setattr(of_warp.wp._src.context, "runtime", types.SimpleNamespace())
         with pytest.raises(RuntimeError, match="run this outside graphs"):
             run_on_host(lambda: None, types.SimpleNamespace(is_cpu=True, is_capturing=True))
 
 
 def test_optimized_kernels_may_run_in_threads(monkeypatch):
-    assert private.may_run_in_threads(increment)
+    assert of_warp.may_run_in_threads(increment)
     monkeypatch.setitem(increment.module.options, "mode", "debug")
-    assert not private.may_run_in_threads(increment)
+    assert not of_warp.may_run_in_threads(increment)
     monkeypatch.setitem(increment.module.options, "mode", "release")
     monkeypatch.setitem(increment.module.options, "optimization_level", 0)
-    assert not private.may_run_in_threads(increment)
+    assert not of_warp.may_run_in_threads(increment)
 
 
-def test_without_the_options_of_a_kernel_it_runs_in_one_thread_and_a_warning_says_so(versions):
+def test_without_the_options_of_a_kernel_it_runs_in_one_thread_and_a_warning_says_so(installed):
     kernel = types.SimpleNamespace(module=types.SimpleNamespace(options={}))
     with pytest.warns(UserWarning, match="one core of the CPU"):
-        assert not private.may_run_in_threads(kernel)
+        assert not of_warp.may_run_in_threads(kernel)
 
 
 def test_names_are_replaced_and_one_that_is_gone_is_an_error():
     module = types.ModuleType("newton.examples")
     module.run = None
-    private.replace_name(module, "run", print)
+    of_newton.replace_name(module, "run", print)
     assert module.run is print
     with pytest.raises(RuntimeError, match=r"has no newton.examples.main, which warp-bsc replaces"):
-        private.replace_name(module, "main", print)
+        of_newton.replace_name(module, "main", print)

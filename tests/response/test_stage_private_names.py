@@ -11,8 +11,7 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD, SolverXPBD
 from newton_scenes import DT, SOLVERS
 
 import warp_bsc as bsc
-from warp_bsc import _private_names
-from warp_bsc.response.integration import private
+from warp_bsc._private_names import of_newton, of_warp, versions
 from warp_bsc.response.substeps.inner_contacts import _SoftContacts
 
 
@@ -71,14 +70,14 @@ def step(solver, model, contacts=None):
 @pytest.mark.parametrize("package", [wp, newton])
 def test_a_stage_warns_once_of_a_version_that_was_not_tested(package, monkeypatch):
     monkeypatch.setattr(package, "__version__", "99.1.0")
-    _private_names.warn_if_untested.cache_clear()
+    versions.warn_if_untested.cache_clear()
     model = sheet_above_sphere("cpu")
     with pytest.warns(UserWarning, match=rf"{package.__name__}, and was tested with its versions .*, not with 99.1.0"):
         bsc.SolverCCD(SOLVERS["vbd"](model))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         bsc.SolverCCD(SOLVERS["vbd"](model))
-    _private_names.warn_if_untested.cache_clear()
+    versions.warn_if_untested.cache_clear()
 
 
 def test_a_paused_tape_records_nothing_and_continues_afterwards(device):
@@ -86,13 +85,13 @@ def test_a_paused_tape_records_nothing_and_continues_afterwards(device):
     y, z, w = (wp.zeros_like(x) for _ in range(3))
     with wp.Tape() as tape:
         wp.launch(double, 2, inputs=[x], outputs=[y], device=device)
-        with private.paused_tape() as paused:
+        with of_warp.paused_tape() as paused:
             wp.launch(double, 2, inputs=[y], outputs=[z], device=device)
         wp.launch(double, 2, inputs=[y], outputs=[w], device=device)
     assert paused is tape and len(tape.launches) == 2
     tape.backward(grads={w: wp.ones_like(w)})
     np.testing.assert_array_equal(x.grad.numpy(), 4.0)
-    with private.paused_tape() as paused:
+    with of_warp.paused_tape() as paused:
         assert paused is None
 
 
@@ -107,22 +106,22 @@ def test_without_the_name_of_the_tape_a_step_is_refused(device, monkeypatch):
 def test_structs_have_their_type_and_their_fields(monkeypatch):
     value = Pair()
     value.first = wp.zeros(3, dtype=float, device="cpu")
-    empty = private.empty_struct(value)
+    empty = of_warp.empty_struct(value)
     assert type(empty) is type(value) and not len(empty.first or ())
-    assert private.empty_struct(value.first) is private.empty_struct(1.0) is None
-    assert private.struct_fields(Pair) == ["first", "second"]
+    assert of_warp.empty_struct(value.first) is of_warp.empty_struct(1.0) is None
+    assert of_warp.struct_fields(Pair) == ["first", "second"]
     monkeypatch.delattr(type(value), "_cls")
     with pytest.raises(RuntimeError, match=r"warp .* has no attribute _cls of structs.*no gradients"):
-        private.empty_struct(value)
+        of_warp.empty_struct(value)
     monkeypatch.delattr(Pair, "vars")
     with pytest.raises(RuntimeError, match=r"warp .* has no attribute vars of structs"):
-        private.struct_fields(Pair)
+        of_warp.struct_fields(Pair)
 
 
 def test_self_contact_cuts_in_the_method_of_its_name(device):
     """Without self-contact, the method cuts nothing; in a solver, another one takes its place."""
     solver = vbd_with_self_contact(sheet_above_sphere(device, speed=60.0))
-    lengths, truncate = [], private.vbd_truncation(solver)
+    lengths, truncate = [], of_newton.vbd_truncation(solver)
     for cuts in (True, False):
         solver.particle_enable_self_contact = cuts
         solver.particle_displacements.fill_(wp.vec3(0.0, 0.0, 1.0))
@@ -131,9 +130,9 @@ def test_self_contact_cuts_in_the_method_of_its_name(device):
     assert lengths[0] < 0.01 and lengths[1] == 1.0
     solver.particle_enable_self_contact, calls = True, []
     for _ in range(2):
-        with private.vbd_truncation_replaced(solver, lambda *given: calls.append(given)):
+        with of_newton.vbd_truncation_replaced(solver, lambda *given: calls.append(given)):
             step(solver, solver.model)
-        assert private.vbd_truncation(solver) == truncate and "_penetration_free_truncation" not in vars(solver)
+        assert of_newton.vbd_truncation(solver) == truncate and "_penetration_free_truncation" not in vars(solver)
     assert len(calls) >= 2 * 3
 
 
@@ -153,8 +152,8 @@ def test_vbd_says_whether_it_moves_bodies(device, monkeypatch):
     model = sheet_above_sphere(device, body=True)
     kinds = {external: SolverVBD(model, integrate_with_external_rigid_solver=external) for external in (True, False)}
     for external, solver in kinds.items():
-        assert private.has_external_rigid_solver(solver) is external
-    assert not private.has_external_rigid_solver(SolverXPBD(model))
+        assert of_newton.has_external_rigid_solver(solver) is external
+    assert not of_newton.has_external_rigid_solver(SolverXPBD(model))
     monkeypatch.delattr(kinds[True], "integrate_with_external_rigid_solver")
     with pytest.raises(RuntimeError, match=r"no SolverVBD.integrate_with_external_rigid_solver.*moves bodies"):
         bsc.SolverCCD(kinds[True])
@@ -166,22 +165,22 @@ def test_vbd_has_the_poses_from_which_velocities_follow(device, monkeypatch):
     end = step(solver, model)  # the first step sets the poses to those of the state
     moved = end.body_q.numpy().copy()
     moved[:, 0] -= 0.01
-    private.body_q_prev(solver).assign(moved)
+    of_newton.body_q_prev(solver).assign(moved)
     again = model.state()
     solver.step(end, again, model.control(), None, DT)
     assert again.body_qd.numpy()[0, 0] == pytest.approx(0.01 / DT, rel=0.1)
     external = SolverVBD(model, integrate_with_external_rigid_solver=True)
-    assert private.body_q_prev(SolverXPBD(model)) is private.body_q_prev(external) is None
+    assert of_newton.body_q_prev(SolverXPBD(model)) is of_newton.body_q_prev(external) is None
     monkeypatch.delattr(solver, "body_q_prev")
     with pytest.raises(RuntimeError, match=r"no SolverVBD.body_q_prev.*cannot push bodies"):
-        private.body_q_prev(solver)
+        of_newton.body_q_prev(solver)
 
 
 @pytest.mark.parametrize("kind", [SolverVBD, SolverStyle3D])
 def test_steps_of_these_solvers_allocate_nothing(kind, device):
     model = sheet_above_sphere(device)
     solver = kind(model)
-    assert not private.may_allocate(solver)
+    assert not of_newton.may_allocate(solver)
     if kind is SolverStyle3D:
         solver.collision = None  # as in steps with substeps
     states, control = [model.state(), model.state()], model.control()
@@ -201,7 +200,7 @@ def test_steps_of_other_solvers_may_allocate(device):
 
     model = sheet_above_sphere(device)
     with_pipeline = SolverVBD(model, collision_pipeline=newton.CollisionPipeline(model))
-    assert all(map(private.may_allocate, (SolverXPBD(model), Derived(model), with_pipeline)))
+    assert all(map(of_newton.may_allocate, (SolverXPBD(model), Derived(model), with_pipeline)))
 
 
 @pytest.mark.parametrize("kind", [SolverVBD, SolverStyle3D, SolverXPBD])
@@ -211,7 +210,7 @@ def test_attributes_hold_all_that_a_step_changes(kind, device):
     solver = kind(model)
     if kind is SolverStyle3D:
         solver.collision = None  # as in steps with substeps
-    attributes = private.attributes_of(solver)
+    attributes = of_newton.attributes_of(solver)
     kept = dict(attributes)
     arrays = {name: wp.clone(value) for name, value in kept.items() if isinstance(value, wp.array) and value.size}
     ends = []
@@ -232,7 +231,7 @@ def test_a_solver_with_slots_takes_no_substeps(device):
 
     model = sheet_above_sphere(device)
     with pytest.raises(RuntimeError, match="Slotted has slots, clock, which substeps cannot restore"):
-        private.attributes_of(Slotted(model))
+        of_newton.attributes_of(Slotted(model))
 
 
 def test_style3d_has_contacts_of_its_own(device, monkeypatch):
@@ -240,31 +239,31 @@ def test_style3d_has_contacts_of_its_own(device, monkeypatch):
     solver = SolverStyle3D(model)
     own = solver.collision
     assert own is not None
-    with private.without_own_contacts(solver):
+    with of_newton.without_own_contacts(solver):
         assert solver.collision is None
         step(solver, model)
     assert solver.collision is own
-    with private.without_own_contacts(SolverXPBD(model)):
+    with of_newton.without_own_contacts(SolverXPBD(model)):
         pass
     monkeypatch.delattr(solver, "collision")
     with pytest.raises(RuntimeError, match=r"no SolverStyle3D.collision.*omit substeps"):
-        private.without_own_contacts(solver).__enter__()
+        of_newton.without_own_contacts(solver).__enter__()
 
 
 def test_soft_contacts_have_arrays_and_counters(device):
     contacts = contacts_of(sheet_above_sphere(device))
-    names = private.struct_fields(_SoftContacts)
-    arrays = private.soft_contact_arrays(contacts, names)
+    names = of_warp.struct_fields(_SoftContacts)
+    arrays = of_newton.soft_contact_arrays(contacts, names)
     assert set(names) - arrays.keys() == {"features"} and contacts._soft_contact_mesh_features is None
     assert {name for name in vars(contacts) if name.startswith("soft_contact_")} == {
         *(f"soft_contact_{name}" for name in arrays),
         *("soft_contact_count", "soft_contact_max", "soft_contact_tids"),  # the last is not of contacts but of threads
     }
     counters = wp.clone(contacts.contact_counters)
-    count, overflow = private.soft_contact_counters(contacts, counters)
+    count, overflow = of_newton.soft_contact_counters(contacts, counters)
     assert count.numpy()[0] == contacts.soft_contact_count.numpy()[0] > 0 and overflow.numpy()[0] == 0
     others = {name: wp.zeros_like(array) for name, array in arrays.items()}
-    packed = private.contacts_with(contacts, counters, others)
+    packed = of_newton.contacts_with(contacts, counters, others)
     assert packed.soft_contact_normal is others["normal"] is not contacts.soft_contact_normal
     assert packed.soft_contact_count.ptr == counters[1:2].ptr != contacts.soft_contact_count.ptr
     assert packed._soft_contact_source_overflow.ptr == counters[3:4].ptr
@@ -286,4 +285,4 @@ def test_counters_in_another_order_are_refused(device):
     contacts = contacts_of(sheet_above_sphere(device))
     contacts.soft_contact_count = contacts.contact_counters[2:3]
     with pytest.raises(RuntimeError, match=r"no Contacts.soft_contact_count as number 1 of Contacts.contact_counters"):
-        private.soft_contact_counters(contacts, contacts.contact_counters)
+        of_newton.soft_contact_counters(contacts, contacts.contact_counters)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .._private_names import replace_name
 from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals, describe_download
 
 __all__ = ["SOLVERS", "serve"]
@@ -66,6 +65,8 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
     """Runs an example as the main module, with the frame loop that measures."""
     import newton.examples  # noqa: PLC0415 (slow)
     import newton.utils  # noqa: PLC0415 (slow)
+
+    from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
     measurements: list[ExampleMeasurement] = []
     stages: list[Any] = []
@@ -133,6 +134,8 @@ def _stage_solvers(stages: list[Any]) -> None:
     This must come before the example is imported: it may import the classes by name.
     """
     import newton.solvers  # noqa: PLC0415 (slow)
+
+    from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
     for name in SOLVERS:
         solver = getattr(newton.solvers, name)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from .._private_names import cpu_graph
+from .._private_names.of_warp import cpu_graph
 from .launch import launch
 
 __all__ = ["run_on_host"]

@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import warp as wp
 
-from .._private_names import may_run_in_threads
+from .._private_names.of_warp import may_run_in_threads
 
 __all__ = [
     "GrowingBuffers",

@@ -18,7 +18,7 @@ from .._arguments import (
     checked_number,
     given,
 )
-from .integration.private import has_external_rigid_solver
+from .._private_names.of_newton import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh

@@ -9,9 +9,9 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from .._one_thread import one_at_a_time
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, without_own_contacts
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
-from .integration.private import body_q_prev, has_external_rigid_solver, without_own_contacts
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
 from .integration.wrapped_solver import StateArrays
 from .layer.contact_layer import ContactLayer

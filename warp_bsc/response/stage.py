@@ -8,8 +8,8 @@ import warp as wp
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
+from .._private_names.of_warp import paused_tape
 from .integration.coupling_interface import CouplingHooks
-from .integration.private import paused_tape
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from ..integration.private import empty_struct
+from ..._private_names.of_warp import empty_struct
 
 
 def copied(struct, lengths):

@@ -5,7 +5,7 @@ from typing import TypeGuard
 
 from newton.solvers import SolverBase, SolverVBD
 
-from .private import vbd_truncation, vbd_truncation_replaced
+from ..._private_names.of_newton import vbd_truncation, vbd_truncation_replaced
 
 
 def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:

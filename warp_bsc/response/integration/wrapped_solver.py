@@ -10,7 +10,7 @@ from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..._arguments import check_instance
 from ..._one_thread import Occupied
-from .private import check_versions
+from ..._private_names.versions import warn_if_untested
 
 
 class StateArrays(NamedTuple):
@@ -46,7 +46,8 @@ class WrappedSolver(SolverBase, CouplingInterface):
             TypeError: If it is no solver of Newton.
         """
         check_instance(solver, "solver", SolverBase, "a solver of Newton")
-        check_versions()
+        warn_if_untested("warp")
+        warn_if_untested("newton")
         self._lock = Occupied(type(self).__name__)
         self.solver = solver
         super().__init__(solver.model)

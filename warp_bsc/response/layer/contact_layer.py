@@ -22,12 +22,12 @@ from newton.solvers import SolverBase
 
 from ..._arguments import checked_distance, checked_number
 from ..._one_thread import one_at_a_time
+from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
 from ..adjoint.arrays import attach_gradients, launch_adjoint
 from ..contacts.queue import PairQueue, queues_of
-from ..integration.private import paused_tape
 from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh

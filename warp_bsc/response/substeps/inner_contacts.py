@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags, GeoType
 
-from ..integration.private import contacts_with, soft_contact_arrays, soft_contact_counters, struct_fields
+from ..._private_names.of_newton import contacts_with, soft_contact_arrays, soft_contact_counters
+from ..._private_names.of_warp import struct_fields
 from ..state.mesh import ModelMesh, are_infinite_planes
 from ..tuning import SEGMENTS, SHAPE_SAGITTA
 

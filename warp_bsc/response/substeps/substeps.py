@@ -25,8 +25,8 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
+from ..._private_names.of_newton import attributes_of, body_q_prev, may_allocate
 from ..contacts.detect import detect_penetrations
-from ..integration.private import attributes_of, body_q_prev, may_allocate
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.mesh import ModelMesh
@@ -64,8 +64,9 @@ class Substeps:
     Limitations:
         In a CUDA graph, a step that allocates memory, such as that of ``SolverXPBD``, cannot be left out where nothing
         touches. The substeps then cost their time in each step, and ``"auto"`` raises. Only ``SolverVBD`` and
-        ``SolverStyle3D`` themselves are known not to allocate, see :func:`.integration.private.may_allocate`. Python
-        attributes that the inner solver changes in place, and not by assignment, are not restored.
+        ``SolverStyle3D`` themselves are known not to allocate, see
+        :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in place,
+        and not by assignment, are not restored.
 
         An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or by VBD's
         self-contact, resolves them beside the stage: a whole step may leave stretch that substeps release. Contacts
@@ -99,7 +100,7 @@ class Substeps:
             moves_bodies: Whether the response can move bodies.
 
         Raises:
-            RuntimeError: If the state of the inner solver cannot be restored, see :mod:`.integration.private`.
+            RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
         """
         self._choices, self._chooses = substeps, len(substeps) > 1
         self._step, self._solver = step, solver

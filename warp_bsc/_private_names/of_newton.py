@@ -1,12 +1,7 @@
-"""What the stage uses of Warp and Newton beyond their public interfaces: one function for each name or contract.
-
-Each function says which contract it relies on, and what happens in a version that breaks it: an error that names it, or
-a fallback that says so in a warning. Tested versions are listed in :mod:`warp_bsc._private_names`.
-"""
+"""Names and contracts of Newton."""
 
 import contextlib
 import copy
-import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
@@ -16,81 +11,25 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
-from ..._private_names import warn_if_untested
+from .versions import missing, version_of, warn_if_untested
 
 _TRUNCATION = "_penetration_free_truncation"
 _OVERFLOW = "_soft_contact_source_overflow"
 
 
-def check_versions() -> None:
-    """Warns, once for each package, if the installed version of Warp or Newton is not a tested one."""
-    warn_if_untested("warp")
+def replace_name(module: ModuleType, name: str, value: object) -> None:
+    """Replaces a function or a class of a module of Newton, for all that look it up there afterwards.
+
+    Contract: Newton's examples call ``newton.examples.run``, download through ``newton.utils.download_asset`` and
+    ``newton.examples.download_external_git_folder``, and make the solvers that :mod:`newton.solvers` names.
+
+    Raises:
+        RuntimeError: If the module does not have the name, so that the replacement would have no effect.
+    """
     warn_if_untested("newton")
-
-
-def _missing(package: ModuleType, name: str, consequence: str) -> RuntimeError:
-    return RuntimeError(f"{package.__name__} {package.__version__} has no {name}, which warp-bsc uses: {consequence}")
-
-
-@contextlib.contextmanager
-def paused_tape() -> Iterator[wp.Tape | None]:
-    """Pauses the active tape, if any, so that it records no launches, and yields it; None if there is none.
-
-    Contract: ``warp._src.context.runtime.tape`` is the active :class:`warp.Tape`, or None. A tape that is left and
-    entered again continues its record.
-
-    Raises:
-        RuntimeError: If this version of Warp has no such name: a tape would record kernels of the stage, and gradients
-            would be wrong.
-    """
-    try:
-        tape = wp._src.context.runtime.tape
-    except AttributeError:
-        raise _missing(wp, "context.runtime.tape", "a step cannot pause the active tape") from None
-    if tape is None:
-        yield None
-        return
-    tape.__exit__(None, None, None)
-    try:
-        yield tape
-    finally:
-        tape.__enter__()
-
-
-def empty_struct(value: Any) -> Any:
-    """Returns a struct without arrays, of the type of a value that is a Warp struct; None for other values.
-
-    It takes the place of the gradient of a struct whose arrays have gradients of their own.
-
-    Contract: Instances of a :class:`warp.struct` have their type as ``_cls``.
-
-    Raises:
-        RuntimeError: If they do not: adjoints cannot be launched then.
-    """
-    if not wp.types.is_struct(value):
-        return None
-    if not hasattr(value, "_cls"):
-        raise _missing(wp, "attribute _cls of structs", "steps carry no gradients")
-    return _make_empty(value._cls)
-
-
-@functools.cache
-def _make_empty(struct):
-    return struct()
-
-
-def struct_fields(struct: Any) -> list[str]:
-    """Returns the names of the fields of a Warp struct, in their order.
-
-    Contract: A :class:`warp.struct` has its fields by name as ``vars``.
-
-    Raises:
-        RuntimeError: If it does not.
-    """
-    try:
-        return list(struct.vars)
-    except AttributeError:
-        raise _missing(wp, "attribute vars of structs", "the stage cannot be constructed") from None
+    if not hasattr(module, name):
+        raise RuntimeError(f"Newton {version_of('newton')} has no {module.__name__}.{name}, which warp-bsc replaces")
+    setattr(module, name, value)
 
 
 def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
@@ -138,7 +77,7 @@ def has_external_rigid_solver(solver: SolverBase) -> bool:
     """
     name = "integrate_with_external_rigid_solver"
     if isinstance(solver, SolverVBD) and not hasattr(solver, name):
-        raise _missing(newton, f"SolverVBD.{name}", "the stage cannot tell whether VBD moves bodies")
+        raise missing("newton", f"SolverVBD.{name}", "the stage cannot tell whether VBD moves bodies")
     return getattr(solver, name, False)
 
 
@@ -153,7 +92,7 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
     poses = getattr(solver, "body_q_prev", None)
     integrates = isinstance(solver, SolverVBD) and solver.model.body_count > 0 and not has_external_rigid_solver(solver)
     if poses is None and integrates:
-        raise _missing(newton, "SolverVBD.body_q_prev", "the stage cannot push bodies; pass bodies that it leaves")
+        raise missing("newton", "SolverVBD.body_q_prev", "the stage cannot push bodies; pass bodies that it leaves")
     return poses
 
 
@@ -199,7 +138,7 @@ def without_own_contacts(solver: SolverBase) -> Iterator[None]:
         yield
         return
     if not hasattr(solver, "collision"):
-        raise _missing(newton, "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
+        raise missing("newton", "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
     own, solver.collision = solver.collision, None
     try:
         yield
@@ -221,7 +160,7 @@ def soft_contact_arrays(contacts: newton.Contacts, names: Sequence[str]) -> dict
     for name in names:
         attribute = _soft_contact_attribute(name)
         if not hasattr(contacts, attribute):
-            raise _missing(newton, f"Contacts.{attribute}", "contacts cannot be left out in steps with substeps")
+            raise missing("newton", f"Contacts.{attribute}", "contacts cannot be left out in steps with substeps")
         arrays[name] = getattr(contacts, attribute)
     return {name: array for name, array in arrays.items() if array is not None}
 
@@ -244,7 +183,7 @@ def soft_contact_counters(contacts: newton.Contacts, counters: wp.array) -> tupl
         view = getattr(contacts, name, None)
         if view is None or array.dtype is not wp.int32 or len(array) <= i or view.ptr != array[i : i + 1].ptr:
             counter = f"Contacts.{name} as number {i} of Contacts.contact_counters"
-            raise _missing(newton, counter, "contacts cannot be left out in steps with substeps")
+            raise missing("newton", counter, "contacts cannot be left out in steps with substeps")
     return counters[1:2], counters[3:4]
 
 

@@ -1,38 +1,14 @@
-"""What this package uses of Warp and Newton beyond their public interfaces: one function for each name or contract.
+"""Names and contracts of Warp."""
 
-Each function says which contract it relies on, and what happens where a version breaks it: a clear error, or a fallback
-that says so in a warning. The first use on a version that was not tested warns, once for each package.
-"""
-
+import contextlib
 import functools
-import importlib
 import warnings
-from types import ModuleType
+from collections.abc import Iterator
 from typing import Any
 
 import warp as wp
 
-__all__ = ["TESTED_VERSIONS", "cpu_graph", "may_run_in_threads", "replace_name", "warn_if_untested"]
-
-TESTED_VERSIONS = {"warp": ("1.18", "1.19"), "newton": ("1.8",)}
-"""Versions with which the tests of this package have passed, by the name of the module."""
-
-
-@functools.cache
-def warn_if_untested(package: str) -> None:
-    """Warns, once, if the version of a package, "warp" or "newton", is none of :data:`TESTED_VERSIONS`."""
-    version, tested = _version(package), TESTED_VERSIONS[package]
-    if ".".join(version.split(".")[:2]) not in tested:
-        warnings.warn(
-            f"warp-bsc relies on undocumented parts of {package}, and was tested with its versions "
-            f"{', '.join(tested)}, not with {version}, which is installed",
-            stacklevel=3,
-        )
-
-
-def _version(package: str) -> str:
-    """Returns the version of a package that has been imported."""
-    return importlib.import_module(package).__version__
+from .versions import missing, warn_if_untested
 
 
 def cpu_graph() -> Any:
@@ -86,16 +62,62 @@ def _warn_of_one_thread() -> None:
     )
 
 
-def replace_name(module: ModuleType, name: str, value: object) -> None:
-    """Replaces a function or a class of a module of Newton, for all that look it up there afterwards.
+@contextlib.contextmanager
+def paused_tape() -> Iterator[wp.Tape | None]:
+    """Pauses the active tape, if any, so that it records no launches, and yields it; None if there is none.
 
-    Contract: Newton's examples call ``newton.examples.run``, download through ``newton.utils.download_asset`` and
-    ``newton.examples.download_external_git_folder``, and make the solvers that :mod:`newton.solvers` names.
+    Contract: ``warp._src.context.runtime.tape`` is the active :class:`warp.Tape`, or None. A tape that is left and
+    entered again continues its record.
 
     Raises:
-        RuntimeError: If the module does not have the name, so that the replacement would have no effect.
+        RuntimeError: If this version of Warp has no such name: a tape would record kernels of the stage, and gradients
+            would be wrong.
     """
-    warn_if_untested("newton")
-    if not hasattr(module, name):
-        raise RuntimeError(f"Newton {_version('newton')} has no {module.__name__}.{name}, which warp-bsc replaces")
-    setattr(module, name, value)
+    try:
+        tape = wp._src.context.runtime.tape
+    except AttributeError:
+        raise missing("warp", "context.runtime.tape", "a step cannot pause the active tape") from None
+    if tape is None:
+        yield None
+        return
+    tape.__exit__(None, None, None)
+    try:
+        yield tape
+    finally:
+        tape.__enter__()
+
+
+def empty_struct(value: Any) -> Any:
+    """Returns a struct without arrays, of the type of a value that is a Warp struct; None for other values.
+
+    It takes the place of the gradient of a struct whose arrays have gradients of their own.
+
+    Contract: Instances of a :class:`warp.struct` have their type as ``_cls``.
+
+    Raises:
+        RuntimeError: If they do not: adjoints cannot be launched then.
+    """
+    if not wp.types.is_struct(value):
+        return None
+    if not hasattr(value, "_cls"):
+        raise missing("warp", "attribute _cls of structs", "steps carry no gradients")
+    return _make_empty(value._cls)
+
+
+@functools.cache
+def _make_empty(struct):
+    return struct()
+
+
+def struct_fields(struct: Any) -> list[str]:
+    """Returns the names of the fields of a Warp struct, in their order.
+
+    Contract: A :class:`warp.struct` has its fields by name as ``vars``.
+
+    Raises:
+        RuntimeError: If it does not.
+    """
+    try:
+        return list(struct.vars)
+    except AttributeError:
+        raise missing("warp", "attribute vars of structs", "the stage cannot be constructed") from None
