@@ -65,8 +65,8 @@ class Substeps:
         In a CUDA graph, a step that allocates memory, such as that of ``SolverXPBD``, cannot be left out where nothing
         touches. The substeps then cost their time in each step, and ``"auto"`` raises. Only ``SolverVBD`` and
         ``SolverStyle3D`` themselves are known not to allocate, see
-        :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in place,
-        and not by assignment, are not restored.
+        :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in
+        place, and not by assignment, are not restored.
 
         An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or by VBD's
         self-contact, resolves them beside the stage: a whole step may leave stretch that substeps release. Contacts
