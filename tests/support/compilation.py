@@ -2,6 +2,7 @@
 
 import functools
 import os
+import sys
 import zlib
 
 import warp as wp
@@ -11,11 +12,29 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["QUICK", "compile_kernels_once"]
+__all__ = ["QUICK", "compile_kernels_once", "omit_gradients_of_newton"]
 
 QUICK = {"cpu_compiler_flags": "-march=native"}
 """Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take twice as
 long to compile. Such kernels are slower, which does not matter in tests."""
+
+
+WITHOUT_GRADIENTS = [
+    "newton._src.geometry.kernels",
+    "newton._src.sim.articulation",
+    "newton._src.solvers.featherstone.kernels",
+    "newton._src.solvers.style3d.kernels",
+    "newton._src.solvers.xpbd.kernels",
+    "newton._src.viewer.kernels",
+]
+"""Modules of Newton's kernels through which no test takes a gradient. Their adjoints take 27 s to compile."""
+
+
+def omit_gradients_of_newton() -> None:
+    """Leaves the adjoints out of :data:`WITHOUT_GRADIENTS`, as far as these are imported."""
+    for name in WITHOUT_GRADIENTS:
+        if name in sys.modules:
+            wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
 
 
 def compile_kernels_once() -> None:
