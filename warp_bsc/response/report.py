@@ -79,7 +79,7 @@ class SolverReport:
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
 
-    Without a response (:class:`.solver_ccd.CollisionMonitor`) the motion that the inner solver predicted is the motion
+    Without a response (:class:`.monitor.CollisionMonitor`) the motion that the inner solver predicted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
     or frozen.
 
@@ -87,13 +87,7 @@ class SolverReport:
         speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(
-        self,
-        motion: ModelMotion,
-        work: Workspace,
-        *,
-        responds: bool = True,
-    ):
+    def __init__(self, motion: ModelMotion, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._motion, self._work, self._responds = motion, work, responds
         self.speed_limit_lifted = False
@@ -123,7 +117,7 @@ class SolverReport:
     def remaining(self) -> int:
         """Contacts that the motion of the last step has as it is stored.
 
-        With a response, they could not be resolved, because kinematic vertices leave no room.
+        With a response, they could not be resolved, because kinematic vertices leave no space.
         """
         return _read(self._work.status.results.remaining)
 
@@ -141,7 +135,7 @@ class SolverReport:
 
         These are pairs of meshes that are to collide, of two bodies, or of a body and a static shape, without elements
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
-        the response moves no bodies, and counts nothing that it keeps apart (``bodies=True``).
+        the response moves no bodies, and counts nothing that it keeps apart (``bodies="separated"``).
         """
         return _read(self._work.status.results.body_contacts)
 
