@@ -185,10 +185,7 @@ class ModelMesh(CollisionMesh):
         return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
 
     def positions(
-        self,
-        particle_q: wp.array[wp.vec3] | None,
-        body_q: wp.array[wp.transform] | None,
-        out: wp.array[wp.vec3],
+        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
     ) -> None:
         """Writes the positions of all vertices, those of particles bit for bit. Can be captured in a CUDA graph.
 

@@ -80,12 +80,7 @@ def continues(motion: Motion, world: int) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def _interrupt(
-    # in
-    world_mask: wp.array[wp.bool],
-    # out
-    interrupted: wp.array[int],
-):
+def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
     """Marks worlds as interrupted, and as the last entry everything that is in all worlds, if any world is."""
     i = wp.tid()
     last = world_mask.shape[0] - 1

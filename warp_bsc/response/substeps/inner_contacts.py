@@ -53,11 +53,7 @@ class _Stage:
 
 @wp.func
 def _resolves(
-    stage: _Stage,
-    contacts: _SoftContacts,
-    i: int,
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
+    stage: _Stage, contacts: _SoftContacts, i: int, particle_q: wp.array[wp.vec3], body_q: wp.array[wp.transform]
 ) -> bool:
     """Returns whether the stage resolves a contact, so that the inner solver need not."""
     shape = contacts.shape[i]

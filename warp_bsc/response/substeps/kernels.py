@@ -146,13 +146,7 @@ def start_substep(
 
 @wp.kernel
 def reset_constraints(
-    # in
-    substep: Motion,
-    vertices: Vertices,
-    detected: wp.array[int],
-    # in and out
-    constraints: Constraints,
-    status: SolveStatus,
+    substep: Motion, vertices: Vertices, detected: wp.array[int], constraints: Constraints, status: SolveStatus
 ):
     """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
     i = wp.tid()
