@@ -203,14 +203,7 @@ class ModelMotion:
     def __init__(
         self, mesh: ModelMesh, friction: Friction, *, moves_bodies: bool = False, responds_to_bodies: bool = False
     ):
-        """Allocates buffers.
-
-        Args:
-            mesh: The mesh.
-            friction: The coefficients of its vertices and planes.
-            moves_bodies: Whether the response can move bodies.
-            responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
-        """
+        """Allocates buffers; ``responds_to_bodies`` keeps bodies apart from each other and from static shapes."""
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()

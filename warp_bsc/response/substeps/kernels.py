@@ -65,20 +65,14 @@ def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: S
 
 @wp.kernel
 def begin_substeps(
-    # in
     has_constraints: wp.array[int],
     number: wp.array[int],
     substeps: int,
-    # in and out
     status: SolveStatus,
-    # out
     takes_substeps: wp.array[int],
-    remaining: wp.array[int],
 ):
-    """Marks the worlds that have constraints and take this number of substeps, and starts the count."""
+    """Marks the worlds that have constraints and take this number of substeps."""
     world = wp.tid()
-    if world == 0:
-        remaining[0] = substeps
     takes_substeps[world] = wp.where(number[world] == substeps, has_constraints[world], 0)
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 

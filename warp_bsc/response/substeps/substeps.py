@@ -119,11 +119,8 @@ class Substeps:
         self._remaining = wp.zeros(1, dtype=int, device=device)  # substeps
         if self._chooses:
             edges, lengths, is_solid = edges_at_rest(model)
-            self._edges = (
-                wp.array(edges, dtype=wp.vec2i, device=device),
-                wp.array(lengths, dtype=float, device=device),
-                wp.array(is_solid, dtype=bool, device=device),
-            )
+            columns = (edges, wp.vec2i), (lengths, float), (is_solid, bool)
+            self._edges = [wp.array(values, dtype=dtype, device=device) for values, dtype in columns]
             self._strain = wp.zeros(worlds, dtype=float, device=device)
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
@@ -224,9 +221,9 @@ class Substeps:
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
         work, mesh, start, motion = self._work, self._mesh, self._in, self._motion.vertices
-        inputs = [self._has_constraints, self._number, substeps]
-        outputs = [work.status, self._takes_substeps, self._remaining]
-        work.launch(kernels.begin_substeps, work.worlds, inputs, outputs)
+        self._remaining.fill_(substeps)
+        inputs = [self._has_constraints, self._number, substeps, work.status]
+        work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
