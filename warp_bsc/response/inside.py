@@ -36,27 +36,16 @@ class Inside:
 
 
 class _Solids(NamedTuple):
-    """The bodies that enclose space: soft bodies, then shapes, those that are in all worlds once for each world.
+    """The bodies that enclose space: soft bodies, then shapes, those that are in all worlds once for each world."""
 
-    Attributes:
-        finder: Finds the points inside them.
-        faces: Vertices of their faces, shape [face_count, 3].
-        of_face: Body of each face, shape [face_count].
-        shape: Shape of each body, -1 for a soft body, shape [n].
-        soft_body: First particle of each body, -1 for a shape, shape [n].
-        body: Rigid body of each shape, -1 for none, shape [n].
-        world: World of each body, shape [n].
-        soft_body_of: First particle of the soft body of each particle, -1 for none, shape [particle_count].
-    """
-
-    finder: ContainmentFinder
-    faces: np.ndarray
-    of_face: np.ndarray
-    shape: np.ndarray
-    soft_body: np.ndarray
-    body: np.ndarray
-    world: np.ndarray
-    soft_body_of: np.ndarray
+    finder: ContainmentFinder  # of the points inside them
+    faces: np.ndarray  # vertices of their faces, shape [face_count, 3]
+    of_face: np.ndarray  # body of each face
+    shape: np.ndarray  # of each body, -1 for a soft body
+    soft_body: np.ndarray  # first particle of each body, -1 for a shape
+    body: np.ndarray  # rigid body of each shape, -1 for none
+    world: np.ndarray  # of each body
+    soft_body_of: np.ndarray  # first particle of the soft body of each particle, -1 for none
 
 
 class InsideFinder:

@@ -39,14 +39,7 @@ def _make_kernels(kind: type, force: type) -> tuple[wp.Kernel, wp.Kernel]:
             starts[i] = ends[i]
 
     @wp.kernel(enable_backward=False, module="unique")
-    def add_forces(
-        # in
-        impulses: wp.array[force],
-        proxy: wp.array[int],
-        dt: float,
-        # out
-        forces: wp.array[force],
-    ):
+    def add_forces(impulses: wp.array[force], proxy: wp.array[int], dt: float, forces: wp.array[force]):
         """Adds the forces that make impulses on bodies or particles in a step, at the indices of their proxies."""
         i = wp.tid()
         if proxy[i] >= 0:

@@ -44,15 +44,7 @@ class Friction:
         vertex_shapes: wp.array[int],
         plane_shapes: wp.array[int],
     ):
-        """Reads the coefficients for the first time.
-
-        Args:
-            of_particles: Coefficients of particles, shape [1] or [particle_count].
-            of_shapes: Coefficients of shapes, shape [shape_count].
-            particle_count: Number of particles, whose vertices come first.
-            vertex_shapes: Shape of each other vertex.
-            plane_shapes: Shape of each infinite plane.
-        """
+        """Reads the coefficients for the first time, of vertices of particles, of those of shapes, and of planes."""
         self.of_particles, self.of_shapes, device = of_particles, of_shapes, of_particles.device
         self._inputs = [of_particles, of_shapes, particle_count, vertex_shapes, plane_shapes]
         self.vertices = wp.zeros(particle_count + len(vertex_shapes), dtype=float, device=device)

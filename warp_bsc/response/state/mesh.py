@@ -118,8 +118,7 @@ class ModelMesh(CollisionMesh):
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
             if key not in tessellations:
-                arguments = model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments
-                tessellations[key] = _tessellate(*arguments)
+                tessellations[key] = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments)
             shape_positions, shape_faces = tessellations[key]
             shape_positions = transform[shape, :3] + _rotate(transform[shape, 3:], shape_positions)
             for world in range(model.world_count) if shape_world[shape] < 0 else [shape_world[shape]]:
@@ -185,10 +184,7 @@ class ModelMesh(CollisionMesh):
         return wp.array(values, dtype=wp.vec3 if values.ndim == 2 else int, device=self.device)
 
     def positions(
-        self,
-        particle_q: wp.array[wp.vec3] | None,
-        body_q: wp.array[wp.transform] | None,
-        out: wp.array[wp.vec3],
+        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
     ) -> None:
         """Writes the positions of all vertices, those of particles bit for bit. Can be captured in a CUDA graph.
 
@@ -265,10 +261,8 @@ def _write_inverse_masses(
     particle_inv_mass: wp.array[float], particle_flags: wp.array[int], inverse_masses: wp.array[float]
 ):
     particle = wp.tid()
-    inverse_mass = float(0.0)
-    if particle_flags[particle] & ParticleFlags.ACTIVE:
-        inverse_mass = particle_inv_mass[particle]
-    inverse_masses[particle] = inverse_mass
+    is_active = particle_flags[particle] & ParticleFlags.ACTIVE != 0
+    inverse_masses[particle] = wp.where(is_active, particle_inv_mass[particle], 0.0)
 
 
 def host_array(array: wp.array | None) -> np.ndarray:
@@ -388,7 +382,7 @@ def _weld(mesh):
 def _capsule_profile(radius, half_height, segments):
     """Returns radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
     angle = np.linspace(0.0, np.pi / 2.0, segments // 4 + 1)
-    lower = np.stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)], axis=1)
+    lower = np.column_stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)])
     upper = lower[::-1] * (1.0, -1.0)
     return np.concatenate([lower, upper if half_height > 0.0 else upper[1:]])
 
@@ -396,9 +390,7 @@ def _capsule_profile(radius, half_height, segments):
 def _revolve(profile, segments):
     """Returns the surface that a profile makes when it turns around the z axis, as :func:`_tessellate` does.
 
-    Args:
-        profile: Radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
-        segments: Number of segments.
+    The profile has radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
     """
     from trimesh import creation  # noqa: PLC0415 (slow)
 

@@ -80,12 +80,7 @@ def continues(motion: Motion, world: int) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def _interrupt(
-    # in
-    world_mask: wp.array[wp.bool],
-    # out
-    interrupted: wp.array[int],
-):
+def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
     """Marks worlds as interrupted, and as the last entry everything that is in all worlds, if any world is."""
     i = wp.tid()
     last = world_mask.shape[0] - 1
@@ -95,29 +90,19 @@ def _interrupt(
 
 
 @wp.kernel(enable_backward=False)
-def _write_start(
-    # in
-    place: _Placement,
-    last: wp.array[wp.vec3],
-    inverse_mass: wp.array[float],
-    world: wp.array[int],
-    # out
-    x0: wp.array[wp.vec3],
-    planes: wp.array[wp.vec4d],
-    interrupted: wp.array[int],
-):
+def _write_start(place: _Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
-    _place_plane(place, i, planes)
-    if i >= x0.shape[0]:
+    _place_plane(place, i, planes.start)
+    if i >= motion.x0.shape[0]:
         return
     x = _position(place, i)
-    x0[i] = x
-    if last and inverse_mass[i] > 0.0:
+    motion.x0[i] = x
+    if last and motion.inverse_mass[i] > 0.0:
         for axis in range(3):
             if x[axis] != last[i][axis]:
-                interrupted[world[i]] = 1
-                interrupted[interrupted.shape[0] - 1] = 1
+                motion.interrupted[motion.world[i]] = 1
+                motion.interrupted[motion.interrupted.shape[0] - 1] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -218,14 +203,7 @@ class ModelMotion:
     def __init__(
         self, mesh: ModelMesh, friction: Friction, *, moves_bodies: bool = False, responds_to_bodies: bool = False
     ):
-        """Allocates buffers.
-
-        Args:
-            mesh: The mesh.
-            friction: The coefficients of its vertices and planes.
-            moves_bodies: Whether the response can move bodies.
-            responds_to_bodies: Whether it keeps them apart from each other and from static shapes.
-        """
+        """Allocates buffers; ``responds_to_bodies`` keeps bodies apart from each other and from static shapes."""
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
@@ -314,11 +292,9 @@ class ModelMotion:
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.state.mesh.ModelMesh.positions`."""
-        vertices = self.vertices
-        self.mesh.check_lengths(particle_q, body_q, vertices.x0)
-        inputs = [self._place(particle_q, body_q), self._last, vertices.inverse_mass, vertices.world]
-        outputs = [vertices.x0, self.planes.start, vertices.interrupted]
-        wp.launch(_write_start, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        self.mesh.check_lengths(particle_q, body_q, self.vertices.x0)
+        inputs = [self._place(particle_q, body_q), self._last, self.vertices, self.planes]
+        wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, body_q)
 

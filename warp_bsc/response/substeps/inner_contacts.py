@@ -53,11 +53,7 @@ class _Stage:
 
 @wp.func
 def _resolves(
-    stage: _Stage,
-    contacts: _SoftContacts,
-    i: int,
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
+    stage: _Stage, contacts: _SoftContacts, i: int, particle_q: wp.array[wp.vec3], body_q: wp.array[wp.transform]
 ) -> bool:
     """Returns whether the stage resolves a contact, so that the inner solver need not."""
     shape = contacts.shape[i]
@@ -115,18 +111,15 @@ def _pack(
 
 @wp.kernel
 def _unpack(
-    # in
     packed: wp.array[wp.spatial_vector],
-    packed_count: wp.array[int],
+    count: wp.array[int],
     places: wp.array[int],
-    first: int,
-    # out
     forces: wp.array[wp.spatial_vector],
 ):
     """Writes the forces of packed contacts to the rows of the contacts that the program passed on."""
     i = wp.tid()
-    if i < packed_count[0]:
-        forces[first + places[i]] = packed[i]
+    if i < count[0]:
+        forces[places[i]] = packed[i]
 
 
 class InnerContacts:
@@ -139,15 +132,10 @@ class InnerContacts:
     """
 
     def __init__(self, mesh: ModelMesh, *, moves_bodies: bool):
-        """Finds which contacts the stage resolves.
-
-        Args:
-            mesh: The mesh.
-            moves_bodies: Whether the response can move bodies.
-        """
-        self._model, self._device = mesh.model, mesh.device
+        """Finds which contacts the stage resolves on a mesh, if the response can move bodies or not."""
+        model, self._device = mesh.model, mesh.device
+        self._model = model
         self._stage = stage = _Stage()
-        model = mesh.model
         stage.depth = wp.array(_depths(model, mesh.segments), dtype=float, device=mesh.device)
         stage.is_plane = wp.array(are_infinite_planes(model), dtype=bool, device=mesh.device)
         stage.takes_part = wp.array(_takes_part(mesh), dtype=bool, device=mesh.device)
@@ -185,11 +173,8 @@ class InnerContacts:
 
     def packed(self, contacts: newton.Contacts) -> newton.Contacts:
         """Returns the contacts that the inner solver got in the last step instead of those of the program."""
-        buffers = self._buffers_of(contacts)
+        buffers = self._buffers.get(_key(contacts, _arrays_of(contacts)))
         return contacts if buffers is None else contacts_with(contacts, buffers.counters, buffers.arrays)
-
-    def _buffers_of(self, contacts):
-        return self._buffers.get(_key(contacts, _arrays_of(contacts)))
 
     def unpack(self, forces: wp.array | None, contacts: newton.Contacts | None) -> None:
         """Moves the forces on packed contacts to the rows of the contacts that the program passed on.
@@ -200,7 +185,7 @@ class InnerContacts:
         """
         if forces is None or contacts is None:
             return
-        buffers = self._buffers_of(contacts)
+        buffers = self._buffers.get(_key(contacts, _arrays_of(contacts)))
         if buffers is None:
             return
         first = contacts.rigid_contact_max
@@ -209,8 +194,8 @@ class InnerContacts:
             buffers.forces = wp.empty_like(rows, requires_grad=False)
         wp.copy(buffers.forces, rows)
         rows.zero_()
-        inputs = [buffers.forces, buffers.count, buffers.places, first]
-        wp.launch(_unpack, contacts.soft_contact_max, inputs=inputs, outputs=[forces], device=self._device)
+        inputs = [buffers.forces, buffers.count, buffers.places]
+        wp.launch(_unpack, contacts.soft_contact_max, inputs=inputs, outputs=[rows], device=self._device)
 
 
 class _Buffers:
@@ -258,9 +243,6 @@ def _depths(model, segments=SEGMENTS):
 def _takes_part(mesh):
     """Returns whether particles take part in the detection, or lie inside soft bodies, behind others that do."""
     model = mesh.model
-    takes_part = np.zeros(mesh.vertex_count, dtype=bool)
-    takes_part[mesh.edges] = True
-    takes_part[mesh.points] = True
-    if model.tet_indices is not None:
-        takes_part[model.tet_indices.numpy()] = True
-    return takes_part[: model.particle_count]
+    inner = np.empty(0, dtype=int) if model.tet_indices is None else model.tet_indices.numpy()
+    members = np.concatenate([mesh.edges.ravel(), mesh.points, inner.ravel()])
+    return np.isin(np.arange(model.particle_count), members)

@@ -16,6 +16,16 @@ _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 """Separation of a constraint that no motion violates, so that it never acts [m]."""
 
 
+@wp.struct
+class SubstepState:
+    """Positions and velocities of a ``newton.State``."""
+
+    particle_q: wp.array[wp.vec3]
+    particle_qd: wp.array[wp.vec3]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+
+
 @wp.kernel
 def use_substeps(unfinished: wp.array[int], number: int, substeps: wp.array[int]):
     """Writes the number of substeps of a step that collides; 0 of others."""
@@ -55,20 +65,14 @@ def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: S
 
 @wp.kernel
 def begin_substeps(
-    # in
     has_constraints: wp.array[int],
     number: wp.array[int],
     substeps: int,
-    # in and out
     status: SolveStatus,
-    # out
     takes_substeps: wp.array[int],
-    remaining: wp.array[int],
 ):
-    """Marks the worlds that have constraints and take this number of substeps, and starts the count."""
+    """Marks the worlds that have constraints and take this number of substeps."""
     world = wp.tid()
-    if world == 0:
-        remaining[0] = substeps
     takes_substeps[world] = wp.where(number[world] == substeps, has_constraints[world], 0)
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
@@ -88,8 +92,7 @@ def start_substep(
     dt: float,
     remaining: wp.array[int],
     detected: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
+    end: SubstepState,
     # in and out
     substep: Motion,
     constraints: Constraints,
@@ -116,10 +119,10 @@ def start_substep(
     if i >= motion.x0.shape[0]:
         return
     is_not_finite = int(0)
-    if i < particle_q.shape[0]:
+    if i < end.particle_q.shape[0]:
         x0 = substep.x0[i]
-        x1 = particle_q[i]
-        velocity = particle_qd[i]
+        x1 = end.particle_q[i]
+        velocity = end.particle_qd[i]
         if not (wp.isfinite(x1) and wp.isfinite(velocity)):
             x1 = x0
             velocity = wp.vec3()
@@ -146,13 +149,7 @@ def start_substep(
 
 @wp.kernel
 def reset_constraints(
-    # in
-    substep: Motion,
-    vertices: Vertices,
-    detected: wp.array[int],
-    # in and out
-    constraints: Constraints,
-    status: SolveStatus,
+    substep: Motion, vertices: Vertices, detected: wp.array[int], constraints: Constraints, status: SolveStatus
 ):
     """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
     i = wp.tid()
@@ -176,44 +173,27 @@ def reset_constraints(
 
 @wp.kernel
 def end_substep(
-    # in
     vertices: Vertices,
-    # in and out
     remaining: wp.array[int],
-    # out
     substep: Motion,
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-):
-    """Makes the end of a substep the start of the next."""
-    vertex = wp.tid()
-    if vertex == 0:
-        remaining[0] = remaining[0] - 1
-    if vertex < particle_q.shape[0]:
-        substep.x0[vertex] = vertices.x1[vertex]
-        particle_q[vertex] = vertices.x1[vertex]
-        particle_qd[vertex] = vertices.velocity[vertex]
-    elif moves_with_body(substep, vertex):
-        substep.x0[vertex] = vertices.x1[vertex]
-
-
-@wp.kernel
-def end_body_substep(
-    # in
-    substep: Motion,
-    vertices: Vertices,
-    # out
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
+    state: SubstepState,
     body_q_prev: wp.array[wp.transform],
 ):
-    """Makes the poses and velocities at the end of a substep those at the start of the next."""
-    body = wp.tid()
-    if substep.bodies.inverse_mass[body] > 0.0:
-        body_q[body] = vertices.bodies.pose[body]
-        body_qd[body] = vertices.bodies.velocity[body]
+    """Makes the end of a substep the start of the next, of vertices and of bodies that the response can move."""
+    i = wp.tid()
+    if i == 0:
+        remaining[0] = remaining[0] - 1
+    if i < state.particle_q.shape[0]:
+        substep.x0[i] = vertices.x1[i]
+        state.particle_q[i] = vertices.x1[i]
+        state.particle_qd[i] = vertices.velocity[i]
+    elif i < substep.x0.shape[0] and moves_with_body(substep, i):
+        substep.x0[i] = vertices.x1[i]
+    if i < substep.bodies.inverse_mass.shape[0] and substep.bodies.inverse_mass[i] > 0.0:
+        state.body_q[i] = vertices.bodies.pose[i]
+        state.body_qd[i] = vertices.bodies.velocity[i]
         if body_q_prev:
-            body_q_prev[body] = vertices.bodies.pose[body]
+            body_q_prev[i] = vertices.bodies.pose[i]
 
 
 @wp.kernel
@@ -246,57 +226,35 @@ def _pose_between(start: wp.transform, end: wp.transform, share: float) -> wp.tr
 
 
 @wp.kernel
-def end_substeps(
-    # in
-    takes_substeps: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-    # in and out
-    motion: Motion,
-    # out
-    particle_q_out: wp.array[wp.vec3],
-    particle_qd_out: wp.array[wp.vec3],
-    vertices: Vertices,
-):
-    """Makes the substeps the predicted motion, in worlds that take them, and puts vertices back to the start."""
-    i = wp.tid()
-    vertices.x1[i] = motion.x0[i]
-    if i >= particle_q.shape[0] or takes_substeps[motion.world[i]] == 0:
-        return
-    if motion.is_not_finite[i] == 0 and motion.inverse_mass[i] != 0.0:
-        motion.x1[i] = particle_q[i]
-        motion.velocity[i] = particle_qd[i]
-        particle_q_out[i] = particle_q[i]
-        particle_qd_out[i] = particle_qd[i]
-
-
-@wp.kernel
-def end_body_substeps(
-    # in
-    takes_substeps: wp.array[int],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    # in and out
-    motion: Motion,
-    # out
-    body_q_out: wp.array[wp.transform],
-    body_qd_out: wp.array[wp.spatial_vector],
-):
+def end_body_substeps(takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState):
     """Makes the poses after the substeps the predicted ones, in worlds that take substeps."""
     body = wp.tid()
     if motion.bodies.inverse_mass[body] == 0.0 or takes_substeps[wp.max(motion.bodies.world[body], 0)] == 0:
         return
-    motion.bodies.end[body] = body_q[body]
-    motion.bodies.velocity[body] = body_qd[body]
-    body_q_out[body] = body_q[body]
-    body_qd_out[body] = body_qd[body]
+    motion.bodies.end[body] = after.body_q[body]
+    motion.bodies.velocity[body] = after.body_qd[body]
+    state.body_q[body] = after.body_q[body]
+    state.body_qd[body] = after.body_qd[body]
 
 
 @wp.kernel
-def place_bodies(motion: Motion):
-    """Writes the predicted positions and velocities of the vertices of bodies."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    if moves_with_body(motion, vertex):
-        x1 = predicted_position(motion, vertex)
-        motion.x1[vertex] = x1
-        motion.velocity[vertex] = predicted_velocity(motion, vertex, x1)
+def end_substeps(
+    takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState, vertices: Vertices
+):
+    """Makes the substeps the predicted motion, in worlds that take them, and puts vertices back to the start.
+
+    Vertices of bodies follow the predicted poses, so that :func:`end_body_substeps` comes first.
+    """
+    i = wp.tid()
+    vertices.x1[i] = motion.x0[i]
+    if moves_with_body(motion, i):
+        x1 = predicted_position(motion, i)
+        motion.x1[i] = x1
+        motion.velocity[i] = predicted_velocity(motion, i, x1)
+    if i >= after.particle_q.shape[0] or takes_substeps[motion.world[i]] == 0:
+        return
+    if motion.is_not_finite[i] == 0 and motion.inverse_mass[i] != 0.0:
+        motion.x1[i] = after.particle_q[i]
+        motion.velocity[i] = after.particle_qd[i]
+        state.particle_q[i] = after.particle_q[i]
+        state.particle_qd[i] = after.particle_qd[i]

@@ -119,11 +119,8 @@ class Substeps:
         self._remaining = wp.zeros(1, dtype=int, device=device)  # substeps
         if self._chooses:
             edges, lengths, is_solid = edges_at_rest(model)
-            self._edges = (
-                wp.array(edges, dtype=wp.vec2i, device=device),
-                wp.array(lengths, dtype=float, device=device),
-                wp.array(is_solid, dtype=bool, device=device),
-            )
+            columns = (edges, wp.vec2i), (lengths, float), (is_solid, bool)
+            self._edges = [wp.array(values, dtype=dtype, device=device) for values, dtype in columns]
             self._strain = wp.zeros(worlds, dtype=float, device=device)
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
@@ -224,9 +221,9 @@ class Substeps:
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
         work, mesh, start, motion = self._work, self._mesh, self._in, self._motion.vertices
-        inputs = [self._has_constraints, self._number, substeps]
-        outputs = [work.status, self._takes_substeps, self._remaining]
-        work.launch(kernels.begin_substeps, work.worlds, inputs, outputs)
+        self._remaining.fill_(substeps)
+        inputs = [self._has_constraints, self._number, substeps, work.status]
+        work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
@@ -242,20 +239,16 @@ class Substeps:
         attributes.update(kept)
         for array, saved in step.arrays:
             wp.copy(array, saved)
-        state = step.state
-        inputs = [self._takes_substeps, start.particle_q, start.particle_qd]
-        outputs = [motion, state.particle_q, state.particle_qd, work.vertices]
-        work.launch(kernels.end_substeps, mesh.vertex_count, inputs, outputs)
+        inputs = [self._takes_substeps, _arrays_of(start), motion, _arrays_of(step.state)]
         if self._moves_bodies:
-            inputs = [self._takes_substeps, start.body_q, start.body_qd, motion]
-            work.launch(kernels.end_body_substeps, mesh.model.body_count, inputs, [state.body_q, state.body_qd])
-            work.launch(kernels.place_bodies, len(mesh.shape_vertices.body), [motion])
+            work.launch(kernels.end_body_substeps, mesh.model.body_count, inputs)
+        work.launch(kernels.end_substeps, mesh.vertex_count, inputs, [work.vertices])
 
     def _take_substep(self, substeps, step):
         """Steps the inner solver, and projects its motion onto the constraints."""
         work, mesh, motion, substep = self._work, self._mesh, self._motion, self._substep
         start, end, bodies = self._in, self._out, mesh.model.body_count
-        particle_q, particle_qd = start.particle_q, start.particle_qd
+        starts = _arrays_of(start)  # now: solvers may replace arrays of a state
         if bodies:
             inputs = [motion.vertices, self._start.body_q, step.state.body_q, substeps, self._remaining]
             work.launch(kernels.move_bodies, bodies, inputs, [start.body_q, end.body_q])
@@ -267,8 +260,7 @@ class Substeps:
         if self._moves_bodies:
             substep.set_body_ends(end.body_q, end.body_qd)
             work.launch_over_bodies(begin_bodies)
-        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected]
-        inputs += [end.particle_q, end.particle_qd]
+        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, _arrays_of(end)]
         outputs = [substep.vertices, work.constraints, work.status, substep.planes, work.vertices]
         size = max(mesh.vertex_count, len(motion.planes.start))
         work.launch(kernels.start_substep, size, inputs, outputs)
@@ -280,11 +272,9 @@ class Substeps:
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
         velocities.project(work, substep_dt)
         start.assign(self._start)
-        outputs = [substep.vertices, particle_q, particle_qd]
-        work.launch(kernels.end_substep, mesh.vertex_count, [work.vertices, self._remaining], outputs)
-        if self._moves_bodies:
-            outputs = [start.body_q, start.body_qd, body_q_prev(self._solver)]
-            work.launch(kernels.end_body_substep, bodies, [substep.vertices, work.vertices], outputs)
+        poses = body_q_prev(self._solver) if self._moves_bodies else None
+        inputs = [work.vertices, self._remaining, substep.vertices, starts, poses]
+        work.launch(kernels.end_substep, max(mesh.vertex_count, bodies), inputs)
 
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""
@@ -292,3 +282,11 @@ class Substeps:
         find_contacts(work, self._motion)
         work.launch(kernels.restore_detection, work.worlds, [self._detected, self._is_fast], [work.status])
         resolve_contacts(work, dt)
+
+
+def _arrays_of(state):
+    """Returns positions and velocities of a state as a struct."""
+    arrays = kernels.SubstepState()
+    for name in kernels.SubstepState.vars:
+        setattr(arrays, name, getattr(state, name))
+    return arrays
