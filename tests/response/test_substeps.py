@@ -39,8 +39,8 @@ def largest_stretch(model, dt, duration=0.4, **options):
     return np.mean(largest[-round(0.1 / dt) :]), solver.report
 
 
-def test_a_coupled_step_stretches_as_little_as_small_steps(device):
-    """At 1/60 s, coupled cloth stretches as at 1/480 s; without substeps, it stretches several times as much.
+def test_a_step_in_substeps_stretches_as_little_as_small_steps(device):
+    """At 1/60 s, cloth in substeps stretches as at 1/480 s; without substeps, it stretches several times as much.
 
     That is so with a number of substeps, and where the stage chooses.
     """
@@ -361,7 +361,7 @@ def test_the_state_at_the_start_may_be_that_at_the_end(device):
     assert state.particle_q.numpy().tobytes() == apart.positions.tobytes()
 
 
-def test_forces_act_as_often_as_without_coupling(device):
+def test_forces_act_as_often_as_without_substeps(device):
     """A patch on frictionless ground is pushed: coupled, it accelerates as force over mass."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=0.0))
@@ -407,7 +407,7 @@ def test_a_moving_plate_pushes_in_each_substep(device):
 
 
 @pytest.mark.parametrize("substeps", [3, "auto"])
-def test_coupled_steps_in_a_graph_are_those_without(substeps, device):
+def test_substeps_in_a_graph_are_those_without(substeps, device):
     if device.is_cuda and not wp.is_conditional_graph_supported():
         pytest.skip("needs conditional nodes")
     model = bullet(30.0, device=device)
@@ -452,7 +452,7 @@ def test_a_solver_that_allocates_is_captured_too(device):
             chooses.step(start, end, rollout.control, None, DT)
 
 
-def test_what_cannot_be_coupled_is_refused(device):
+def test_what_cannot_take_substeps_is_refused(device):
     model = bullet(10.0, device=device)
     with pytest.raises(ValueError, match="substeps must be an integer in"):
         bsc.SolverCCD(SOLVERS["vbd"](model), substeps=1)
@@ -533,7 +533,7 @@ def test_the_inner_solver_alone_keeps_its_limit(device):
     assert "_penetration_free_truncation" not in vars(inner)
 
 
-def test_friction_holds_and_slides_as_without_coupling(device):
+def test_friction_holds_and_slides_as_without_substeps(device):
     """Cloth on a ramp slides as a rigid body would, without friction and with it."""
     angle, time = np.radians(20.0), 0.25
     tilt = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), float(angle))
