@@ -68,10 +68,13 @@ class GradientTotals:
             no plane, are unbounded; finite ones replace them, see :mod:`warp_bsc.kernels.gradients`.
         lost_steps: Steps in a CUDA graph whose record did not fit in its buffers. Gradients through such a step are
             NaN, see :class:`.captured_steps.CapturedSteps`.
+        layerless_steps: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
+            Contacts then act where they hit, and results are not continuous.
     """
 
     grazing: int
     lost_steps: int
+    layerless_steps: int
 
 
 class SolverReport:
@@ -94,6 +97,7 @@ class SolverReport:
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
+        self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
 
     @property
@@ -273,7 +277,8 @@ class SolverReport:
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
-        return GradientTotals(*self._read_totals()[-2:])
+        layerless = 0 if self.layerless_steps is None else int(self.layerless_steps.numpy()[0])
+        return GradientTotals(*self._read_totals()[-2:], layerless)
 
     def _read_totals(self):
         return list(map(int, self.total_values.numpy()))
@@ -297,6 +302,8 @@ class SolverReport:
             line += f", {totals.not_finite_steps} steps with positions that are not finite"
         if gradients.grazing or gradients.lost_steps:
             line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
+        if gradients.layerless_steps:
+            line += f"; {gradients.layerless_steps} steps without their contact layer"
         return line
 
     @property

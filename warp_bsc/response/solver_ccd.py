@@ -186,6 +186,8 @@ class SolverCCD(CollisionStage):
         needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
         if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
             self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)
+        if isinstance(self.solver, ContactLayer):
+            self.report.layerless_steps = self.solver.skipped
         self._limited = inner if options.lift_speed_limit and has_speed_limit(inner) else None
         self.report.speed_limit_lifted = self._limited is not None
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
