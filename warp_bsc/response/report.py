@@ -278,7 +278,8 @@ class SolverReport:
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
         layerless = 0 if self.layerless_steps is None else int(self.layerless_steps.numpy()[0])
-        return GradientTotals(*self._read_totals()[-2:], layerless)
+        grazing, lost_steps = self._read_totals()[-2:]
+        return GradientTotals(grazing, lost_steps, layerless)
 
     def _read_totals(self):
         return list(map(int, self.total_values.numpy()))
