@@ -1,7 +1,5 @@
 """Copies of arrays of structs, and launches of the adjoints of kernels."""
 
-from types import SimpleNamespace
-
 import warp as wp
 
 from ..._private_names.of_warp import empty_struct
@@ -26,33 +24,26 @@ def copied(struct, lengths):
     return into
 
 
-def attach_gradients(struct, names, gradients=None):
-    """Replaces arrays of a struct by aliases with gradients, given or new ones; returns the gradients by name."""
-    into = SimpleNamespace(**(gradients or {}))
-    for name in names:
+def attach_gradients(struct, names=(), **gradients):
+    """Replaces arrays of a struct by aliases with gradients, zeros for ``names``; returns a struct of the gradients."""
+    into = struct._cls()
+    for name in (*names, *gradients):
         array = getattr(struct, name)
-        if not hasattr(into, name):
-            setattr(into, name, wp.zeros_like(array, requires_grad=False))
+        gradient = gradients[name] if name in gradients else wp.zeros_like(array, requires_grad=False)
+        setattr(into, name, gradient)
         if len(array):
             alias = array[:]
-            alias.grad = getattr(into, name)
+            alias.grad = gradient
             setattr(struct, name, alias)
     return into
 
 
-def launch_adjoint(kernel, dim, inputs, outputs, of_outputs, device):
-    """Launches the adjoint of a kernel, given the gradients with respect to its outputs.
+def launch_adjoint(kernel, dim, inputs, of_outputs, device):
+    """Launches the adjoint of a kernel, given the gradients with respect to the outputs that are not among its inputs.
 
-    The adjoint does not read or write outputs, so their gradients may stand in for them, except for outputs that
-    functions add to.
+    The adjoint does not read or write outputs, so their gradients stand in for them. Outputs that functions add to must
+    be among the inputs: the adjoint adds to these again.
     """
-    wp.launch(
-        kernel,
-        dim,
-        inputs=inputs,
-        outputs=outputs,
-        adj_inputs=[empty_struct(value) for value in inputs],
-        adj_outputs=of_outputs,
-        adjoint=True,
-        device=device,
-    )
+    adjoints = [empty_struct(value) for value in inputs]
+    options = {"outputs": of_outputs, "adj_outputs": of_outputs, "adjoint": True, "device": device}
+    wp.launch(kernel, dim, inputs=inputs, adj_inputs=adjoints, **options)

@@ -38,56 +38,38 @@ from ..solve.sweeps import (
     with_momentum,
 )
 from ..state.motion import moves_with_body, predicted_velocity
-from ..state.planes import signed_distance, time_of_entry, transformed_plane
+from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transformed_plane
 from ..state.poses import centre_of, inverse_inertia_at, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Vertices
 from ..state.vectors import ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_SAGITTA
-from .restore import RestoredStep, entry_of, is_movable
+from .restore import Paths, Projection, RestoredStep, entry_of, is_movable
 
 
 @wp.func
 def _add_change(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    change: wp.vec3d,
-    x: wp.array[wp.vec3],
-    vertex_changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vectord],
+    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, swept: Projection
 ):
-    """Adds what the change of a multiplier does to its vertices and bodies, at positions ``x`` of vertices.
+    """Adds what the change of a multiplier does to its vertices and bodies.
 
     :func:`.solve.sweeps.add_delta` and :func:`.solve.bodies.add_body_delta` do it in integers.
     """
     for j in range(4):
         vertex = constraints.vertices[i][j]
         share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
-        wp.atomic_add(vertex_changes, vertex, to_single(share * change))
+        wp.atomic_add(swept.vertex_change, vertex, to_single(share * change))
     if motion.bodies.of_vertex:
         for side in range(2):
-            body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
+            body, shift, turn = body_change(motion, vertices, constraints, i, side, change, swept.x)
             if body >= 0:
-                wp.atomic_add(
-                    body_changes, body, wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
-                )
+                added = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+                wp.atomic_add(swept.body_change, body, added)
 
 
 @wp.kernel
-def change_multipliers(
-    # in
-    step: RestoredStep,
-    of_velocities: bool,
-    x: wp.array[wp.vec3],
-    # out
-    multiplier_changes: wp.array[wp.vec3d],
-    previous_changes: wp.array[wp.vec3d],
-    vertex_changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vectord],
-):
-    """Computes what a sweep on positions or ``of_velocities`` changes, whose impulses act at positions ``x``.
+def change_multipliers(step: RestoredStep, swept: Projection):
+    """Computes what a sweep changes.
 
     See :func:`.solve.positions.project_positions` and :func:`.solve.velocities.project_velocities`.
     """
@@ -96,40 +78,30 @@ def change_multipliers(
     if entry < 0:
         return
     i = step.record.constraint[entry]
-    old = constraints.position_multiplier[i]
+    old = swept.multiplier[i]
     multiplier = old
-    if of_velocities:
-        old = constraints.velocity_multiplier[i]
+    if swept.of_velocities:
         multiplier = velocity_multiplier_after(motion, vertices, constraints, i, step.restitution)
     else:
         pushes_only = not is_reversible(step.status, constraints.pace[i] != Pace.FAST)
         multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
     previous = constraints.previous_multiplier[i]
     change = with_momentum(multiplier, previous, step.record.momentum[entry]) - old
-    multiplier_changes[i] = change
-    previous_changes[i] = multiplier - previous
-    _add_change(motion, vertices, constraints, i, change, x, vertex_changes, body_changes)
+    swept.multiplier_change[i] = change
+    swept.previous_change[i] = multiplier - previous
+    _add_change(motion, vertices, constraints, i, change, swept)
 
 
 @wp.kernel
-def initialize_multipliers(
-    # in
-    step: RestoredStep,
-    # out
-    velocity_multipliers: wp.array[wp.vec3d],
-    previous_multipliers: wp.array[wp.vec3d],
-    vertex_changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vectord],
-):
+def initialize_multipliers(step: RestoredStep, swept: Projection):
     """Computes initial velocity multipliers, see :func:`.solve.velocities.initialize_velocity_multipliers`."""
     i = wp.tid()
-    vertices = step.vertices
     constraints = step.constraints
     if i < constraints.count[0] and has_pushed(constraints, i):
         first = initial_velocity_multiplier(constraints, i, step.dt)
-        velocity_multipliers[i] = first
-        previous_multipliers[i] = first
-        _add_change(step.motion, vertices, constraints, i, first, vertices.x1, vertex_changes, body_changes)
+        swept.multiplier_change[i] = first
+        swept.previous_change[i] = first
+        _add_change(step.motion, step.vertices, constraints, i, first, swept)
 
 
 @wp.kernel
@@ -181,11 +153,9 @@ def _torque_and_moments(totals: wp.array2d[wp.float64], world: int):
 
 @wp.kernel
 def turn_velocities(
-    # in
     motion: Motion,
     vertices: Vertices,
     totals: wp.array2d[wp.float64],
-    # out
     changes: wp.array[wp.vec3],
     body_changes: wp.array[wp.spatial_vector],
 ):
@@ -210,24 +180,12 @@ def turn_velocities(
 
 
 @wp.kernel
-def make_constraints(
-    # in
-    step: RestoredStep,
-    found: Constraints,
-    # out
-    weights: wp.array[wp.vec4d],
-    normals: wp.array[wp.vec3d],
-    separations: wp.array[wp.float64],
-    frictions: wp.array[float],
-    approaches: wp.array[wp.float64],
-):
+def make_constraints(step: RestoredStep, found: Constraints):
     """Computes the constraints that a detection ``found``, from contacts and proximities; the cursor is ahead of it.
 
     See :func:`.contacts.collect.collect_contacts` and :func:`.contacts.proximities.collect_proximities`.
     """
-    motion = step.motion
-    vertices = step.vertices
-    iteration = step.cursor.iteration[0]
+    motion, vertices, constraints, iteration = step.motion, step.vertices, step.constraints, step.cursor.iteration[0]
     i = wp.tid()
     if iteration >= 0:
         i += step.record.constraint_offsets[iteration]
@@ -264,18 +222,17 @@ def make_constraints(
         weight = across
         normal = direction
         separation = feasible(motion, corners, step.separation, distance, step.separation)
-    weights[i] = weight
-    normals[i] = normal
-    separations[i] = separation
-    frictions[i] = friction
-    approaches[i] = approach_of(motion, vertices, corners, weight, normal, separation)
+    constraints.weights[i] = weight
+    constraints.normal[i] = normal
+    constraints.separation[i] = separation
+    constraints.friction[i] = friction
+    constraints.approach[i] = approach_of(motion, vertices, corners, weight, normal, separation)
 
 
 @wp.kernel
 def find_truncation_times(step: RestoredStep, times: wp.array[wp.float64]):
     """Computes the times of the contacts that an iteration truncated paths before."""
-    motion = step.motion
-    record = step.record
+    motion, record = step.motion, step.record
     entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
     if entry < 0 or record.kind[entry] == NO_CONTACT:
         return
@@ -288,36 +245,19 @@ def find_truncation_times(step: RestoredStep, times: wp.array[wp.float64]):
         lowest = level(motion, step.planes, plane, vertex)
         times[entry] = time_of_entry(before - lowest, after - lowest)
     else:
-        impact = impact_of(
-            motion,
-            step.vertices,
-            corners,
-            record.kind[entry],
-            record.within_tolerance[entry],
-            record.toi[entry],
-            record.coordinates[entry],
-            record.normal[entry],
-        )
+        kind, within_tolerance, toi = record.kind[entry], record.within_tolerance[entry], record.toi[entry]
+        coordinates, normal = record.coordinates[entry], record.normal[entry]
+        impact = impact_of(motion, step.vertices, corners, kind, within_tolerance, toi, coordinates, normal)
         times[entry] = impact.toi
 
 
 @wp.kernel
-def truncate_paths(
-    # in
-    step: RestoredStep,
-    times: wp.array[wp.float64],
-    # out
-    ends: wp.array[wp.vec3],
-    velocities: wp.array[wp.vec3],
-    poses: wp.array[wp.transform],
-    twists: wp.array[wp.spatial_vector],
-):
+def truncate_paths(step: RestoredStep, times: wp.array[wp.float64], paths: Paths):
     """Computes the ends and velocities of truncated paths of vertices and bodies.
 
     See :func:`.solve.division.truncate_vertices` and :func:`.solve.division.cut_bodies`. Frozen paths have time 0.
     """
-    motion = step.motion
-    record = step.record
+    motion, record = step.motion, step.record
     entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
     if entry < 0:
         return
@@ -326,18 +266,18 @@ def truncate_paths(
     if vertex >= 0:
         x0 = to_double(motion.x0[vertex])
         path = truncated_path(x0, to_double(step.vertices.x1[vertex]), times[entry])
-        ends[entry] = to_single(x0 + path)
-        velocities[entry] = to_single(path / step.dt)
+        paths.end[entry] = to_single(x0 + path)
+        paths.velocity[entry] = to_single(path / step.dt)
     elif body >= 0:
         start = motion.bodies.start[body]
         if record.kind[entry] == NO_CONTACT:
-            poses[entry] = start
-            twists[entry] = wp.spatial_vector()
+            paths.pose[entry] = start
+            paths.twist[entry] = wp.spatial_vector()
         else:
             share = share_before(times[entry])
             end = pose_between(motion.bodies, body, start, step.vertices.bodies.pose[body], share)
-            poses[entry] = end
-            twists[entry] = velocity_between(motion.bodies, body, start, end, step.dt)
+            paths.pose[entry] = end
+            paths.twist[entry] = velocity_between(motion.bodies, body, start, end, step.dt)
 
 
 @wp.func
@@ -391,28 +331,17 @@ def vertex_velocities(motion: Motion, vertices: Vertices, velocities: wp.array[w
 
 
 @wp.kernel
-def set_centres(
-    motion: Motion, poses: wp.array[wp.transform], centres: wp.array[wp.vec3d], inverse_inertias: wp.array[wp.mat33d]
-):
+def set_centres(motion: Motion, poses: wp.array[wp.transform], moved: MovedBodies):
     """Computes where impulses act on bodies in given poses, see :func:`.solve.bodies.move_to_end`."""
     body = wp.tid()
     if is_movable(motion, body):
-        centres[body] = centre_of(motion.bodies, body, poses[body])
-        inverse_inertias[body] = inverse_inertia_at(motion.bodies, body, poses[body])
+        moved.centre[body] = centre_of(motion.bodies, body, poses[body])
+        moved.inverse_inertia[body] = inverse_inertia_at(motion.bodies, body, poses[body])
 
 
 @wp.kernel
 def place_shape_vertices(
-    # in
-    motion: Motion,
-    bodies: wp.array[int],
-    positions: wp.array[wp.vec3],
-    particle_count: int,
-    dt: float,
-    # out
-    x0: wp.array[wp.vec3],
-    x1: wp.array[wp.vec3],
-    velocities: wp.array[wp.vec3],
+    motion: Motion, bodies: wp.array[int], positions: wp.array[wp.vec3], particle_count: int, dt: float
 ):
     """Computes the predicted motion of vertices of shapes from that of their bodies, see :mod:`.state.motion`."""
     i = wp.tid()
@@ -422,26 +351,19 @@ def place_shape_vertices(
         return
     start = wp.transform_point(motion.bodies.start[body], positions[i])
     end = wp.transform_point(motion.bodies.end[body], positions[i])
-    x0[vertex] = start
-    x1[vertex] = end
+    motion.x0[vertex] = start
+    motion.x1[vertex] = end
     if moves_with_body(motion, vertex):
-        velocities[vertex] = predicted_velocity(motion, vertex, end)
+        motion.velocity[vertex] = predicted_velocity(motion, vertex, end)
     else:
-        velocities[vertex] = (end - start) / dt
+        motion.velocity[vertex] = (end - start) / dt
 
 
 @wp.kernel
 def place_planes(
-    # in
-    motion: Motion,
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    bodies: wp.array[int],
-    # out
-    starts: wp.array[wp.vec4d],
-    ends: wp.array[wp.vec4d],
+    motion: Motion, points: wp.array[wp.vec3], normals: wp.array[wp.vec3], bodies: wp.array[int], planes: MovingPlanes
 ):
     """Computes the planes at the start and at the end of a step, see :mod:`.state.motion`."""
     i = wp.tid()
-    starts[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.start)
-    ends[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.end)
+    planes.start[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.start)
+    planes.end[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.end)

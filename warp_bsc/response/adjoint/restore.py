@@ -49,6 +49,31 @@ class RestoredStep:
 
 
 @wp.struct
+class Projection:
+    """The sweeps on positions, or those on velocities. Adjoints only read the gradients of changes."""
+
+    of_velocities: wp.bool
+    x: wp.array[wp.vec3]  # where impulses act [m]
+    multiplier: wp.array[wp.vec3d]
+    sums: wp.array2d[wp.int64]  # of what all sweeps changed vertices by
+    body_sums: wp.array2d[wp.int64]
+    multiplier_change: wp.array[wp.vec3d]  # by one sweep
+    previous_change: wp.array[wp.vec3d]  # of the multiplier without momentum
+    vertex_change: wp.array[wp.vec3]
+    body_change: wp.array[wp.spatial_vectord]
+
+
+@wp.struct
+class Paths:
+    """Truncated paths, by their places in the record."""
+
+    end: wp.array[wp.vec3]  # of a vertex [m]
+    velocity: wp.array[wp.vec3]
+    pose: wp.array[wp.transform]  # of a body, at the end
+    twist: wp.array[wp.spatial_vector]
+
+
+@wp.struct
 class BodyGradients:
     """Gradients with respect to bodies, and to changes of them by constraints, at the cursor."""
 
@@ -69,6 +94,33 @@ class Gradients:
     velocity_change: wp.array[wp.vec3]  # with respect to what constraints add to velocities
     on_bodies: wp.array[wp.vec3]  # with respect to positions or velocities of vertices of bodies
     bodies: BodyGradients
+
+
+@wp.struct
+class StateGradients:
+    """Gradients with respect to the states of a step: first its results, then what the inner solver predicted.
+
+    Those of the start are added to.
+    """
+
+    start_q: wp.array[wp.vec3]
+    particle_q: wp.array[wp.vec3]
+    particle_qd: wp.array[wp.vec3]
+    start_body_q: wp.array[wp.transform]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+
+
+@wp.struct
+class ModelGradients:
+    """Gradients of the model that a step adds to, as far as the model has them."""
+
+    particle_inv_mass: wp.array[float]
+    body_inv_mass: wp.array[float]
+    body_inv_inertia: wp.array[wp.mat33]
+    body_mass: wp.array[float]
+    body_inertia: wp.array[wp.mat33]
+    restitution: wp.array[float]
 
 
 class Move(enum.IntEnum):
@@ -98,17 +150,7 @@ def is_movable(motion: Motion, body: int) -> bool:
 
 @wp.kernel
 def begin_gradients(
-    # in
-    motion: Motion,
-    undetected: wp.array[int],
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    # out
-    gradients: Gradients,
-    x0: wp.array[wp.vec3],
-    starts: wp.array[wp.transform],
+    motion: Motion, undetected: wp.array[int], of_state: StateGradients, gradients: Gradients, of_motion: Motion
 ):
     """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
 
@@ -117,10 +159,10 @@ def begin_gradients(
     vertex = wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
-        pose = body_q[body]
-        twist = body_qd[body]
+        pose = of_state.body_q[body]
+        twist = of_state.body_qd[body]
         if undetected[0] == 1 and is_movable(motion, body):
-            starts[body] = pose
+            of_motion.bodies.start[body] = pose
             pose = wp.transform(wp.vec3(), wp.quat())
             twist = wp.spatial_vector()
         gradients.bodies.pose[body] = pose
@@ -128,12 +170,12 @@ def begin_gradients(
         return
     x1 = wp.vec3()
     velocity = wp.vec3()
-    if vertex < particle_q.shape[0]:
-        x1 = particle_q[vertex]
-        velocity = particle_qd[vertex]
-    x0[vertex] = wp.vec3()
+    if vertex < of_state.particle_q.shape[0]:
+        x1 = of_state.particle_q[vertex]
+        velocity = of_state.particle_qd[vertex]
+    of_motion.x0[vertex] = wp.vec3()
     if undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
-        x0[vertex] = x1
+        of_motion.x0[vertex] = x1
         x1 = wp.vec3()
         velocity = wp.vec3()
     gradients.x1[vertex] = x1
@@ -185,26 +227,17 @@ def _step_back(cursor: Cursor):
 
 
 @wp.kernel
-def restore_multipliers(
-    # in
-    step: RestoredStep,
-    x: wp.array[wp.vec3],
-    # in and out
-    multiplier: wp.array[wp.vec3d],
-    sums: wp.array2d[wp.int64],
-    body_sums: wp.array2d[wp.int64],
-):
-    """Restores multipliers as they were before a sweep, and the sums of what they changed, at positions ``x``."""
-    record = step.record
-    constraints = step.constraints
-    sweep = step.cursor.next_sweep[0]
+def restore_multipliers(step: RestoredStep, swept: Projection):
+    """Restores multipliers as they were before a sweep, and the sums of what they changed."""
+    record, constraints, sweep = step.record, step.constraints, step.cursor.next_sweep[0]
     entry = entry_of(record, sweep, wp.tid())
     if sweep < step.cursor.first_sweep[0] or entry < 0:
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
-    add_delta(step.motion, step.vertices, constraints, i, old - multiplier[i], x, sums, body_sums)
-    multiplier[i] = old
+    change = old - swept.multiplier[i]
+    add_delta(step.motion, step.vertices, constraints, i, change, swept.x, swept.sums, swept.body_sums)
+    swept.multiplier[i] = old
     constraints.previous_multiplier[i] = record.previous_multiplier[entry]
     count_active(step.motion, step.vertices, constraints, i)
 
@@ -251,29 +284,8 @@ def restore_velocities(step: RestoredStep, gradients: Gradients):
 
 
 @wp.kernel
-def restore_unturned(motion: Motion, vertices: Vertices):
-    """Restores velocities as they were before the turn that restores angular momentum, over vertices and bodies."""
-    vertex = wp.tid()
-    body = vertex - motion.x0.shape[0]
-    if body >= 0:
-        change_body_velocity(motion, vertices, body)
-    else:
-        change_velocity(motion, vertices, vertex)
-
-
-@wp.kernel
-def restore_paths(
-    # in
-    step: RestoredStep,
-    # in and out
-    gradients: Gradients,
-    # out
-    end: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    pose: wp.array[wp.transform],
-    twist: wp.array[wp.spatial_vector],
-):
-    """Restores paths before truncation; the gradients of their vertices and bodies move to the last four arguments."""
+def restore_paths(step: RestoredStep, gradients: Gradients, of_paths: Paths):
+    """Restores paths before truncation; the gradients of their vertices and bodies move to ``of_paths``."""
     record = step.record
     entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
     if entry < 0:
@@ -281,14 +293,14 @@ def restore_paths(
     vertex = record.vertex[entry]
     body = record.body[entry]
     if vertex >= 0:
-        end[entry] = gradients.x1[vertex]
-        velocity[entry] = gradients.velocity[vertex]
+        of_paths.end[entry] = gradients.x1[vertex]
+        of_paths.velocity[entry] = gradients.velocity[vertex]
         gradients.x1[vertex] = wp.vec3()
         gradients.velocity[vertex] = wp.vec3()
         step.vertices.x1[vertex] = record.end[entry]
     elif body >= 0:
-        pose[entry] = gradients.bodies.pose[body]
-        twist[entry] = gradients.bodies.velocity[body]
+        of_paths.pose[entry] = gradients.bodies.pose[body]
+        of_paths.twist[entry] = gradients.bodies.velocity[body]
         gradients.bodies.pose[body] = wp.transform(wp.vec3(), wp.quat())
         gradients.bodies.velocity[body] = wp.spatial_vector()
         step.vertices.bodies.pose[body] = record.pose[entry]
@@ -317,22 +329,12 @@ def _missing(complete: wp.array[int]) -> float:
 
 @wp.kernel
 def finish_gradients(
-    # in
     motion: Motion,
     gradients: Gradients,
     complete: wp.array[int],
-    x0: wp.array[wp.vec3],
-    inverse_mass: wp.array[float],
-    # in and out
-    predicted_x1: wp.array[wp.vec3],
-    predicted_velocity: wp.array[wp.vec3],
-    friction: wp.array[float],
-    start_q: wp.array[wp.vec3],
-    particle_inv_mass: wp.array[float],
-    restitution: wp.array[float],
-    # out
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
+    of_motion: Motion,
+    of_state: StateGradients,
+    of_model: ModelGradients,
 ):
     """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
 
@@ -340,40 +342,31 @@ def finish_gradients(
     """
     particle = wp.tid()
     missing = _missing(complete)
-    x1 = gradients.x1[particle] + gradients.more_x1[particle] + predicted_x1[particle]
-    velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + predicted_velocity[particle]
-    friction[particle] = friction[particle] + missing
-    if particle == 0 and restitution:
-        restitution[0] = restitution[0] + missing
-    if particle >= particle_q.shape[0]:
-        predicted_x1[particle] = x1
-        predicted_velocity[particle] = velocity
+    x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
+    velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
+    of_motion.friction[particle] += missing
+    if particle == 0 and of_model.restitution:
+        of_model.restitution[0] += missing
+    if particle >= of_state.particle_q.shape[0]:
+        of_motion.x1[particle] = x1
+        of_motion.velocity[particle] = velocity
         return
-    if particle_inv_mass and motion.inverse_mass[particle] > 0.0:
-        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle] + missing
-    particle_q[particle] = x1 + wp.vec3(missing)
-    particle_qd[particle] = velocity + wp.vec3(missing)
-    start_q[particle] = start_q[particle] + x0[particle] + wp.vec3(missing)
+    masses = of_model.particle_inv_mass
+    if masses and motion.inverse_mass[particle] > 0.0:
+        masses[particle] = masses[particle] + of_motion.inverse_mass[particle] + missing
+    of_state.particle_q[particle] = x1 + wp.vec3(missing)
+    of_state.particle_qd[particle] = velocity + wp.vec3(missing)
+    of_state.start_q[particle] = of_state.start_q[particle] + of_motion.x0[particle] + wp.vec3(missing)
 
 
 @wp.kernel
 def finish_body_gradients(
-    # in
     motion: Motion,
-    gradients: BodyGradients,
+    gradients: Gradients,
     complete: wp.array[int],
-    motion_starts: wp.array[wp.transform],
-    motion_ends: wp.array[wp.transform],
-    motion_velocities: wp.array[wp.spatial_vector],
-    motion_inverse_masses: wp.array[float],
-    # in and out
-    starts: wp.array[wp.transform],
-    ends: wp.array[wp.transform],
-    velocities: wp.array[wp.spatial_vector],
-    inverse_masses: wp.array[float],
-    inverse_inertias: wp.array[wp.mat33],
-    masses: wp.array[float],
-    inertias: wp.array[wp.mat33],
+    of_motion: Motion,
+    of_state: StateGradients,
+    of_model: ModelGradients,
 ):
     """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
 
@@ -381,26 +374,27 @@ def finish_body_gradients(
     """
     body = wp.tid()
     missing = _missing(complete)
-    start = starts[body] + motion_starts[body]
-    end = motion_ends[body]
+    start = of_state.start_body_q[body] + of_motion.bodies.start[body]
+    end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:
-        velocity = gradients.velocity[body] + motion_velocities[body]
+        velocity = gradients.bodies.velocity[body] + of_motion.bodies.velocity[body]
         for i in range(6):
             velocity[i] = velocity[i] + missing
-        velocities[body] = velocity
+        of_state.body_qd[body] = velocity
         if is_movable(motion, body):
-            if inverse_masses:
-                inverse_masses[body] = inverse_masses[body] + motion_inverse_masses[body] + missing
-            if inverse_inertias:
-                inverse_inertias[body] = inverse_inertias[body] + missing * wp.identity(3, dtype=float)
+            masses = of_model.body_inv_mass
             if masses:
-                masses[body] = masses[body] + missing
-            if inertias:
-                inertias[body] = inertias[body] + missing * wp.identity(3, dtype=float)
+                masses[body] = masses[body] + of_motion.bodies.inverse_mass[body] + missing
+            if of_model.body_inv_inertia:
+                of_model.body_inv_inertia[body] += missing * wp.identity(3, dtype=float)
+            if of_model.body_mass:
+                of_model.body_mass[body] += missing
+            if of_model.body_inertia:
+                of_model.body_inertia[body] += missing * wp.identity(3, dtype=float)
     else:
-        end = end + ends[body]
+        end = end + of_state.body_q[body]
     for i in range(7):
         start[i] = start[i] + missing
         end[i] = end[i] + missing
-    starts[body] = start
-    ends[body] = end
+    of_state.start_body_q[body] = start
+    of_state.body_q[body] = end

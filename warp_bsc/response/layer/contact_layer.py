@@ -26,7 +26,7 @@ from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ..adjoint.arrays import attach_gradients, launch_adjoint
+from ..adjoint.arrays import attach_gradients, copied, launch_adjoint
 from ..contacts.queue import PairQueue, queues_of
 from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
@@ -35,20 +35,7 @@ from ..state.motion import ModelMotion
 from ..state.planes import MovingPlanes
 from ..state.structs import Motion
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
-from .kernels import (
-    Layer,
-    add_pushes,
-    add_pushes_of_planes,
-    add_shares,
-    add_shares_of_planes,
-    begin_backward,
-    finish_backward,
-    finish_shares,
-    move_particles,
-    place_vertices_between,
-    sum_pushes,
-    sum_shares,
-)
+from . import kernels
 
 
 @dataclass(frozen=True)
@@ -124,19 +111,12 @@ class ContactLayer(WrappedSolver):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        options = StageOptions.of(
-            self.model,
-            friction=friction,
-            restitution=restitution,
-            min_distance=min_distance,
-            particle_radius=particle_radius,
-        )
+        given = {"friction": friction, "restitution": restitution}
+        given |= {"min_distance": min_distance, "particle_radius": particle_radius}
+        options = StageOptions.of(self.model, **given)
         self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
-        self.friction, self.restitution, self._reads_friction = (
-            options.friction,
-            options.restitution,
-            options.reads_friction,
-        )
+        self.friction, self.restitution = options.friction, options.restitution
+        self._reads_friction = options.reads_friction
         if thickness is None:
             lengths = particle_edge_lengths(mesh)
             shares = np.array(LAYER_THICKNESS) * ((np.median(lengths), lengths.min()) if len(lengths) else (1.0, 1.0))
@@ -144,7 +124,7 @@ class ContactLayer(WrappedSolver):
         self.thickness = checked_distance(thickness, "thickness", zero=False)
         moves_bodies = options.moves_bodies(mesh, solver)
         self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
-        self._layer = layer = Layer()
+        self._layer = layer = kernels.Layer()
         layer.thickness, layer.restitution = self.thickness, self.restitution
         layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
         device = mesh.device
@@ -235,7 +215,7 @@ class ContactLayer(WrappedSolver):
     def _detect(self):
         """Finds the pairs that may be in the layer."""
         detector = self._detector
-        self._launch(place_vertices_between, len(self._y), [self._motion.vertices, self._layer, self._y])
+        self._launch(kernels.place_vertices_between, len(self._y), [self._motion.vertices, self._layer, self._y])
         retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self.mesh.device)
 
     @one_at_a_time
@@ -248,14 +228,14 @@ class ContactLayer(WrappedSolver):
         motion, planes, layer, detector = self._motion.vertices, self._motion.planes, self._layer, self._detector
         pairs = queues_of(detector)
         for of_kind in pairs:
-            self._launch_over(sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
+            self._launch_over(kernels.sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
         inputs = [motion, planes, layer, detector.counters.array, detector.capacities]
-        self._launch(finish_shares, len(motion.x1), [*inputs, self._share_sums, self._shares, self.skipped])
+        self._launch(kernels.finish_shares, len(motion.x1), [*inputs, self._share_sums, self._shares, self.skipped])
         for of_kind in pairs:
-            self._launch_over(sum_pushes, of_kind, [motion, layer, of_kind, self._shares, self._sums])
+            self._launch_over(kernels.sum_pushes, of_kind, [motion, layer, of_kind, self._shares, self._sums])
         step = self._recorded(pairs, dt) if record else None
         inputs = [motion, planes, layer, self._shares, dt, self._sums]
-        self._launch(move_particles, len(end.particle_q), [*inputs, end.particle_q, end.particle_qd])
+        self._launch(kernels.move_particles, len(end.particle_q), [*inputs, end.particle_q, end.particle_qd])
         return step
 
     def _backward(self, step, start_q, particle_q, particle_qd):
@@ -266,49 +246,39 @@ class ContactLayer(WrappedSolver):
         """
         motion, planes, layer, device = step.motion, step.planes, self._layer, self.mesh.device
         n, particles = len(motion.x0), len(particle_q)
-        of_changes, changes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
-        self._launch(begin_backward, particles, [motion.is_not_finite, step.dt, particle_q, particle_qd, of_changes])
+        of_changes = wp.zeros(n, dtype=wp.vec3, device=device)
+        inputs = [motion.is_not_finite, step.dt, particle_q, particle_qd, of_changes]
+        self._launch(kernels.begin_backward, particles, inputs)
         of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
         of_planes = attach_gradients(planes, ("friction",))
-        shares = step.shares[:]
-        shares.grad = of_shares = wp.zeros(n, dtype=wp.float64, device=device)
-        sums = wp.zeros(n, dtype=wp.float64, device=device)
-        over_planes = (particles, len(planes.end))
-        for of_kind in step.pairs:
-            inputs = [motion, layer, of_kind, shares]
-            launch_adjoint(add_pushes, len(of_kind.pairs), inputs, [changes], [of_changes], device)
-        inputs = [motion, planes, layer, shares]
-        launch_adjoint(add_pushes_of_planes, over_planes, inputs, [changes], [of_changes], device)
-        for of_kind in step.pairs:
-            inputs = [motion, layer, of_kind]
-            launch_adjoint(add_shares, len(of_kind.pairs), inputs, [sums], [of_shares], device)
-        launch_adjoint(add_shares_of_planes, over_planes, [motion, planes, layer], [sums], [of_shares], device)
+        shares, of_shares = step.shares[:], wp.zeros(n, dtype=wp.float64, device=device)
+        shares.grad = of_shares
+        over_planes, of_planes_only = (particles, len(planes.end)), [motion, planes, layer]
+        for queue in step.pairs:
+            inputs = [motion, layer, queue, shares]
+            launch_adjoint(kernels.add_pushes, len(queue.pairs), inputs, [of_changes], device)
+        inputs = [*of_planes_only, shares]
+        launch_adjoint(kernels.add_pushes_of_planes, over_planes, inputs, [of_changes], device)
+        for queue in step.pairs:
+            launch_adjoint(kernels.add_shares, len(queue.pairs), [motion, layer, queue], [of_shares], device)
+        launch_adjoint(kernels.add_shares_of_planes, over_planes, of_planes_only, [of_shares], device)
         inverse_mass = self.model.particle_inv_mass
         assert inverse_mass is not None
         inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
-        self._launch(finish_backward, particles, [*inputs, start_q, particle_q, inverse_mass.grad])
+        self._launch(kernels.finish_backward, particles, [*inputs, start_q, particle_q, inverse_mass.grad])
         self._motion.friction.backward(of_motion.friction, of_planes.friction)
 
     def _recorded(self, pairs, dt):
         """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
-            copy = PairQueue()
-            copy.kind, copy.count, copy.elements = of_kind.kind, of_kind.count, of_kind.elements
             count = len(of_kind.pairs)
             if not self.mesh.device.is_capturing:
                 count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
             if count:
-                copy.pairs, copy.counts = wp.clone(of_kind.pairs[:count]), wp.clone(of_kind.counts)
-                copies.append(copy)
-        motion, planes = Motion(), MovingPlanes()
-        for name in ("x0", "x1", "is_not_finite", "friction"):
-            setattr(motion, name, wp.clone(getattr(self._motion.vertices, name)))
-        for name in ("inverse_mass", "world"):
-            setattr(motion, name, getattr(self._motion.vertices, name))
-        for name in MovingPlanes.vars:
-            array = getattr(self._motion.planes, name)
-            setattr(planes, name, wp.clone(array) if name in ("start", "end", "friction") else array)
+                copies.append(copied(of_kind, {"pairs": count, "counts": None}))
+        motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
+        planes = copied(self._motion.planes, ("start", "end", "friction"))
         return _PushedStep(motion, planes, copies, wp.clone(self._shares), dt)
 
     def _launch(self, kernel, size, inputs):
