@@ -111,9 +111,13 @@ class ContactLayer(WrappedSolver):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        given = {"friction": friction, "restitution": restitution}
-        given |= {"min_distance": min_distance, "particle_radius": particle_radius}
-        options = StageOptions.of(self.model, **given)
+        options = StageOptions.of(
+            self.model,
+            friction=friction,
+            restitution=restitution,
+            min_distance=min_distance,
+            particle_radius=particle_radius,
+        )
         self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
         self.friction, self.restitution = options.friction, options.restitution
         self._reads_friction = options.reads_friction
