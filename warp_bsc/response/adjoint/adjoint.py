@@ -127,7 +127,8 @@ class StepAdjoint:
         self._sums.grad = of_bodies.shift
         self._times = wp.zeros(self._truncations, dtype=wp.float64, device=device)
         self._times.grad = wp.zeros_like(self._times)
-        self._of_paths = allocate(restore.Paths, self._truncations, device)
+        self._paths = allocate(restore.Paths, self._truncations, device)
+        self._of_paths = attach_gradients(self._paths, restore.Paths.vars)
         status = copied(work.status, ())
         status.loop = allocate(LoopControl, 1, device)
         step.motion, step.planes, step.vertices, step.constraints = motion, planes, moved, constraints
@@ -263,11 +264,11 @@ class StepAdjoint:
 
     def _through_truncation(self):
         """Goes back through the truncation of paths."""
-        step, times, of_paths, count = self._step, self._times, self._of_paths, self._truncations
-        self._launch(restore.restore_paths, count, step, self._gradients, of_paths)
+        step, times, count = self._step, self._times, self._truncations
+        self._launch(restore.restore_paths, count, step, self._gradients, self._of_paths)
         self._place()
         self._launch(kernels.find_truncation_times, count, step, times)
-        self._launch_adjoint(kernels.truncate_paths, count, [step, times], [of_paths])
+        self._launch_adjoint(kernels.truncate_paths, count, [step, times, self._paths])
         self._launch_adjoint(kernels.find_truncation_times, count, [step, times])
 
     def _through_placement(self, kernel, *inputs):

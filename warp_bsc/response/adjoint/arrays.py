@@ -33,7 +33,7 @@ def attach_gradients(struct, names=(), **gradients):
         setattr(into, name, gradient)
         if len(array):
             alias = array[:]
-            alias.grad = gradient
+            alias.grad, alias.retain_grad = gradient, True  # which a store would clear
             setattr(struct, name, alias)
     return into
 

@@ -13,8 +13,6 @@ little less than one, so that some hundredths more of the speed come back. Frict
 fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable.
 """
 
-from dataclasses import dataclass
-
 import newton
 import numpy as np
 import warp as wp
@@ -32,29 +30,8 @@ from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion
-from ..state.planes import MovingPlanes
-from ..state.structs import Motion
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from . import kernels
-
-
-@dataclass(frozen=True)
-class _PushedStep:
-    """What the adjoint needs of a step.
-
-    Attributes:
-        motion: The predicted motion.
-        planes: The planes.
-        pairs: The pairs that may be in the layer, of each kind.
-        shares: The sums of the weights of the contacts of each vertex.
-        dt: Length of the step [s].
-    """
-
-    motion: Motion
-    planes: MovingPlanes
-    pairs: list[PairQueue]
-    shares: wp.array
-    dt: float
 
 
 class ContactLayer(WrappedSolver):
@@ -128,8 +105,9 @@ class ContactLayer(WrappedSolver):
         self.thickness = checked_distance(thickness, "thickness", zero=False)
         moves_bodies = options.moves_bodies(mesh, solver)
         self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
-        self._layer = layer = kernels.Layer()
+        layer = kernels.Layer()
         layer.thickness, layer.restitution = self.thickness, self.restitution
+        layer.motion, layer.planes = self._motion.vertices, self._motion.planes
         layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
         device = mesh.device
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
@@ -137,7 +115,8 @@ class ContactLayer(WrappedSolver):
         n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
         self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
-        self._shares = wp.zeros(n, dtype=wp.float64, device=device)
+        layer.shares = wp.zeros(n, dtype=wp.float64, device=device)
+        self._layer = layer
         self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
         self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
         self._motion.set_start(self.model.particle_q, self.model.body_q)
@@ -200,7 +179,7 @@ class ContactLayer(WrappedSolver):
             arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
             read = [self._motion.friction.of_particles, self._motion.friction.of_shapes, self.restitution]
             read = [a for a in [*read, self.model.particle_inv_mass] if a is not None and len(a) and a.requires_grad]
-            pushed: _PushedStep | None = None
+            pushed: tuple[kernels.Layer, list[PairQueue]] | None = None
 
             def forward():
                 nonlocal pushed
@@ -208,7 +187,7 @@ class ContactLayer(WrappedSolver):
 
             def backward():
                 with self._lock:
-                    self._backward(pushed, *(array.grad for array in arrays))
+                    self._backward(*pushed, *(array.grad for array in arrays))
 
             run_on_host(forward, device)
             tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
@@ -219,7 +198,7 @@ class ContactLayer(WrappedSolver):
     def _detect(self):
         """Finds the pairs that may be in the layer."""
         detector = self._detector
-        self._launch(kernels.place_vertices_between, len(self._y), [self._motion.vertices, self._layer, self._y])
+        self._launch(kernels.place_vertices_between, len(self._y), [self._layer, self._y])
         retry_until_fits(lambda: detector.find_contacts(self._y, self._y), detector, self.mesh.device)
 
     @one_at_a_time
@@ -229,51 +208,55 @@ class ContactLayer(WrappedSolver):
             self._motion.friction.read()
         self._set_end(end, dt)
         self._detect()
-        motion, planes, layer, detector = self._motion.vertices, self._motion.planes, self._layer, self._detector
+        layer, detector = self._layer, self._detector
+        layer.dt = dt
         pairs = queues_of(detector)
         for of_kind in pairs:
-            self._launch_over(kernels.sum_shares, of_kind, [motion, layer, of_kind, self._share_sums])
-        inputs = [motion, planes, layer, detector.counters.array, detector.capacities]
-        self._launch(kernels.finish_shares, len(motion.x1), [*inputs, self._share_sums, self._shares, self.skipped])
+            self._launch_over(kernels.sum_shares, of_kind, [layer, of_kind, self._share_sums])
+        inputs = [layer, detector.counters.array, detector.capacities, self._share_sums, self.skipped]
+        self._launch(kernels.finish_shares, len(self._y), inputs)
         for of_kind in pairs:
-            self._launch_over(kernels.sum_pushes, of_kind, [motion, layer, of_kind, self._shares, self._sums])
-        step = self._recorded(pairs, dt) if record else None
-        inputs = [motion, planes, layer, self._shares, dt, self._sums]
-        self._launch(kernels.move_particles, len(end.particle_q), [*inputs, end.particle_q, end.particle_qd])
-        return step
+            self._launch_over(kernels.sum_pushes, of_kind, [layer, of_kind, self._sums])
+        recorded = self._recorded(pairs) if record else None
+        inputs = [layer, self._sums, end.particle_q, end.particle_qd]
+        self._launch(kernels.move_particles, len(end.particle_q), inputs)
+        return recorded
 
-    def _backward(self, step, start_q, particle_q, particle_qd):
+    def _backward(self, layer, pairs, start_q, particle_q, particle_qd):
         """Turns gradients with respect to a pushed state into those with respect to the predicted one, in place.
 
         Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
         from, and of restitution, where these have such arrays.
+
+        Args:
+            layer: The layer as it was recorded.
+            pairs: The pairs that may be in it, of each kind.
+            start_q: Gradient with respect to positions at the start.
+            particle_q: Gradient with respect to the positions at the end.
+            particle_qd: Gradient with respect to the velocities at the end.
         """
-        motion, planes, layer, device = step.motion, step.planes, self._layer, self.mesh.device
-        n, particles = len(motion.x0), len(particle_q)
+        n, particles, device = len(layer.motion.x0), len(particle_q), self.mesh.device
         of_changes = wp.zeros(n, dtype=wp.vec3, device=device)
-        inputs = [motion.is_not_finite, step.dt, particle_q, particle_qd, of_changes]
-        self._launch(kernels.begin_backward, particles, inputs)
+        self._launch(kernels.begin_backward, particles, [layer, particle_q, particle_qd, of_changes])
+        layer, motion, planes = copied(layer, ()), copied(layer.motion, ()), copied(layer.planes, ())
         of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
         of_planes = attach_gradients(planes, ("friction",))
-        shares, of_shares = step.shares[:], wp.zeros(n, dtype=wp.float64, device=device)
-        shares.grad = of_shares
-        over_planes, of_planes_only = (particles, len(planes.end)), [motion, planes, layer]
-        for queue in step.pairs:
-            inputs = [motion, layer, queue, shares]
-            launch_adjoint(kernels.add_pushes, len(queue.pairs), inputs, [of_changes], device)
-        inputs = [*of_planes_only, shares]
-        launch_adjoint(kernels.add_pushes_of_planes, over_planes, inputs, [of_changes], device)
-        for queue in step.pairs:
-            launch_adjoint(kernels.add_shares, len(queue.pairs), [motion, layer, queue], [of_shares], device)
-        launch_adjoint(kernels.add_shares_of_planes, over_planes, of_planes_only, [of_shares], device)
+        of_shares = attach_gradients(layer, ("shares",)).shares
+        layer.motion, layer.planes = motion, planes
+        over_planes = (particles, len(planes.end))
+        for queue in pairs:
+            launch_adjoint(kernels.add_pushes, len(queue.pairs), [layer, queue], [of_changes], device)
+        launch_adjoint(kernels.add_pushes_of_planes, over_planes, [layer], [of_changes], device)
+        for queue in pairs:
+            launch_adjoint(kernels.add_shares, len(queue.pairs), [layer, queue], [of_shares], device)
+        launch_adjoint(kernels.add_shares_of_planes, over_planes, [layer], [of_shares], device)
         inverse_mass = self.model.particle_inv_mass
         assert inverse_mass is not None
-        inputs = [of_motion.x0, of_motion.x1, of_motion.inverse_mass]
-        self._launch(kernels.finish_backward, particles, [*inputs, start_q, particle_q, inverse_mass.grad])
+        self._launch(kernels.finish_backward, particles, [of_motion, start_q, particle_q, inverse_mass.grad])
         self._motion.friction.backward(of_motion.friction, of_planes.friction)
 
-    def _recorded(self, pairs, dt):
-        """Copies what the adjoint of a step needs; in a CUDA graph, all of the queues."""
+    def _recorded(self, pairs):
+        """Copies the layer and the pairs that may be in it for the adjoint; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
             count = len(of_kind.pairs)
@@ -281,9 +264,10 @@ class ContactLayer(WrappedSolver):
                 count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
             if count:
                 copies.append(copied(of_kind, {"pairs": count, "counts": None}))
-        motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
-        planes = copied(self._motion.planes, ("start", "end", "friction"))
-        return _PushedStep(motion, planes, copies, wp.clone(self._shares), dt)
+        layer = copied(self._layer, ("shares",))
+        layer.motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
+        layer.planes = copied(self._motion.planes, ("start", "end", "friction"))
+        return layer, copies
 
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)

@@ -22,11 +22,15 @@ _ROOT_OF_2 = wp.constant(2.0**0.5)
 
 @wp.struct
 class Layer:
-    """Thickness, minimum distances and restitution of the layer."""
+    """The layer around a predicted motion."""
 
+    motion: Motion
+    planes: MovingPlanes
     thickness: wp.float64  # [m]
     distances: MinDistances  # of pairs [m]
     restitution: wp.array[float]  # in [0, 1]
+    shares: wp.array[wp.float64]  # of vertices, summed over contacts, see _share_of
+    dt: float  # length of the step [s]
 
 
 @wp.func
@@ -45,21 +49,22 @@ def _gains(restitution: float):
 
 
 @wp.func
-def _between(x0: wp.vec3, x1: wp.vec3, theta: wp.float64) -> wp.vec3d:
-    return to_double(x1) + theta * (to_double(x0) - to_double(x1))
+def _between(motion: Motion, vertex: int, theta: wp.float64) -> wp.vec3d:
+    x1 = to_double(motion.x1[vertex])
+    return x1 + theta * (to_double(motion.x0[vertex]) - x1)
 
 
 @wp.func
-def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i):
+def _contact_of_pair(layer: Layer, kind: int, corners: wp.vec4i):
     """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not.
 
     Elements are in contact only if they are on the same sides of each other as at the start: not if they have passed.
     """
     _kappa, theta = _gains(layer.restitution[0])
-    a = _between(motion.x0[corners[0]], motion.x1[corners[0]], theta)
-    b = _between(motion.x0[corners[1]], motion.x1[corners[1]], theta)
-    c = _between(motion.x0[corners[2]], motion.x1[corners[2]], theta)
-    d = _between(motion.x0[corners[3]], motion.x1[corners[3]], theta)
+    a = _between(layer.motion, corners[0], theta)
+    b = _between(layer.motion, corners[1], theta)
+    c = _between(layer.motion, corners[2], theta)
+    d = _between(layer.motion, corners[3], theta)
     weights = closest_weights(kind, a, b, c, d)
     vector = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
     distance = wp.length(vector)
@@ -67,9 +72,9 @@ def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i)
     if depth <= ZERO or distance <= ZERO:
         return weights, vector, ZERO
     normal = vector / distance
-    if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(motion, corners):
+    if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(layer.motion, corners):
         return weights, normal, ZERO
-    _weights, at_start = closest_vector(motion, corners, kind)
+    _weights, at_start = closest_vector(layer.motion, corners, kind)
     if not wp.dot(normal, at_start) > ZERO:  # nor if it is not a number
         return weights, normal, ZERO
     if kind == EDGE_EDGE:
@@ -81,8 +86,9 @@ def _contact_of_pair(motion: Motion, layer: Layer, kind: int, corners: wp.vec4i)
 
 
 @wp.func
-def _contact_with_plane(motion: Motion, planes: MovingPlanes, layer: Layer, plane: int, vertex: int):
+def _contact_with_plane(layer: Layer, plane: int, vertex: int):
     """Returns the normal of a contact of a vertex with a plane, and its depth in the layer [m], 0 if it is not."""
+    motion, planes = layer.motion, layer.planes
     _kappa, theta = _gains(layer.restitution[0])
     end = planes.end[plane]
     normal = wp.vec3d(end[0], end[1], end[2])
@@ -104,10 +110,10 @@ def _share_of(layer: Layer, depth: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _shares_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int):
+def _shares_of_pair(layer: Layer, queue: PairQueue, i: int):
     """Returns the four vertices of a pair, and its shares of their masses, 0 if it is not in contact."""
     corners = vertices_of(queue, i)
-    weights, _normal, depth = _contact_of_pair(motion, layer, queue.kind, corners)
+    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
     shares = wp.vec4d()
     if depth > ZERO:
         for j in range(4):
@@ -117,24 +123,12 @@ def _shares_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int):
 
 @wp.func
 def _push(
-    motion: Motion,
-    layer: Layer,
-    normal: wp.vec3d,
-    depth: wp.float64,
-    path: wp.vec3d,
-    resistance: wp.float64,
-    friction: float,
+    layer: Layer, normal: wp.vec3d, depth: wp.float64, path: wp.vec3d, resistance: wp.float64, friction: float
 ) -> wp.vec3d:
     """Returns the push of a contact, an impulse times a time [kg m].
 
-    Args:
-        motion: The motion.
-        layer: The layer.
-        normal: The normal.
-        depth: The depth [m].
-        path: Of the first contact point relative to the second [m].
-        resistance: The sum over its vertices of inverse mass, weight, and the shares of all contacts [1/kg].
-        friction: The coefficient.
+    Its first contact point moves along ``path`` relative to the second [m]. The ``resistance`` is the sum over its
+    vertices of inverse mass, weight, and the shares of all contacts [1/kg].
     """
     kappa, _theta = _gains(layer.restitution[0])
     part = _share_of(layer, depth) / resistance  # the mass that the vertices have for this contact
@@ -148,14 +142,15 @@ def _push(
 
 
 @wp.func
-def _push_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int, shares: wp.array[wp.float64]):
+def _push_of_pair(layer: Layer, queue: PairQueue, i: int):
     """Returns the four vertices of a pair, how much its push moves each [1/kg], and the push, 0 if there is none."""
+    motion = layer.motion
     corners = vertices_of(queue, i)
-    weights, normal, depth = _contact_of_pair(motion, layer, queue.kind, corners)
+    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
     resistance = ZERO
     for j in range(4):
         vertex = corners[j]
-        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
+        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
     mobilities = wp.vec4d()
     if depth <= ZERO or resistance <= ZERO:
         return corners, mobilities, wp.vec3d()
@@ -164,136 +159,116 @@ def _push_of_pair(motion: Motion, layer: Layer, queue: PairQueue, i: int, shares
         vertex = corners[j]
         path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    push = _push(motion, layer, normal, depth, path, resistance, friction)
+    push = _push(layer, normal, depth, path, resistance, friction)
     for j in range(4):
         mobilities[j] = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
     return corners, mobilities, push
 
 
 @wp.func
-def _change_by_plane(
-    motion: Motion, planes: MovingPlanes, layer: Layer, plane: int, vertex: int, shares: wp.array[wp.float64]
-) -> wp.vec3d:
+def _change_by_plane(layer: Layer, plane: int, vertex: int) -> wp.vec3d:
     """Returns what the push of a plane moves a vertex by [m], 0 if there is none."""
-    normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
-    resistance = wp.float64(motion.inverse_mass[vertex]) * shares[vertex]
+    motion = layer.motion
+    normal, depth = _contact_with_plane(layer, plane, vertex)
+    resistance = wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
     if depth <= ZERO or resistance <= ZERO:
         return wp.vec3d()
     path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
-    friction = contact_friction(motion.friction[vertex], planes.friction[plane])
-    return wp.float64(motion.inverse_mass[vertex]) * _push(motion, layer, normal, depth, path, resistance, friction)
+    friction = contact_friction(motion.friction[vertex], layer.planes.friction[plane])
+    return wp.float64(motion.inverse_mass[vertex]) * _push(layer, normal, depth, path, resistance, friction)
 
 
 @wp.kernel(enable_backward=False)
-def place_vertices_between(motion: Motion, layer: Layer, y: wp.array[wp.vec3]):
+def place_vertices_between(layer: Layer, y: wp.array[wp.vec3]):
     """Writes the positions at which contacts act, to which the detection is near enough in single precision."""
     vertex = wp.tid()
     _kappa, theta = _gains(layer.restitution[0])
-    y[vertex] = to_single(_between(motion.x0[vertex], motion.x1[vertex], theta))
+    y[vertex] = to_single(_between(layer.motion, vertex, theta))
 
 
 @wp.kernel(enable_backward=False)
-def sum_shares(motion: Motion, layer: Layer, queue: PairQueue, sums: wp.array[wp.int64]):
+def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64]):
     """Adds the shares of contacts to the sums of their vertices."""
     i = wp.tid()
     if has_pair(queue, i):
-        corners, shares = _shares_of_pair(motion, layer, queue, i)
+        corners, shares = _shares_of_pair(layer, queue, i)
         for j in range(4):
             wp.atomic_add(sums, corners[j], to_units(shares[j]))
 
 
 @wp.kernel
-def add_shares(motion: Motion, layer: Layer, queue: PairQueue, sums: wp.array[wp.float64]):
+def add_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.float64]):
     """Adds as :func:`sum_shares`, differentiably."""
     i = wp.tid()
     if has_pair(queue, i):
-        corners, shares = _shares_of_pair(motion, layer, queue, i)
+        corners, shares = _shares_of_pair(layer, queue, i)
         for j in range(4):
             wp.atomic_add(sums, corners[j], shares[j])
 
 
 @wp.kernel(enable_backward=False)
 def finish_shares(
-    # in
-    motion: Motion,
-    planes: MovingPlanes,
     layer: Layer,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     # in and out
     sums: wp.array[wp.int64],
-    # out
-    shares: wp.array[wp.float64],
     layerless_steps: wp.array[wp.int64],
 ):
     """Adds the shares of contacts with planes, and writes the sums; zeros if pairs are missing: then nothing pushes."""
     vertex = wp.tid()
     share = from_units(sums[vertex])
     sums[vertex] = wp.int64(0)
-    for plane in range(planes.end.shape[0]):
-        _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+    for plane in range(layer.planes.end.shape[0]):
+        _normal, depth = _contact_with_plane(layer, plane, vertex)
         share += _share_of(layer, depth)
     if has_overflowed(counts, capacities):
         share = ZERO
         if vertex == 0:
             layerless_steps[0] += wp.int64(1)
-    shares[vertex] = share
+    layer.shares[vertex] = share
 
 
 @wp.kernel
-def add_shares_of_planes(motion: Motion, planes: MovingPlanes, layer: Layer, sums: wp.array[wp.float64]):
+def add_shares_of_planes(layer: Layer, sums: wp.array[wp.float64]):
     """Adds as :func:`finish_shares`, differentiably, with a thread for each vertex and plane."""
     vertex, plane = wp.tid()
-    _normal, depth = _contact_with_plane(motion, planes, layer, plane, vertex)
+    _normal, depth = _contact_with_plane(layer, plane, vertex)
     wp.atomic_add(sums, vertex, _share_of(layer, depth))
 
 
 @wp.kernel(enable_backward=False)
-def sum_pushes(
-    motion: Motion, layer: Layer, queue: PairQueue, shares: wp.array[wp.float64], sums: wp.array2d[wp.int64]
-):
+def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64]):
     """Adds what contacts move vertices by to the sums of these."""
     i = wp.tid()
     if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(motion, layer, queue, i, shares)
+        corners, mobilities, push = _push_of_pair(layer, queue, i)
         for j in range(4):
             add_to_sum(sums, corners[j], 0, mobilities[j] * push)
 
 
 @wp.kernel
-def add_pushes(
-    motion: Motion, layer: Layer, queue: PairQueue, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
-):
+def add_pushes(layer: Layer, queue: PairQueue, changes: wp.array[wp.vec3]):
     """Adds as :func:`sum_pushes`, differentiably."""
     i = wp.tid()
     if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(motion, layer, queue, i, shares)
+        corners, mobilities, push = _push_of_pair(layer, queue, i)
         for j in range(4):
             wp.atomic_add(changes, corners[j], to_single(mobilities[j] * push))
 
 
 @wp.kernel(enable_backward=False)
 def move_particles(
-    # in
-    motion: Motion,
-    planes: MovingPlanes,
-    layer: Layer,
-    shares: wp.array[wp.float64],
-    dt: float,
-    # in and out
-    sums: wp.array2d[wp.int64],
-    # out
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
+    layer: Layer, sums: wp.array2d[wp.int64], particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3]
 ):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
-    vertex = wp.tid()
-    for plane in range(planes.end.shape[0]):
-        add_to_sum(sums, vertex, 0, _change_by_plane(motion, planes, layer, plane, vertex, shares))
+    motion, vertex = layer.motion, wp.tid()
+    for plane in range(layer.planes.end.shape[0]):
+        add_to_sum(sums, vertex, 0, _change_by_plane(layer, plane, vertex))
     change = sum_of(sums, vertex, 0)
     if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
-        motion.velocity[vertex] += to_single(change / wp.float64(dt))
+        motion.velocity[vertex] += to_single(change / wp.float64(layer.dt))
         particle_q[vertex] = motion.x1[vertex]
         particle_qd[vertex] = motion.velocity[vertex]
     for axis in range(3):
@@ -301,40 +276,29 @@ def move_particles(
 
 
 @wp.kernel
-def add_pushes_of_planes(
-    motion: Motion, planes: MovingPlanes, layer: Layer, shares: wp.array[wp.float64], changes: wp.array[wp.vec3]
-):
+def add_pushes_of_planes(layer: Layer, changes: wp.array[wp.vec3]):
     """Adds as :func:`move_particles`, differentiably, with a thread for each particle and plane."""
     vertex, plane = wp.tid()
-    wp.atomic_add(changes, vertex, to_single(_change_by_plane(motion, planes, layer, plane, vertex, shares)))
+    wp.atomic_add(changes, vertex, to_single(_change_by_plane(layer, plane, vertex)))
 
 
 @wp.kernel(enable_backward=False)
 def begin_backward(
-    is_not_finite: wp.array[int],
-    dt: float,
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-    changes: wp.array[wp.vec3],
+    layer: Layer, particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3], changes: wp.array[wp.vec3]
 ):
     """Writes the gradient with respect to what contacts move particles by."""
     particle = wp.tid()
-    if is_not_finite[particle] == 0:
-        changes[particle] = particle_q[particle] + particle_qd[particle] / dt
+    if layer.motion.is_not_finite[particle] == 0:
+        changes[particle] = particle_q[particle] + particle_qd[particle] / layer.dt
 
 
 @wp.kernel(enable_backward=False)
 def finish_backward(
-    x0: wp.array[wp.vec3],
-    x1: wp.array[wp.vec3],
-    inverse_mass: wp.array[float],
-    start_q: wp.array[wp.vec3],
-    particle_q: wp.array[wp.vec3],
-    particle_inv_mass: wp.array[float],
+    of_motion: Motion, start_q: wp.array[wp.vec3], particle_q: wp.array[wp.vec3], particle_inv_mass: wp.array[float]
 ):
     """Adds to the gradients of the inputs of the step."""
     particle = wp.tid()
-    start_q[particle] = start_q[particle] + x0[particle]
-    particle_q[particle] = particle_q[particle] + x1[particle]
+    start_q[particle] += of_motion.x0[particle]
+    particle_q[particle] += of_motion.x1[particle]
     if particle_inv_mass:
-        particle_inv_mass[particle] = particle_inv_mass[particle] + inverse_mass[particle]
+        particle_inv_mass[particle] += of_motion.inverse_mass[particle]
