@@ -87,21 +87,26 @@ def paused_tape() -> Iterator[wp.Tape | None]:
         tape.__enter__()
 
 
-def empty_struct(value: Any) -> Any:
-    """Returns a struct without arrays, of the type of a value that is a Warp struct; None for other values.
-
-    It takes the place of the gradient of a struct whose arrays have gradients of their own.
+def struct_type(struct: Any) -> Any:
+    """Returns the type of a Warp struct.
 
     Contract: Instances of a :class:`warp.struct` have their type as ``_cls``.
 
     Raises:
-        RuntimeError: If they do not: adjoints cannot be launched then.
+        RuntimeError: If they do not: steps cannot be recorded, and adjoints not be launched then.
     """
-    if not wp.types.is_struct(value):
-        return None
-    if not hasattr(value, "_cls"):
+    if not hasattr(struct, "_cls"):
         raise missing("warp", "attribute _cls of structs", "steps carry no gradients")
-    return _make_empty(value._cls)
+    return struct._cls
+
+
+def empty_struct(value: Any) -> Any:
+    """Returns a struct without arrays, of the type of a value that is a Warp struct; None for other values.
+
+    It takes the place of the gradient of a struct whose arrays have gradients of their own. Errors are those of
+    :func:`struct_type`.
+    """
+    return _make_empty(struct_type(value)) if wp.types.is_struct(value) else None
 
 
 @functools.cache

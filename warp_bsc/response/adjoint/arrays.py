@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..._private_names.of_warp import empty_struct
+from ..._private_names.of_warp import empty_struct, struct_fields, struct_type
 
 
 def copied(struct, lengths):
@@ -12,8 +12,8 @@ def copied(struct, lengths):
         struct: The struct.
         lengths: Names of the arrays to copy; a dictionary says how many elements, None for all.
     """
-    into = struct._cls()
-    for name in struct._cls.vars:
+    into = struct_type(struct)()
+    for name in struct_fields(struct_type(struct)):
         setattr(into, name, getattr(struct, name))
     for name, length in lengths.items() if isinstance(lengths, dict) else dict.fromkeys(lengths).items():
         array = getattr(struct, name)
@@ -26,7 +26,7 @@ def copied(struct, lengths):
 
 def attach_gradients(struct, names=(), **gradients):
     """Replaces arrays of a struct by aliases with gradients, zeros for ``names``; returns a struct of the gradients."""
-    into = struct._cls()
+    into = struct_type(struct)()
     for name in (*names, *gradients):
         array = getattr(struct, name)
         gradient = gradients[name] if name in gradients else wp.zeros_like(array, requires_grad=False)

@@ -186,6 +186,7 @@ class ContactLayer(WrappedSolver):
                 pushed = self._push(end, dt, record=True)
 
             def backward():
+                assert pushed is not None
                 with self._lock:
                     self._backward(*pushed, *(array.grad for array in arrays))
 
