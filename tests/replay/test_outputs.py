@@ -8,11 +8,20 @@ import shutil
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from progress_lines import without_progress
 from pxr import Usd, UsdGeom
-from replay_files import OUTPUTS, Page, falling_through_quads, left_behind, many_hits, replay
+from replay_files import (
+    OUTPUTS,
+    Page,
+    errors_of,
+    falling_through_quads,
+    left_behind,
+    many_hits,
+    read_contacts,
+    read_polygons,
+    replay,
+)
 from stages import FALLING, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc._atomic_file import OutputFile
@@ -24,44 +33,6 @@ from warp_bsc.replay import usd_overlay
 @pytest.fixture
 def stage(tmp_path):
     return falling_through_quads(tmp_path)
-
-
-def errors_of(stage):
-    """What usdchecker finds wrong."""
-    validation = pytest.importorskip("pxr.UsdValidation")
-    validators = [
-        validator
-        for validator in validation.ValidationRegistry().GetOrLoadAllValidators()
-        if not validator.GetMetadata().name.startswith("warp_bsc.")  # our own rule finds the collisions
-    ]
-    return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
-
-
-def read_contacts(overlay, time, kinds=("VertexFace", "EdgeEdge"), root="/Collisions"):
-    """Points of contact, and the values of each primvar, meshes by their names."""
-    prims, points, primvars = overlay.GetPrimAtPath(root).GetAttribute("prims").Get(), [], {}
-    for kind in kinds:
-        instancer = UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"{root}/{kind}"))
-        api = UsdGeom.PrimvarsAPI(instancer)
-        points.extend(instancer.GetPositionsAttr().Get(time))
-        assert len(instancer.GetProtoIndicesAttr().Get(time)) == len(instancer.GetPositionsAttr().Get(time))
-        for name in ("toi", "elementA", "elementB", "primA", "primB"):
-            primvar = api.GetPrimvar(name)
-            assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
-            values = [tuple(value) if name.startswith("element") else value for value in primvar.Get(time)]
-            primvars.setdefault(name, []).extend(
-                [prims[value] for value in values] if name.startswith("prim") else values
-            )
-    return np.array(points).reshape(-1, 3), primvars
-
-
-def read_polygons(overlay, time, root="/Collisions"):
-    """The triangles of the polygons that collide, as points: of one side, then of the other."""
-    mesh = UsdGeom.Mesh(overlay.GetPrimAtPath(f"{root}/Polygons"))
-    points = np.array(mesh.GetPointsAttr().Get(time)).reshape(-1, 3)
-    counts, corners = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
-    assert list(counts) == [3] * (len(corners) // 3)
-    return points[np.array(corners, dtype=int)].reshape(-1, 3, 3)
 
 
 def test_what_is_printed_names_the_files(stage, capsys, tmp_path):

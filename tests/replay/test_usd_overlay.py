@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils
-from replay_files import Page, falling_through_quads, left_behind, near_and_inside_stage, replay
+from replay_files import (
+    Page,
+    errors_of,
+    falling_through_quads,
+    left_behind,
+    near_and_inside_stage,
+    read_contacts,
+    read_polygons,
+    replay,
+)
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
 
 import warp_bsc as bsc
@@ -22,44 +31,6 @@ ASSETS = Path(__file__).resolve().parents[2] / "assets"
 @pytest.fixture
 def stage(tmp_path):
     return falling_through_quads(tmp_path)
-
-
-def errors_of(stage):
-    """What usdchecker finds wrong."""
-    validation = pytest.importorskip("pxr.UsdValidation")
-    validators = [
-        validator
-        for validator in validation.ValidationRegistry().GetOrLoadAllValidators()
-        if not validator.GetMetadata().name.startswith("warp_bsc.")  # our own rule finds the collisions
-    ]
-    return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
-
-
-def read_contacts(overlay, time, kinds=("VertexFace", "EdgeEdge"), root="/Collisions"):
-    """Points of contact, and the values of each primvar, meshes by their names."""
-    prims, points, primvars = overlay.GetPrimAtPath(root).GetAttribute("prims").Get(), [], {}
-    for kind in kinds:
-        instancer = UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"{root}/{kind}"))
-        api = UsdGeom.PrimvarsAPI(instancer)
-        points.extend(instancer.GetPositionsAttr().Get(time))
-        assert len(instancer.GetProtoIndicesAttr().Get(time)) == len(instancer.GetPositionsAttr().Get(time))
-        for name in ("toi", "elementA", "elementB", "primA", "primB"):
-            primvar = api.GetPrimvar(name)
-            assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
-            values = [tuple(value) if name.startswith("element") else value for value in primvar.Get(time)]
-            primvars.setdefault(name, []).extend(
-                [prims[value] for value in values] if name.startswith("prim") else values
-            )
-    return np.array(points).reshape(-1, 3), primvars
-
-
-def read_polygons(overlay, time, root="/Collisions"):
-    """The triangles of the polygons that collide, as points: of one side, then of the other."""
-    mesh = UsdGeom.Mesh(overlay.GetPrimAtPath(f"{root}/Polygons"))
-    points = np.array(mesh.GetPointsAttr().Get(time)).reshape(-1, 3)
-    counts, corners = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
-    assert list(counts) == [3] * (len(corners) // 3)
-    return points[np.array(corners, dtype=int)].reshape(-1, 3, 3)
 
 
 def read_curves(overlay, time, root="/Collisions"):

@@ -1,4 +1,4 @@
-"""Hashes of fifty random scenes behind the collision stage, so that a change of its code can be seen to change no bit.
+"""Hashes of random scenes behind the collision stage, so that a change of its code can be seen to change no bit.
 
 ``python tests/support/scene_hashes.py --write before.json`` steps the scenes, and writes a hash of the states, reports
 and gradients of each. ``--compare before.json`` compares with that file; the status is 1 where one differs. Hashes
