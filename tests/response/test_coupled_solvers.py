@@ -253,7 +253,8 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
     solver.step(start, end, None, None, DT)
     report = stages[0].report
     assert report.certified and report.hits == 0
-    np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
+    # the sheet is at rest but for the rounding of its elastic forces; the ball would carry it by its radius
+    np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)
 
 
 def test_hooks_are_those_of_the_inner_solver(device):

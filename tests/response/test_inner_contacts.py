@@ -67,8 +67,9 @@ def test_a_step_is_the_same_with_contacts_passed_on(inner, substeps, device):
     plain, passed = (roll(model, passes, 24, inner=inner, substeps=substeps) for passes in (False, True))
     assert passed.solver.report.totals.substepped_steps > 4 and passed.solver.report.totals.uncertified_steps == 0
     assert passed.solver.report.totals.substepped_steps == plain.solver.report.totals.substepped_steps
-    assert passed.positions.tobytes() == plain.positions.tobytes()
-    assert passed.velocities.tobytes() == plain.velocities.tobytes()
+    in_any_order = inner == "xpbd" and device.is_cuda  # XPBD adds up floats by atomic operations
+    np.testing.assert_allclose(passed.positions, plain.positions, rtol=0.0, atol=1e-5 * in_any_order)
+    np.testing.assert_allclose(passed.velocities, plain.velocities, rtol=0.0, atol=1e-3 * in_any_order)
 
 
 def test_contacts_in_a_graph_are_those_of_each_replay(device):

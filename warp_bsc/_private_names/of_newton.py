@@ -99,10 +99,13 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
 def may_allocate(solver: SolverBase) -> bool:
     """Returns whether a step of a solver may allocate memory, which the body of a condition in a CUDA graph must not.
 
-    Contract: ``SolverVBD`` and ``SolverStyle3D`` without a collision pipeline of their own allocate nothing in a step;
-    every other solver, and every class derived from these, counts as one that does. Where the contract is broken, Warp
-    raises an error when the step is captured.
+    Contract: ``SolverVBD``, and ``SolverStyle3D`` on a CPU, allocate nothing in a step unless they have a collision
+    pipeline of their own. On a GPU the inner products of Style3D allocate. Every other solver, and every class derived
+    from these, counts as one that allocates. Where the contract is broken, Warp raises an error when the step is
+    captured.
     """
+    if type(solver) is SolverStyle3D and solver.device.is_cuda:
+        return True
     return type(solver) not in (SolverVBD, SolverStyle3D) or solver.collision_pipeline is not None
 
 
