@@ -7,6 +7,7 @@ import warp as wp
 
 from .classification import classify
 from .culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from .custom_gradients import func_grad
 from .gradients import with_gradients
 from .min_distance import min_distance_impact
 from .motion import all_finite, doubles, motion_and_distance, relative_motion
@@ -70,7 +71,7 @@ def _find_impact(
     return solve(relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), timed, tolerance)
 
 
-@wp.func_grad(_find_impact)
+@func_grad(_find_impact, Impact)
 def _adjoint_of_find_impact(
     kind: int,
     # points at the start

@@ -21,6 +21,7 @@ of zero.
 import warp as wp
 
 from .closest import between
+from .custom_gradients import func_grad
 from .distance import nearest_pair
 from .gradients import MIN_SQUARE_LENGTH, SQUARE_SINE
 from .motion import all_finite, relative_motion
@@ -133,7 +134,7 @@ def with_distance_gradients(
     return result
 
 
-@wp.func_grad(with_distance_gradients)
+@func_grad(with_distance_gradients, Impact)
 def _adjoint_of_with_distance_gradients(
     kind: int,
     # points at the start

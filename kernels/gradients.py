@@ -44,6 +44,7 @@ is 1.
 import warp as wp
 
 from .bernstein import mix, restrict_cubic
+from .custom_gradients import func_grad
 from .motion import all_finite, relative_motion
 from .polynomials import VERTEX_FACE, Motion, coplanarity
 from .signs import FREE
@@ -188,7 +189,7 @@ def with_gradients(
     return result
 
 
-@wp.func_grad(with_gradients)
+@func_grad(with_gradients, Impact)
 def _adjoint_of_with_gradients(
     kind: int,
     # points at the start

@@ -4,6 +4,7 @@ import os
 import sys
 import textwrap
 
+import compilation
 import newton
 import newton.examples
 import newton.utils
@@ -22,8 +23,11 @@ FALLING_TRIANGLE = """
     import newton
     import newton.examples
     import warp as wp
+    from compilation import omit_gradients_of_newton
     from newton.solvers import SolverXPBD
     from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledADMM
+
+    omit_gradients_of_newton()  # as the tests do, so that both take the same kernels
 
 
     class Derived(SolverXPBD):
@@ -87,7 +91,8 @@ FALLING_TRIANGLE = """
 @pytest.fixture
 def write_example(tmp_path, monkeypatch):
     """Writes the source of an example, in a module that a process of its own can import, and describes it."""
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    folders = [str(tmp_path), compilation.FOLDER, *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
 
     def write(source, *options):
         (tmp_path / "example_written.py").write_text(textwrap.dedent(source))

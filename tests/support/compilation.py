@@ -1,8 +1,9 @@
 """Compilation of the tests' kernels: options that make it quick, and no module compiled by two processes at once."""
 
+import contextlib
 import functools
+import importlib
 import os
-import sys
 import zlib
 
 import warp as wp
@@ -12,7 +13,10 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["QUICK", "compile_kernels_once", "omit_gradients_of_newton"]
+__all__ = ["FOLDER", "QUICK", "compile_kernels_once", "omit_gradients_of_newton"]
+
+FOLDER = os.path.dirname(__file__)
+"""Folder from which a program that a test starts can import this module."""
 
 QUICK = {"cpu_compiler_flags": "-march=native"}
 """Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take twice as
@@ -20,21 +24,27 @@ long to compile. Such kernels are slower, which does not matter in tests."""
 
 
 WITHOUT_GRADIENTS = [
+    "newton._src.geometry.inertia",
     "newton._src.geometry.kernels",
     "newton._src.sim.articulation",
+    "newton._src.sim.collide",
     "newton._src.solvers.featherstone.kernels",
+    "newton._src.solvers.style3d.builder",
+    "newton._src.solvers.style3d.collision.bvh.kernels",
+    "newton._src.solvers.style3d.collision.kernels",
     "newton._src.solvers.style3d.kernels",
+    "newton._src.solvers.style3d.linear_solver",
     "newton._src.solvers.xpbd.kernels",
     "newton._src.viewer.kernels",
 ]
-"""Modules of Newton's kernels through which no test takes a gradient. Their adjoints take 27 s to compile."""
+"""Modules of Newton's kernels through which no test takes a gradient. Their adjoints take a minute to compile."""
 
 
 def omit_gradients_of_newton() -> None:
-    """Leaves the adjoints out of :data:`WITHOUT_GRADIENTS`, as far as these are imported."""
+    """Leaves the adjoints out of :data:`WITHOUT_GRADIENTS`, in this process."""
     for name in WITHOUT_GRADIENTS:
-        if name in sys.modules:
-            wp.set_module_options({"enable_backward": False}, module=sys.modules[name])
+        with contextlib.suppress(ImportError):  # in another version of Newton
+            wp.set_module_options({"enable_backward": False}, module=importlib.import_module(name))
 
 
 def compile_kernels_once() -> None:
