@@ -106,7 +106,7 @@ def contacts(shape):
     for critical, touches in shape.critical():
         f = inner_part(critical)
         for lower, upper in isolated_roots(f):
-            if touches(lambda q, f=f, lower=lower, upper=upper: sign_at_root(q, f, lower, upper)):
+            if touches(lambda q, known=critical, root=(f, lower, upper): 0 if q is known else sign_at_root(q, *root)):
                 yield f, lower, upper
                 break
     if shape.touches(lambda q: sign_at(q, 1)):

@@ -11,6 +11,7 @@ __all__ = [
     "multiply",
     "negate",
     "sign_at",
+    "sign_at_ratio",
     "triangle_areas",
     "triangle_weights",
     "trim",
@@ -73,7 +74,11 @@ def differentiate(f):
 
 def sign_at(f, time):
     """Returns the sign of f at a time: an int, a Fraction or a float, taken exactly."""
-    numerator, denominator = time.as_integer_ratio()
+    return sign_at_ratio(f, *time.as_integer_ratio())
+
+
+def sign_at_ratio(f, numerator, denominator):
+    """Returns the sign of f at a fraction of a positive denominator."""
     value, power = 0, 1
     for a in reversed(f):  # Horner's rule, times denominator^degree
         value = value * numerator + a * power

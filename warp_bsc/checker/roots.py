@@ -1,15 +1,19 @@
 """Real roots of polynomials with integer coefficients, by the theorem of Sturm and Tarski."""
 
 import bisect
+import functools
 import itertools
 import math
 from fractions import Fraction
 
 import numpy as np
 
-from .polynomials import differentiate, multiply, sign_at, trim
+from .polynomials import differentiate, multiply, sign_at, sign_at_ratio, trim
 
 __all__ = ["doubles_around", "inner_part", "isolated_roots", "sign_at_root"]
+
+_HALVINGS = 24
+"""Of an interval with a root. In one of this length, a polynomial that is not zero at the root is seldom zero."""
 
 
 def _signed_remainders(f, g):
@@ -38,8 +42,23 @@ def _changes(sequence, time):
 
 def sign_at_root(q, f, lower, upper):
     """Returns the sign of q at the only root of f between two times that are not roots of f."""
+    if sign := _sign_between(q, lower, upper):
+        return sign
     sequence = _signed_remainders(f, trim(multiply(differentiate(f), q)) if q else [])
     return _changes(sequence, lower) - _changes(sequence, upper)
+
+
+def _sign_between(f, lower, upper):
+    """Returns the sign that f has everywhere between two times; 0 if its Taylor series at the first does not tell."""
+    (start, scale), (end, other) = lower.as_integer_ratio(), upper.as_integer_ratio()
+    start, width, scale = start * other, end * scale - start * other, scale * other
+    taylor, power = [0], 1
+    for a in reversed(f):  # Horner's rule for f((start + s) / scale) scale^degree, a polynomial in s
+        taylor = [start * low + high for low, high in zip([*taylor, 0], [0, *taylor], strict=True)]
+        taylor[0] += a * power
+        power *= scale
+    rest = sum(abs(a) * width**i for i, a in enumerate(taylor[1:], start=1))
+    return (taylor[0] > rest) - (taylor[0] < -rest)
 
 
 def inner_part(f):
@@ -59,7 +78,7 @@ def isolated_roots(f):
         lower, upper = intervals.pop()
         roots = _changes(sturm, lower) - _changes(sturm, upper)
         if roots == 1:
-            yield lower, upper
+            yield _narrowed(f, lower, upper)
         elif roots > 1:
             middle = Fraction(lower + upper, 2)
             while sign_at(f, middle) == 0:
@@ -67,12 +86,34 @@ def isolated_roots(f):
             intervals += [(middle, upper), (lower, middle)]
 
 
+def _narrowed(f, lower, upper):
+    """Returns times closer together around the only root of f between two, unless it is a root of even order."""
+    (low, scale), (high, other) = lower.as_integer_ratio(), upper.as_integer_ratio()
+    low, high, scale = low * other, high * scale, scale * other
+    before = sign_at_ratio(f, low, scale)
+    if before == sign_at_ratio(f, high, scale):
+        return lower, upper
+    for _ in range(_HALVINGS):
+        low, middle, high, scale = 4 * low, 2 * (low + high), 4 * high, 4 * scale
+        sign = sign_at_ratio(f, middle, scale)
+        if sign == 0:
+            low, high = (low + middle) // 2, (middle + high) // 2
+        elif sign == before:
+            low = middle
+        else:
+            high = middle
+    return Fraction(low, scale), Fraction(high, scale)
+
+
 def doubles_around(f, lower, upper):
     """Returns the doubles around the only root of f between two times: equal when it is one, neighbours otherwise."""
     if f is None:
         return float(lower), float(upper)
-    sturm = _signed_remainders(f, differentiate(f))
-    changes = _changes(sturm, lower)
+    if sign_at(f, lower) != sign_at(f, upper):  # else a root of even order
+        side_of = functools.partial(sign_at, f)
+    else:
+        side_of = functools.partial(_changes, _signed_remainders(f, differentiate(f)))
+    before = side_of(lower)
 
     def double(bits):
         return float(np.int64(bits).view(np.float64))
@@ -81,10 +122,11 @@ def doubles_around(f, lower, upper):
         time = double(bits)
         if time <= lower or time >= upper:
             return time >= upper
-        return sign_at(f, time) == 0 or _changes(sturm, time) != changes
+        return sign_at(f, time) == 0 or side_of(time) != before
 
     # The bits of doubles that are not negative, read as integers, are in the same order.
-    one = int(np.float64(1.0).view(np.int64))
-    after = double(bisect.bisect_left(range(one + 1), True, key=reached))
+    low, high = (int(np.float64(time).view(np.int64)) for time in (lower, upper))
+    bits = range(max(low - 1, 0), high + 2)
+    after = double(bits[bisect.bisect_left(bits, True, key=reached)])
     exact = lower < after < upper and sign_at(f, after) == 0
     return after if exact else float(np.nextafter(after, 0.0)), after
