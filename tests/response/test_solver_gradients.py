@@ -263,7 +263,7 @@ def test_grazing_contacts_are_flagged_and_gradients_finite(device):
         assert np.abs(array.grad.numpy()).max() < 1e6
 
 
-def test_hundreds_of_tape_iterations_take_no_more_memory(device):
+def test_many_tape_iterations_take_no_more_memory(device):
     resource = pytest.importorskip("resource")  # of POSIX
     scene = Throw(device, friction=0.3, steps=1)
     down = np.array((0.0, 0.0, -9.0), dtype=np.float32)
@@ -273,12 +273,12 @@ def test_hundreds_of_tape_iterations_take_no_more_memory(device):
             return wp.get_mempool_used_mem_current(device)
         return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
-    for i in range(200):
+    for i in range(120):
         scene.gradient(down)
-        if i == 70:
+        if i == 60:
             before = used()
-    assert scene.hits > 200
-    assert used() - before < 2**20
+    assert scene.hits > 120
+    assert used() - before < 2**19
 
 
 def test_state_at_the_start_must_be_kept(device):
