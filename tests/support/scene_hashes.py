@@ -2,7 +2,7 @@
 
 ``python tests/support/scene_hashes.py --write before.json`` steps the scenes, and writes a hash of the states, reports
 and gradients of each. ``--compare before.json`` compares with that file; the status is 1 where one differs. Hashes
-differ between devices, and between versions of Warp and Newton.
+differ between devices, and between versions of Warp and Newton. Scenes that differ from run to run are not compared.
 """
 
 import argparse
@@ -22,6 +22,8 @@ import warp_bsc as bsc
 
 STEPS = 8
 KINDS = 17
+VARYING_ON_GPU = 5, 12, 16
+"""Kinds of scenes in which ``SolverSemiImplicit`` adds up the forces on a particle in any order."""
 COUNTS = "steps", "uncertified_steps", "truncated_steps", "frozen_steps", "total_remaining", "total_excluded"
 COUNTS += "hits", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen", "substeps"
 
@@ -241,7 +243,8 @@ def main() -> int:
     hashes, differing = {}, 0
     for seed in range(options.count):
         hashes[str(seed)], report = hash_scene(seed)
-        differs = str(seed) in given and given[str(seed)] != hashes[str(seed)]
+        varies = wp.get_device().is_cuda and seed % KINDS in VARYING_ON_GPU
+        differs = not varies and str(seed) in given and given[str(seed)] != hashes[str(seed)]
         differing += differs
         print(f"scene {seed:2} {hashes[str(seed)]} {'DIFFERS' if differs else ''} {report}", flush=True)
     if options.write:
