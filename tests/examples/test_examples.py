@@ -264,7 +264,7 @@ def test_the_substeps_of_scenes_are_measured(monkeypatch, capsys):
     options = ["--scenes", "drape", "blocks", "--substeps", "2", "--device", str(wp.get_device())]
     monkeypatch.setattr(sys, "argv", ["substeps.py", *options])
     program.main()
-    rows = re.findall(r"│ (1/\d+) +│ (\d+|-|auto) +│(?: [\d.e+-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
+    rows = re.findall(r"│ (1/\d+) +│ (\d+|-|auto) +│(?: [\d.e+…-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
     steps = [("1/480", "-"), ("1/240", "-"), ("1/240", "-"), ("1/240", "2"), ("1/240", "auto")]
     steps += [("1/120", "-"), ("1/120", "4"), ("1/120", "auto")]
     assert rows == [(*step, "0") for step in 2 * steps]  # all certified
