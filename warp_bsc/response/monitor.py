@@ -53,7 +53,7 @@ class CollisionMonitor(CollisionStage):
         keeps_distances = min_distance > 0.0 or bool(radii.any())
         mesh = ModelMesh(self.model, strands=keeps_distances)
         if keeps_distances:
-            mesh.keep_distances(min_distance, radii, reach=0.0)
+            mesh.distances = mesh.min_distances(min_distance, radii, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
         self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)

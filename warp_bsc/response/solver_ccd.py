@@ -169,7 +169,7 @@ class SolverCCD(CollisionStage):
         mesh = ModelMesh(self.model, strands=options.keeps_distances)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
         if options.keeps_distances:
-            mesh.keep_distances(options.min_distance, options.radii, reach=self.separation)
+            mesh.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         if self.substeps is not None and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")

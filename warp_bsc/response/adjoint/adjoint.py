@@ -11,7 +11,7 @@ are integers.
 import warp as wp
 
 from ..schedule import SWEEPS_PER_BATCH, LoopControl, views_of
-from ..state.record import OFFSETS, PER_ENTRY, PER_TRUNCATION, RecordCounts, check_complete
+from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, MovedBodies, allocate
 from ..state.workspace import Workspace
 from . import kernels, restore
@@ -75,7 +75,8 @@ class RecordedStep:
         lengths = dict.fromkeys(Constraints.vars.keys() - _UNUSED_OF_CONSTRAINTS, count)
         self.constraints = copied(constraints, {**lengths, "count": 1})
         lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}
-        lengths |= {**dict.fromkeys(PER_ENTRY, entries), **dict.fromkeys(PER_TRUNCATION, truncations)}
+        for kind, length in (("entries", entries), ("truncations", truncations)):
+            lengths |= dict.fromkeys(GROWING[kind], length)
         self.record = copied(record, lengths)
         self.record.counts = views_of(RecordCounts, wp.clone(recorder.counts))
         self.complete = wp.empty(1, dtype=int, device=device)

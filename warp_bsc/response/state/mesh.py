@@ -6,11 +6,11 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
-from ..._arguments import checked_distance, checked_distances, checked_integer
+from ..._arguments import checked_integer
 from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
 from ..tuning import SEGMENTS
-from .structs import Incidence
+from .structs import Connectivity, Incidence
 
 MAX_SEGMENTS = 1024
 """Most triangles around a round shape; a sphere has about the square of them."""
@@ -75,8 +75,7 @@ class ModelMesh(CollisionMesh):
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
-        device_vertex_edges: The edges of each vertex, :class:`Incidence`.
-        device_edge_faces: The faces of each edge, :class:`Incidence`.
+        connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
     """
 
@@ -140,8 +139,10 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
-        self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
-        self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
+        self.connectivity = connectivity = Connectivity()
+        connectivity.faces, connectivity.edges = self.device_faces, self.device_edges
+        connectivity.vertex_edges = _incidence(self.edges, vertex_count, self.device)
+        connectivity.edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
@@ -151,33 +152,19 @@ class ModelMesh(CollisionMesh):
         """Whether a vertex or a plane moves with a body."""
         return bool((self.shape_vertices.body >= 0).any() or (self.planes.body >= 0).any())
 
-    def keep_distances(
-        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
-    ) -> None:
-        """Sets the minimum distances of pairs, with arguments and errors as of :meth:`min_distances`."""
-        self.distances = self.min_distances(min_distance, radius, reach=reach)
-
-    def min_distances(
-        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
-    ) -> MinDistances:
+    def min_distances(self, min_distance: float, radii: np.ndarray, *, reach: float) -> MinDistances:
         """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 
         Args:
             min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
-            radius: Radius of each particle [m], as the distance, shape [particle_count], or one for all; None for 0.
+            radii: Radius of each particle [m], shape [particle_count], or one for all.
             reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
-
-        Raises:
-            TypeError: If ``min_distance`` or ``radius`` is no number.
-            ValueError: If one of them has another shape or is out of range.
         """
-        distance, count = checked_distance(min_distance, "min_distance"), self.model.particle_count
-        radii = radius.numpy() if isinstance(radius, wp.array) else radius
-        every = np.full(self.vertex_count, 0.5 * distance)
-        every[:count] += checked_distances(0.0 if radii is None else radii, "radius", count)
-        group = np.full(self.vertex_count, -1)
+        count, group = self.model.particle_count, np.full(self.vertex_count, -1)
+        every = np.full(self.vertex_count, 0.5 * min_distance)
+        every[:count] += radii
         group[count:] = self.shape_vertices.body + 1
-        return make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
+        return make_min_distances(self, every, of_planes=0.5 * min_distance, reach=reach, group=group)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""

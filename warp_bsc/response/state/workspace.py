@@ -19,15 +19,12 @@ from .structs import (
     NO_NODE,
     NOT_FINITE,
     SUMS,
-    Connectivity,
     Constraints,
     DividingPlanes,
     Motion,
+    MovedBodies,
     Vertices,
-    allocate_bodies,
-    allocate_constraints,
-    allocate_dividing_planes,
-    allocate_vertices,
+    allocate,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -49,7 +46,8 @@ def _begin(
     if i == 0:
         clear_status(status)
         constraints.count[0] = 0
-        dividing.count[0] = 0
+        if dividing.count:
+            dividing.count[0] = 0
     if i < worlds:
         status.contact_iteration[i] = -1
         status.is_fast[i] = 0
@@ -68,8 +66,9 @@ def _begin(
     vertices.first_contact[i] = NEVER
     vertices.changed[i] = 0
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
-    dividing.first[i] = NO_NODE
-    dividing.kept[i] = NO_NODE
+    if dividing.first:
+        dividing.first[i] = NO_NODE
+        dividing.kept[i] = NO_NODE
 
 
 @dataclass(frozen=True)
@@ -88,27 +87,17 @@ class Resolution:
 
 
 class Workspace:
-    """The buffers that a step works on, reused from step to step, on one device.
+    """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
     Attributes:
-        detector: The detector of contacts.
-        crossing_candidates: The detector of edges that may cross faces.
-        mesh: The mesh.
-        connectivity: Its elements, for kernels.
         motion: The motion of the step that is being resolved; it is only read.
         vertices: The vertices and bodies as they are moved.
-        constraints: The constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
-        status: The solve status.
         status_values: The arrays that the parts of ``status`` are views of.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
-        separation: Distance that projection moves contacts apart [m].
         tolerance: Tolerance of constraints on positions [m].
-        restitution: Share of the approaching velocity that comes back, array of one float.
-        differentiable: Whether steps may be recorded.
         worlds: Number of worlds.
-        device: The device.
     """
 
     motion: ModelMotion
@@ -136,32 +125,27 @@ class Workspace:
         """
         self.mesh, self.device = mesh, mesh.device
         self.separation, self.restitution = separation, restitution
-        self.differentiable, self.keeps_distances = differentiable, mesh.distances is not None
+        self.differentiable = differentiable
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
-        self.particle_count, self.shape_vertex_count = (
-            mesh.model.particle_count,
-            mesh.vertex_count - mesh.model.particle_count,
-        )
+        self.particle_count, vertices, device = mesh.model.particle_count, mesh.vertex_count, self.device
         self.body_count = mesh.model.body_count if moves_bodies else 0
-        device = self.device
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
-        self.connectivity = Connectivity()
-        self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges
-        self.connectivity.vertex_edges = mesh.device_vertex_edges
-        self.connectivity.edge_faces = mesh.device_edge_faces
-        self.vertices = allocate_vertices(mesh.vertex_count, device)
+        self.connectivity = mesh.connectivity
+        size = vertices, 3
+        self.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
         if moves_bodies:
-            self.vertices.bodies = allocate_bodies(self.body_count, device)
-        self.constraints = allocate_constraints(0, device)
+            size = self.body_count, 6
+            self.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
+        self.constraints = allocate(Constraints, 0, device, count=1, active_count=1)
         self._retired: list[Constraints] = []
-        capacity = DIVIDING_PLANES * self.particle_count
-        self._dividing_planes = allocate_dividing_planes(
-            mesh.vertex_count, capacity, device, keep_distances=self.keeps_distances
-        )
-        self.dividing = DividingPlanes() if differentiable else self._dividing_planes
+        self.dividing = DividingPlanes()
+        if not differentiable:
+            capacity = DIVIDING_PLANES * self.particle_count
+            sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
+            self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status, self.status_values = allocate_status(self.worlds, device, **limits)
         self.recorder: StepRecorder | None = None
@@ -190,14 +174,18 @@ class Workspace:
         self.motion, self.recorder = motion, recorder
         self.record = StepRecord()  # which records nothing
         if recorder is not None:
-            if not self.device.is_capturing:
-                recorder.reserve_entries(MIN_ENTRIES)
-            elif not len(recorder.record.constraint):
+            recorder.reserve("entries", MIN_ENTRIES)
+            if not len(recorder.record.constraint):
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
-            self.record = recorder.begin()
-        outputs = [self.vertices, self.constraints, self._dividing_planes, self.status]
+            recorder.counts.zero_()
+            self.record = recorder.record
+        outputs = [self.vertices, self.constraints, self.dividing, self.status]
         size = max(len(self.vertices.x1), self.worlds + 1)
         self.launch(_begin, size, [motion.vertices, self.worlds], outputs)
+
+    def _if_distances(self, capacity):
+        """Returns a capacity, or 0 without minimum distances."""
+        return 0 if self.mesh.distances is None else capacity
 
     @property
     def max_contacts(self) -> int:
@@ -212,7 +200,8 @@ class Workspace:
         filled = int(old.count.numpy()[0])
         if len(old.vertices) < filled + more:
             capacity = filled + ITERATIONS_RESERVED * more
-            self.constraints = new = allocate_constraints(capacity, self.device, keep_distances=self.keeps_distances)
+            sizes = {"count": 1, "active_count": 1, "min_distance": self._if_distances(capacity)}
+            self.constraints = new = allocate(Constraints, capacity, self.device, **sizes)
             for name in Constraints.vars if filled else ():
                 array = getattr(old, name)
                 wp.copy(getattr(new, name), array, count=min(filled, len(array)))
@@ -235,12 +224,12 @@ class Workspace:
     def reserve_entries(self, sweeps: int) -> None:
         """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
         if self.recorder is not None and not self.device.is_capturing:
-            self.record = self.recorder.reserve_entries(sweeps * int(self.constraints.count.numpy()[0]))
+            self.recorder.reserve("entries", sweeps * int(self.constraints.count.numpy()[0]))
 
     def reserve_truncations(self) -> None:
         """Reserves a truncation for each particle and body, if the step is recorded; does nothing in a CUDA graph."""
-        if self.recorder is not None and not self.device.is_capturing:
-            self.record = self.recorder.reserve_truncations(self.particle_count + self.body_count)
+        if self.recorder is not None:
+            self.recorder.reserve("truncations", self.particle_count + self.body_count)
 
     def launch(self, kernel: wp.Kernel, size: int, inputs: Sequence, outputs: Sequence = ()) -> None:
         """Launches a kernel on the device."""
@@ -284,4 +273,5 @@ class Workspace:
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
         if self.body_count:
-            self.launch(kernel, self.shape_vertex_count, [self.motion.vertices, self.vertices, *inputs])
+            count = self.mesh.vertex_count - self.particle_count
+            self.launch(kernel, count, [self.motion.vertices, self.vertices, *inputs])
