@@ -193,10 +193,4 @@ def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | N
     for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
         if not values[shape] >= 0.0:
             raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
-    return Friction(
-        of_particles,
-        of_shapes,
-        particle_count=model.particle_count,
-        vertex_shapes=mesh.device_shape_vertices.shape,
-        plane_shapes=mesh.device_planes.shape,
-    )
+    return Friction(mesh, of_particles, of_shapes)

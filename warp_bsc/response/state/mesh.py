@@ -55,6 +55,19 @@ class Planes(NamedTuple, Generic[_Array]):
     world: _Array
 
 
+@wp.struct
+class Placement:
+    """Where the vertices and the planes of a mesh are in a state."""
+
+    particle_q: wp.array[wp.vec3]
+    body_q: wp.array[wp.transform]
+    shape_vertex_position: wp.array[wp.vec3]
+    shape_vertex_body: wp.array[int]
+    plane_point: wp.array[wp.vec3]
+    plane_normal: wp.array[wp.vec3]
+    plane_body: wp.array[int]
+
+
 class ModelMesh(CollisionMesh):
     """The triangles of a Newton model that particles can collide with, as one mesh.
 
@@ -185,22 +198,26 @@ class ModelMesh(CollisionMesh):
         Raises:
             ValueError: If an array has another length.
         """
-        self.check_lengths(particle_q, body_q, out)
-        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        if len(out) != self.vertex_count:
+            raise ValueError(f"out must have length {self.vertex_count}, not {len(out)}")
+        inputs = [self.place(particle_q, body_q)]
         wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
 
-    def check_lengths(
-        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
-    ) -> None:
-        """Raises ValueError if an array as of :meth:`positions` has another length."""
+    def place(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> Placement:
+        """Returns where vertices and planes are in a state, with arguments and errors as of :meth:`positions`."""
+        place, model = Placement(), self.model
         for name, array, count in (
-            ("particle_q", particle_q, self.model.particle_count),
-            ("body_q", body_q, self.model.body_count),
-            ("out", out, self.vertex_count),
+            ("particle_q", particle_q, model.particle_count),
+            ("body_q", body_q, model.body_count),
         ):
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
+        place.particle_q, place.body_q = particle_q, body_q
+        vertices, planes = self.device_shape_vertices, self.device_planes
+        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
+        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
+        return place
 
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
@@ -213,34 +230,20 @@ class ModelMesh(CollisionMesh):
 
 
 @wp.func
-def vertex_position(
-    vertex: int,
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    shape_vertex_position: wp.array[wp.vec3],
-    shape_vertex_body: wp.array[int],
-) -> wp.vec3:
+def vertex_position(place: Placement, vertex: int) -> wp.vec3:
     """Returns the position of a vertex of a :class:`ModelMesh` [m], see :meth:`ModelMesh.positions`."""
-    i = vertex - particle_q.shape[0]
+    i = vertex - place.particle_q.shape[0]
     if i < 0:
-        return particle_q[vertex]
-    if shape_vertex_body[i] < 0:
-        return shape_vertex_position[i]
-    return wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+        return place.particle_q[vertex]
+    body = place.shape_vertex_body[i]
+    if body < 0:
+        return place.shape_vertex_position[i]
+    return wp.transform_point(place.body_q[body], place.shape_vertex_position[i])
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _write_positions(
-    # in
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    shape_vertex_position: wp.array[wp.vec3],
-    shape_vertex_body: wp.array[int],
-    # out
-    positions: wp.array[wp.vec3],
-):
-    vertex = wp.tid()
-    positions[vertex] = vertex_position(vertex, particle_q, body_q, shape_vertex_position, shape_vertex_body)
+def _write_positions(place: Placement, positions: wp.array[wp.vec3]):
+    positions[wp.tid()] = vertex_position(place, wp.tid())
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -277,19 +280,24 @@ def are_infinite_planes(model: Model) -> np.ndarray:
 
 def _soft_faces(model):
     """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
-    triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
-    if model.tet_indices is None:
-        return triangles
-    sides = sides_of(model.tet_indices.numpy())
+    triangles = elements_of(model.tri_indices, 3)
+    return np.concatenate([triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)])
+
+
+def elements_of(indices: wp.array | None, n: int) -> np.ndarray:
+    """Returns the elements of a model, which have ``n`` vertices each, shape [element_count, n]."""
+    return np.empty((0, n), dtype=np.int32) if indices is None else indices.numpy().reshape(-1, n)
+
+
+def outer_sides(tetrahedra: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Returns the outer sides of tetrahedra without the triangles, counterclockwise from outside, shape [n, 3]."""
+    sides = tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    if not len(sides):
+        return sides
     # an inner side belongs to two tetrahedra; with the triangles counted twice, the missing sides occur once
     corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
-    return np.concatenate([triangles, sides[first[count == 1]]])
-
-
-def sides_of(tetrahedra: np.ndarray) -> np.ndarray:
-    """Returns the sides of tetrahedra, shape [n, 4], counterclockwise from outside, shape [4 n, 3]."""
-    return tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    return sides[first[count == 1]]
 
 
 def _strands(model, faces):
@@ -300,8 +308,7 @@ def _strands(model, faces):
     count = model.particle_count
     bare = np.ones(count, dtype=bool)
     bare[faces[faces < count]] = False
-    if model.tet_indices is not None:
-        bare[model.tet_indices.numpy()] = False
+    bare[elements_of(model.tet_indices, 4)] = False
     if not model.spring_count:
         return None, np.flatnonzero(bare)
     springs = model.spring_indices.numpy().reshape(-1, 2)

@@ -6,36 +6,18 @@ import warp as wp
 from newton import BodyFlags
 
 from .friction import Friction
-from .mesh import ModelMesh, vertex_position
+from .mesh import ModelMesh, Placement, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
-from .structs import Bodies, Motion
+from .structs import Bodies, Motion, add_zeros
 from .vectors import to_double
 
 _SAME_POSE = 1e-5
 """Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
 
 
-@wp.struct
-class _Placement:
-    """Where the vertices and the planes of a mesh are in a state."""
-
-    particle_q: wp.array[wp.vec3]
-    body_q: wp.array[wp.transform]
-    shape_vertex_position: wp.array[wp.vec3]
-    shape_vertex_body: wp.array[int]
-    plane_point: wp.array[wp.vec3]
-    plane_normal: wp.array[wp.vec3]
-    plane_body: wp.array[int]
-
-
 @wp.func
-def _position(place: _Placement, vertex: int) -> wp.vec3:
-    return vertex_position(vertex, place.particle_q, place.body_q, place.shape_vertex_position, place.shape_vertex_body)
-
-
-@wp.func
-def _place_plane(place: _Placement, i: int, planes: wp.array[wp.vec4d]):
+def _place_plane(place: Placement, i: int, planes: wp.array[wp.vec4d]):
     """Writes a plane, if there is one of that number."""
     if i < planes.shape[0]:
         planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
@@ -90,13 +72,13 @@ def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False)
-def _write_start(place: _Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
+def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
     _place_plane(place, i, planes.start)
     if i >= motion.x0.shape[0]:
         return
-    x = _position(place, i)
+    x = vertex_position(place, i)
     motion.x0[i] = x
     if last and motion.inverse_mass[i] > 0.0:
         for axis in range(3):
@@ -135,7 +117,7 @@ def _write_bodies(
 @wp.kernel(enable_backward=False)
 def _write_end(
     # in
-    place: _Placement,
+    place: Placement,
     particle_qd: wp.array[wp.vec3],
     dt: float,
     last: wp.array[wp.vec3],
@@ -160,7 +142,7 @@ def _write_end(
         if continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
             motion.x0[i] = last[i]
     x0 = motion.x0[i]
-    x1 = _position(place, i)
+    x1 = vertex_position(place, i)
     velocity = (x1 - x0) / dt
     if i < particle_qd.shape[0]:
         velocity = particle_qd[i]
@@ -207,10 +189,8 @@ class ModelMotion:
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
-        for name in ("x0", "x1", "velocity"):
-            setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=device))
-        vertices.is_not_finite = wp.zeros(mesh.vertex_count, dtype=int, device=device)
-        vertices.interrupted = wp.zeros(max(1, model.world_count) + 1, dtype=int, device=device)
+        add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
+        add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
         self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
@@ -220,8 +200,7 @@ class ModelMotion:
         of_planes = mesh.device_planes
         planes.friction, planes.world = friction.planes, of_planes.world
         planes.shape, planes.body = of_planes.shape, of_planes.body
-        for name in ("start", "end"):
-            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=device))
+        add_zeros(planes, ("start", "end"), len(friction.planes), device)
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies
         if moves_bodies:
@@ -229,8 +208,7 @@ class ModelMotion:
             vertices.bodies.responds = int(responds_to_bodies)
         self.keeps_poses = moves_bodies or bool(model.requires_grad and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
-            for name in ("start", "end"):
-                setattr(vertices.bodies, name, wp.zeros(model.body_count, dtype=wp.transform, device=device))
+            add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
@@ -247,8 +225,7 @@ class ModelMotion:
         bodies.position = mesh.device_shape_vertices.position
         bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
         bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
-        bodies.inverse_mass = wp.zeros(model.body_count, dtype=float, device=device)
-        bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
+        add_zeros(bodies, ("inverse_mass", "velocity"), model.body_count, device)
         return bodies
 
     def remember(self, last: wp.array[wp.vec3]) -> None:
@@ -292,8 +269,7 @@ class ModelMotion:
 
     def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
         """Copies the positions at the start of a step, from arrays as of :meth:`.state.mesh.ModelMesh.positions`."""
-        self.mesh.check_lengths(particle_q, body_q, self.vertices.x0)
-        inputs = [self._place(particle_q, body_q), self._last, self.vertices, self.planes]
+        inputs = [self.mesh.place(particle_q, body_q), self._last, self.vertices, self.planes]
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, body_q)
@@ -310,12 +286,12 @@ class ModelMotion:
 
         Velocities of bodies are read only if the response can move bodies.
         """
-        self.mesh.check_lengths(particle_q, body_q, self.vertices.x1)
+        place = self.mesh.place(particle_q, body_q)
         if self.moves_bodies:
             self.set_body_ends(body_q, body_qd)
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, body_q)
-        inputs = [self._place(particle_q, body_q), particle_qd, dt, self._last, self.vertices, self.planes]
+        inputs = [place, particle_qd, dt, self._last, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
     def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
@@ -323,12 +299,3 @@ class ModelMotion:
         model = self.mesh.model
         inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
         wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)
-
-    def _place(self, particle_q, body_q):
-        """Returns where the vertices and the planes are in a state."""
-        mesh, place = self.mesh, _Placement()
-        place.particle_q, place.body_q = particle_q, body_q
-        vertices, planes = mesh.device_shape_vertices, mesh.device_planes
-        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
-        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
-        return place
