@@ -283,15 +283,13 @@ class SolverCCD(CollisionStage):
             nonlocal recorded
             resolution, recorded = self._resolve(end, dt, self._recorder), None
             if device.is_capturing or self._has_changed(resolution.vertices):
-                recorded = RecordedStep(motion, resolution, self._recorder, dt)
-                self._launch(
-                    count_record, 1, [self._recorder.record.counts, recorded.complete], [self.report.device_totals]
-                )
+                recorded = RecordedStep(self._work, dt)
+                self._launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
             with self._lock:
                 if recorded is not None:
-                    StepAdjoint(recorded, self._work).backward(*(array.grad for array in arrays))
+                    StepAdjoint(recorded).backward(*(array.grad for array in arrays))
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])

@@ -108,7 +108,7 @@ def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals)
 
 
 @wp.kernel
-def count_record(counts: RecordCounts, complete: wp.array[int], totals: StepTotals):
+def count_record(counts: RecordCounts, totals: StepTotals):
     """Adds the record of a step to the totals."""
     totals.grazing[0] += wp.int64(counts.grazing[0])
-    totals.lost_gradients[0] += wp.int64(1 - complete[0])
+    totals.lost_gradients[0] += wp.int64(1 - counts.complete[0])

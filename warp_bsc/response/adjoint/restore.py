@@ -149,19 +149,17 @@ def is_movable(motion: Motion, body: int) -> bool:
 
 
 @wp.kernel
-def begin_gradients(
-    motion: Motion, undetected: wp.array[int], of_state: StateGradients, gradients: Gradients, of_motion: Motion
-):
+def begin_gradients(step: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
     """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
 
     Threads are over vertices and bodies.
     """
-    vertex = wp.tid()
+    motion, undetected, vertex = step.motion, step.status.results.undetected[0] == 1, wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
         pose = of_state.body_q[body]
         twist = of_state.body_qd[body]
-        if undetected[0] == 1 and is_movable(motion, body):
+        if undetected and is_movable(motion, body):
             of_motion.bodies.start[body] = pose
             pose = wp.transform(wp.vec3(), wp.quat())
             twist = wp.spatial_vector()
@@ -174,7 +172,7 @@ def begin_gradients(
         x1 = of_state.particle_q[vertex]
         velocity = of_state.particle_qd[vertex]
     of_motion.x0[vertex] = wp.vec3()
-    if undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
+    if undetected and motion.inverse_mass[vertex] > 0.0:
         of_motion.x0[vertex] = x1
         x1 = wp.vec3()
         velocity = wp.vec3()
@@ -183,17 +181,16 @@ def begin_gradients(
 
 
 @wp.kernel
-def move_cursor(step: RestoredStep, move: int, complete: wp.array[int]):
+def move_cursor(step: RestoredStep, move: int):
     """Moves the cursor, and sets the iteration of the status to the one that computed what is there.
 
-    There is nothing to go back through in a record that is not ``complete``.
+    There is nothing to go back through in a record that is not complete.
     """
-    record = step.record
-    cursor = step.cursor
+    record, cursor = step.record, step.cursor
     iteration = cursor.iteration[0]
     first = cursor.first_sweep[0]
     last = cursor.next_sweep[0]
-    if complete[0] == 0:
+    if record.counts.complete[0] == 0:
         first = 0
         last = -1
     elif move == Move.END:
@@ -322,26 +319,21 @@ def collect_gradients_on_bodies(
 
 
 @wp.func
-def _missing(complete: wp.array[int]) -> float:
+def _missing(step: RestoredStep) -> float:
     """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
-    return wp.where(complete[0] == 0, wp.nan, float(0.0))
+    return wp.where(step.record.counts.complete[0] == 0, wp.nan, float(0.0))
 
 
 @wp.kernel
 def finish_gradients(
-    motion: Motion,
-    gradients: Gradients,
-    complete: wp.array[int],
-    of_motion: Motion,
-    of_state: StateGradients,
-    of_model: ModelGradients,
+    step: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
 
     Those of vertices of shapes remain gradients with respect to what was predicted of them.
     """
     particle = wp.tid()
-    missing = _missing(complete)
+    missing = _missing(step)
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
@@ -352,7 +344,7 @@ def finish_gradients(
         of_motion.velocity[particle] = velocity
         return
     masses = of_model.particle_inv_mass
-    if masses and motion.inverse_mass[particle] > 0.0:
+    if masses and step.motion.inverse_mass[particle] > 0.0:
         masses[particle] = masses[particle] + of_motion.inverse_mass[particle] + missing
     of_state.particle_q[particle] = x1 + wp.vec3(missing)
     of_state.particle_qd[particle] = velocity + wp.vec3(missing)
@@ -361,19 +353,14 @@ def finish_gradients(
 
 @wp.kernel
 def finish_body_gradients(
-    motion: Motion,
-    gradients: Gradients,
-    complete: wp.array[int],
-    of_motion: Motion,
-    of_state: StateGradients,
-    of_model: ModelGradients,
+    step: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
 
     Where the response moves no bodies, only those of poses change.
     """
-    body = wp.tid()
-    missing = _missing(complete)
+    motion, body = step.motion, wp.tid()
+    missing = _missing(step)
     start = of_state.start_body_q[body] + of_motion.bodies.start[body]
     end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:

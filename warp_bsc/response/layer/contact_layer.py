@@ -24,7 +24,7 @@ from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ..adjoint.arrays import attach_gradients, copied, launch_adjoint
+from ..adjoint.arrays import copied, filled, launch_adjoint, with_gradients
 from ..contacts.queue import PairQueue, queues_of
 from ..integration.wrapped_solver import StateArrays, WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
@@ -239,11 +239,10 @@ class ContactLayer(WrappedSolver):
         n, particles, device = len(layer.motion.x0), len(particle_q), self.mesh.device
         of_changes = wp.zeros(n, dtype=wp.vec3, device=device)
         self._launch(kernels.begin_backward, particles, [layer, particle_q, particle_qd, of_changes])
-        layer, motion, planes = copied(layer, ()), copied(layer.motion, ()), copied(layer.planes, ())
-        of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
-        of_planes = attach_gradients(planes, ("friction",))
-        of_shares = attach_gradients(layer, ("shares",)).shares
-        layer.motion, layer.planes = motion, planes
+        motion, of_motion = with_gradients(layer.motion, ("x0", "x1", "inverse_mass", "friction"))
+        planes, of_planes = with_gradients(layer.planes, ["friction"])
+        layer, of_layer = with_gradients(layer, ["shares"])
+        layer.motion, layer.planes, of_shares = motion, planes, of_layer.shares
         over_planes = (particles, len(planes.end))
         for queue in pairs:
             launch_adjoint(kernels.add_pushes, len(queue.pairs), [layer, queue], [of_changes], device)
@@ -260,10 +259,7 @@ class ContactLayer(WrappedSolver):
         """Copies the layer and the pairs that may be in it for the adjoint; in a CUDA graph, all of the queues."""
         copies = []
         for of_kind in pairs:
-            count = len(of_kind.pairs)
-            if not self.mesh.device.is_capturing:
-                count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
-            if count:
+            if count := filled(of_kind.pairs, of_kind.counts, of_kind.count):
                 copies.append(copied(of_kind, {"pairs": count, "counts": None}))
         layer = copied(self._layer, ("shares",))
         layer.motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))

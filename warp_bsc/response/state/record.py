@@ -34,6 +34,7 @@ class RecordCounts:
     truncations: wp.array[int]  # truncated paths
     dropped: wp.array[int]  # 1 if constraints were dropped
     grazing: wp.array[int]  # contacts whose gradients are clamped
+    complete: wp.array[int]  # of a copy for an adjoint, 1 if nothing is missing
 
 
 @wp.struct
@@ -153,11 +154,11 @@ def record_offsets(constraints: Constraints, status: SolveStatus, record: StepRe
 
 
 @wp.kernel
-def check_complete(constraints: Constraints, record: StepRecord, complete: wp.array[int]):
-    """Sets ``complete`` to 1 if everything that a step did fits in these constraints and its record, else to 0."""
+def check_complete(constraints: Constraints, record: StepRecord):
+    """Sets whether the record is complete: whether all that a step did fits in these constraints and in the record."""
     counts = record.counts
     fits = constraints.count[0] <= constraints.vertices.shape[0] and counts.dropped[0] == 0
     fits = fits and counts.sweeps[0] <= record.sweep_ends.shape[0]
     fits = fits and counts.entries[0] <= record.constraint.shape[0]
     fits = fits and counts.truncations[0] <= record.vertex.shape[0]
-    complete[0] = wp.where(fits, 1, 0)
+    counts.complete[0] = wp.where(fits, 1, 0)
