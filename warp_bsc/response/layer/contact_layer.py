@@ -212,12 +212,10 @@ class ContactLayer(WrappedSolver):
         layer, detector = self._layer, self._detector
         layer.dt = dt
         pairs = queues_of(detector)
-        for of_kind in pairs:
-            self._launch_over(kernels.sum_shares, of_kind, [layer, of_kind, self._share_sums])
+        self._launch_over(kernels.sum_shares, pairs, self._share_sums)
         inputs = [layer, detector.counters.array, detector.capacities, self._share_sums, self.skipped]
         self._launch(kernels.finish_shares, len(self._y), inputs)
-        for of_kind in pairs:
-            self._launch_over(kernels.sum_pushes, of_kind, [layer, of_kind, self._sums])
+        self._launch_over(kernels.sum_pushes, pairs, self._sums)
         recorded = self._recorded(pairs) if record else None
         inputs = [layer, self._sums, end.particle_q, end.particle_qd]
         self._launch(kernels.move_particles, len(end.particle_q), inputs)
@@ -245,10 +243,10 @@ class ContactLayer(WrappedSolver):
         layer.motion, layer.planes, of_shares = motion, planes, of_layer.shares
         over_planes = (particles, len(planes.end))
         for queue in pairs:
-            launch_adjoint(kernels.add_pushes, len(queue.pairs), [layer, queue], [of_changes], device)
+            launch_adjoint(kernels.sum_pushes, len(queue.pairs), [layer, queue, None], [of_changes], device)
         launch_adjoint(kernels.add_pushes_of_planes, over_planes, [layer], [of_changes], device)
         for queue in pairs:
-            launch_adjoint(kernels.add_shares, len(queue.pairs), [layer, queue], [of_shares], device)
+            launch_adjoint(kernels.sum_shares, len(queue.pairs), [layer, queue, None], [of_shares], device)
         launch_adjoint(kernels.add_shares_of_planes, over_planes, [layer], [of_shares], device)
         inverse_mass = self.model.particle_inv_mass
         assert inverse_mass is not None
@@ -258,9 +256,9 @@ class ContactLayer(WrappedSolver):
     def _recorded(self, pairs):
         """Copies the layer and the pairs that may be in it for the adjoint; in a CUDA graph, all of the queues."""
         copies = []
-        for of_kind in pairs:
-            if count := filled(of_kind.pairs, of_kind.counts, of_kind.count):
-                copies.append(copied(of_kind, {"pairs": count, "counts": None}))
+        for queue in pairs:
+            if count := filled(queue.pairs, queue.counts, queue.count):
+                copies.append(copied(queue, {"pairs": count, "counts": None}))
         layer = copied(self._layer, ("shares",))
         layer.motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
         layer.planes = copied(self._motion.planes, ("start", "end", "friction"))
@@ -269,12 +267,12 @@ class ContactLayer(WrappedSolver):
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
 
-    def _launch_over(self, kernel, of_kind, inputs):
-        """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
-        count = len(of_kind.pairs)
-        if self.mesh.device.is_cpu:
-            count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
-        self._launch(kernel, count, inputs)
+    def _launch_over(self, kernel, pairs, sums):
+        """Launches a kernel over pairs: those found on the CPU, on one thread, as sums are not atomic."""
+        for queue in pairs:
+            on_cpu = self.mesh.device.is_cpu
+            count = filled(queue.pairs, queue.counts, queue.count) if on_cpu else len(queue.pairs)
+            self._launch(kernel, count, [self._layer, queue, sums, None])
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:

@@ -186,24 +186,17 @@ def place_vertices_between(layer: Layer, y: wp.array[wp.vec3]):
     y[vertex] = to_single(_between(layer.motion, vertex, theta))
 
 
-@wp.kernel(enable_backward=False)
-def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64]):
-    """Adds the shares of contacts to the sums of their vertices."""
-    i = wp.tid()
-    if has_pair(queue, i):
-        corners, shares = _shares_of_pair(layer, queue, i)
-        for j in range(4):
-            wp.atomic_add(sums, corners[j], to_units(shares[j]))
-
-
 @wp.kernel
-def add_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.float64]):
-    """Adds as :func:`sum_shares`, differentiably."""
+def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64], differentiable: wp.array[wp.float64]):
+    """Adds the shares of contacts to the sums of their vertices, or to ``differentiable`` ones instead."""
     i = wp.tid()
     if has_pair(queue, i):
         corners, shares = _shares_of_pair(layer, queue, i)
         for j in range(4):
-            wp.atomic_add(sums, corners[j], shares[j])
+            if differentiable:
+                wp.atomic_add(differentiable, corners[j], shares[j])
+            else:
+                wp.atomic_add(sums, corners[j], to_units(shares[j]))
 
 
 @wp.kernel(enable_backward=False)
@@ -237,24 +230,17 @@ def add_shares_of_planes(layer: Layer, sums: wp.array[wp.float64]):
     wp.atomic_add(sums, vertex, _share_of(layer, depth))
 
 
-@wp.kernel(enable_backward=False)
-def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64]):
-    """Adds what contacts move vertices by to the sums of these."""
-    i = wp.tid()
-    if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(layer, queue, i)
-        for j in range(4):
-            add_to_sum(sums, corners[j], 0, mobilities[j] * push)
-
-
 @wp.kernel
-def add_pushes(layer: Layer, queue: PairQueue, changes: wp.array[wp.vec3]):
-    """Adds as :func:`sum_pushes`, differentiably."""
+def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], differentiable: wp.array[wp.vec3]):
+    """Adds what contacts move vertices by to the sums of these, or to ``differentiable`` ones instead."""
     i = wp.tid()
     if has_pair(queue, i):
         corners, mobilities, push = _push_of_pair(layer, queue, i)
         for j in range(4):
-            wp.atomic_add(changes, corners[j], to_single(mobilities[j] * push))
+            if differentiable:
+                wp.atomic_add(differentiable, corners[j], to_single(mobilities[j] * push))
+            else:
+                add_to_sum(sums, corners[j], 0, mobilities[j] * push)
 
 
 @wp.kernel(enable_backward=False)
