@@ -6,10 +6,10 @@ from newton.solvers import SolverBase
 
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
-from .integration.wrapped_solver import StateArrays
 from .options import checked_min_distance, checked_radii, default_separation, friction_of
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
+from .state.motion import StateArrays
 from .step import inspect
 from .write_back import finish_inspection
 
@@ -66,8 +66,8 @@ class CollisionMonitor(CollisionStage):
     def _inspect(self, end, dt):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._timed():
-            self._set_end(end, dt)
-            resolution = inspect(self._work, self._motion)
-            inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
+            self._motion.set_end(end, dt)
+            inspect(self._work, self._motion)
+            inputs, outputs = [self._work.vertices.outcome, self.model.particle_count], [self._work.status]
             self._launch(finish_inspection, self.mesh.vertex_count, inputs, outputs)
-            self._count_step(resolution)
+            self._count_step()

@@ -13,12 +13,12 @@ from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, w
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
-from .integration.wrapped_solver import StateArrays
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
+from .state.motion import StateArrays
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
@@ -281,8 +281,9 @@ class SolverCCD(CollisionStage):
 
         def forward():
             nonlocal recorded
-            resolution, recorded = self._resolve(end, dt, self._recorder), None
-            if device.is_capturing or self._has_changed(resolution.vertices):
+            recorded = None
+            self._resolve(end, dt, self._recorder)
+            if device.is_capturing or self._has_changed():
                 recorded = RecordedStep(self._work, dt)
                 self._launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
@@ -294,8 +295,9 @@ class SolverCCD(CollisionStage):
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
-    def _has_changed(self, vertices):
+    def _has_changed(self):
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
+        vertices = self._work.vertices
         outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
         return any(outcome.numpy().any() for outcome in outcomes)
 
@@ -304,9 +306,8 @@ class SolverCCD(CollisionStage):
         """Resolves the motion from the start of the step to its end, and changes the end."""
         with self._timed():
             self._read_end(end, dt)
-            resolution = resolve(self._work, self._motion, dt, recorder)
-            self._write_end(resolution, end)
-        return resolution
+            resolve(self._work, self._motion, dt, recorder)
+            self._write_end(end)
 
     @one_at_a_time
     def _resolve_in_substeps(self, state, control, contacts, dt):
@@ -314,25 +315,25 @@ class SolverCCD(CollisionStage):
         with self._timed():
             self._read_end(StateArrays.of(state), dt)
             assert self._in_substeps is not None
-            resolution = self._in_substeps.resolve(state, control, contacts, dt)
-            self._write_end(resolution, StateArrays.of(state))
+            self._in_substeps.resolve(state, control, contacts, dt)
+            self._write_end(StateArrays.of(state))
 
     def _read_end(self, end, dt):
         """Reads the predicted motion."""
         if self._reads_friction:
             self._motion.friction.read()
-        self._set_end(end, dt)
+        self._motion.set_end(end, dt)
 
-    def _write_end(self, resolution, end):
-        """Writes a resolved motion to the arrays of a state, and counts the step."""
-        vertices = resolution.vertices
+    def _write_end(self, end):
+        """Writes the resolved motion to the arrays of a state, and counts the step."""
+        vertices, status = self._work.vertices, self._work.status
         inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [end.particle_q, end.particle_qd, resolution.status]
+        outputs = [end.particle_q, end.particle_qd, status]
         self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
         if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), resolution.status]
+            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), status]
             self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
-        self._count_step(resolution)
+        self._count_step()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

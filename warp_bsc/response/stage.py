@@ -14,8 +14,8 @@ from .report import SolverReport
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh
-from .state.motion import ModelMotion
-from .state.workspace import Resolution, Workspace
+from .state.motion import ModelMotion, StateArrays
+from .state.workspace import Workspace
 from .step import prepare
 from .write_back import count_step
 
@@ -57,8 +57,8 @@ class CollisionStage(CouplingHooks):
             moves_bodies=moves_bodies,
             max_iterations=max_iterations,
         )
-        self._motion.set_start(model.particle_q, model.body_q)
-        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
+        self._motion.set_start(StateArrays.of(model))
+        self._motion.set_end(StateArrays.of(model), 1.0)
         prepare(self._work, self._motion)
         self._recount_crossings()
         if not model.requires_grad:
@@ -94,7 +94,7 @@ class CollisionStage(CouplingHooks):
         with paused_tape() as tape:
             self._check_tape(tape, state_in, state_out)
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
-            self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
+            self._motion.set_start(StateArrays.of(start))  # now: some solvers overwrite it
             passed = self._begin_step(state_in, contacts)
         self._step_inner(state_in, state_out, control, passed, dt, **options)
         with paused_tape() as tape:
@@ -117,14 +117,11 @@ class CollisionStage(CouplingHooks):
         """Detects the collisions of the step after the inner solver, which was passed contacts of the program."""
         raise NotImplementedError
 
-    def _set_end(self, end, dt):
-        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
-
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
-    def _count_step(self, resolution: Resolution):
-        self._launch(count_step, 1, [resolution.status, self.report.last_substeps], [self.report.device_totals])
+    def _count_step(self):
+        self._launch(count_step, 1, [self._work.status, self.report.last_substeps], [self.report.device_totals])
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""

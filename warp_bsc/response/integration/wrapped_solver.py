@@ -1,30 +1,13 @@
 """A solver around another one, which has all attributes of the inner solver."""
 
 import functools
-from typing import NamedTuple
 
-import newton
-import warp as wp
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..._arguments import check_instance
 from ..._one_thread import Occupied
 from ..._private_names.versions import warn_if_untested
-
-
-class StateArrays(NamedTuple):
-    """The arrays of a state, which an attribute of the state may replace later."""
-
-    particle_q: wp.array | None
-    particle_qd: wp.array | None
-    body_q: wp.array | None
-    body_qd: wp.array | None
-
-    @classmethod
-    def of(cls, state: newton.State) -> "StateArrays":
-        """Returns the arrays of a state as they are now."""
-        return cls(*(getattr(state, name) for name in cls._fields))
 
 
 class WrappedSolver(SolverBase, CouplingInterface):

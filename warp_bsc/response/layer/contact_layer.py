@@ -26,10 +26,10 @@ from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
 from ..adjoint.arrays import copied, filled, launch_adjoint, with_gradients
 from ..contacts.queue import PairQueue, queues_of
-from ..integration.wrapped_solver import StateArrays, WrappedSolver
+from ..integration.wrapped_solver import WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion
+from ..state.motion import ModelMotion, StateArrays
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from . import kernels
 
@@ -119,8 +119,8 @@ class ContactLayer(WrappedSolver):
         self._layer = layer
         self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
         self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
-        self._motion.set_start(self.model.particle_q, self.model.body_q)
-        self._set_end(self.model, 1.0)
+        self._motion.set_start(StateArrays.of(self.model))
+        self._motion.set_end(StateArrays.of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
 
     @property
@@ -167,7 +167,7 @@ class ContactLayer(WrappedSolver):
                     raise NotImplementedError(
                         "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
                     )
-            self._motion.set_start(state_in.particle_q, state_in.body_q)
+            self._motion.set_start(StateArrays.of(state_in))
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with paused_tape() as tape:
             end, device = StateArrays.of(state_out), self.mesh.device
@@ -193,9 +193,6 @@ class ContactLayer(WrappedSolver):
             run_on_host(forward, device)
             tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
-    def _set_end(self, end, dt):
-        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
-
     def _detect(self):
         """Finds the pairs that may be in the layer."""
         detector = self._detector
@@ -207,7 +204,7 @@ class ContactLayer(WrappedSolver):
         """Changes the end of a step by the pushes of contacts; returns what the adjoint needs if that is recorded."""
         if self._reads_friction:
             self._motion.friction.read()
-        self._set_end(end, dt)
+        self._motion.set_end(end, dt)
         self._detect()
         layer, detector = self._layer, self._detector
         layer.dt = dt

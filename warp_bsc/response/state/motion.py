@@ -1,5 +1,7 @@
 """The motion of a model in a step: its vertices and planes at the start, and as predicted at the end."""
 
+from typing import NamedTuple
+
 import newton
 import numpy as np
 import warp as wp
@@ -154,6 +156,20 @@ def _write_end(
     motion.is_not_finite[i] = wp.where(finite, 0, 1)
 
 
+class StateArrays(NamedTuple):
+    """The arrays of a state, which an attribute of the state may replace later."""
+
+    particle_q: wp.array | None
+    particle_qd: wp.array | None
+    body_q: wp.array | None
+    body_qd: wp.array | None
+
+    @classmethod
+    def of(cls, state: newton.State | newton.Model) -> "StateArrays":
+        """Returns the arrays of a state as they are now."""
+        return cls(*(getattr(state, name) for name in cls._fields))
+
+
 def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
     if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
@@ -267,31 +283,24 @@ class ModelMotion:
         arrays: list[wp.array] = [self.vertices.interrupted]
         return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
-    def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
-        """Copies the positions at the start of a step, from arrays as of :meth:`.state.mesh.ModelMesh.positions`."""
-        inputs = [self.mesh.place(particle_q, body_q), self._last, self.vertices, self.planes]
+    def set_start(self, start: StateArrays) -> None:
+        """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
+        inputs = [self.mesh.place(start.particle_q, start.body_q), self._last, self.vertices, self.planes]
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
-            wp.copy(self.vertices.bodies.start, body_q)
+            wp.copy(self.vertices.bodies.start, start.body_q)
 
-    def set_end(
-        self,
-        particle_q: wp.array[wp.vec3] | None,
-        particle_qd: wp.array[wp.vec3] | None,
-        body_q: wp.array[wp.transform] | None,
-        dt: float,
-        body_qd: wp.array[wp.spatial_vector] | None = None,
-    ) -> None:
+    def set_end(self, end: StateArrays, dt: float) -> None:
         """Copies the predicted positions and velocities at the end of a step of length ``dt`` [s], after its start.
 
         Velocities of bodies are read only if the response can move bodies.
         """
-        place = self.mesh.place(particle_q, body_q)
+        place = self.mesh.place(end.particle_q, end.body_q)
         if self.moves_bodies:
-            self.set_body_ends(body_q, body_qd)
+            self.set_body_ends(end.body_q, end.body_qd)
         elif self.keeps_poses:
-            wp.copy(self.vertices.bodies.end, body_q)
-        inputs = [place, particle_qd, dt, self._last, self.vertices, self.planes]
+            wp.copy(self.vertices.bodies.end, end.body_q)
+        inputs = [place, end.particle_qd, dt, self._last, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
     def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:

@@ -1,7 +1,6 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -69,21 +68,6 @@ def _begin(
     if dividing.first:
         dividing.first[i] = NO_NODE
         dividing.kept[i] = NO_NODE
-
-
-@dataclass(frozen=True)
-class Resolution:
-    """The result of a step; the next step overwrites its arrays.
-
-    Attributes:
-        vertices: The vertices as they were moved.
-        constraints: The constraints that moved them.
-        status: The solve status at the end.
-    """
-
-    vertices: Vertices
-    constraints: Constraints
-    status: SolveStatus
 
 
 class Workspace:
@@ -159,11 +143,6 @@ class Workspace:
         self.turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self._max_blocks = BLOCKS * device.sm_count
-
-    @property
-    def resolution(self) -> Resolution:
-        """The step as it was resolved last."""
-        return Resolution(self.vertices, self.constraints, self.status)
 
     def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
         """Initializes everything for a step.
