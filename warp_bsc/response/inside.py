@@ -66,7 +66,7 @@ class InsideFinder:
 
     def __init__(self, mesh: ModelMesh):
         """Takes the mesh of a model; the first search finds its solids."""
-        self._mesh = mesh
+        self._mesh, self._world = mesh, mesh.device_world.numpy()
 
     def find(self, x: np.ndarray | wp.array, planes: np.ndarray | wp.array) -> Inside:
         """Returns which particles are inside solids. Synchronizes with the device of the arrays.
@@ -124,11 +124,6 @@ class InsideFinder:
             inside = particles[deep & (movable[particles] | moves[of_planes.body[i]])]
             rows.append(np.column_stack([inside, np.full_like(inside, of_planes.shape[i]), np.full_like(inside, -1)]))
         return np.concatenate(rows)
-
-    @functools.cached_property
-    def _world(self) -> np.ndarray:
-        """World of each vertex, shape [vertex_count]."""
-        return self._mesh.device_world.numpy()
 
     @functools.cached_property
     def _solids(self) -> _Solids:

@@ -24,7 +24,7 @@ from .step import resolve
 from .substeps.inner_contacts import InnerContacts
 from .substeps.substeps import Substeps
 from .tuning import SUBSTEPS
-from .write_back import count_record, write_back, write_back_bodies
+from .write_back import count_record, write_back
 
 
 class SolverCCD(CollisionStage):
@@ -326,13 +326,10 @@ class SolverCCD(CollisionStage):
 
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""
-        vertices, status = self._work.vertices, self._work.status
-        inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [end.particle_q, end.particle_qd, status]
-        self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
-        if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), status]
-            self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
+        size = max(self.mesh.vertex_count, self.model.body_count)
+        poses = body_q_prev(self.solver) if self._moves_bodies else None
+        outputs = [*end, poses, self._work.status]
+        self._launch(write_back, size, [self._work.vertices], outputs)
         self._count_step()
 
     def update_contacts(self, contacts, state=None):

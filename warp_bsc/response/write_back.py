@@ -5,61 +5,14 @@ import warp as wp
 from .report import StepTotals
 from .schedule import SolveStatus
 from .state.record import RecordCounts
-from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, MovedBodies
+from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def write_back(
-    # in
-    outcome: wp.array[int],
-    x1: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    # out
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-    status: SolveStatus,
-):
-    """Writes the particles that the response changed; the others keep every bit of what they are."""
-    particle = wp.tid()
-    if particle >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
-        if outcome[particle] & NOT_FINITE != 0:
-            status.results.certified[0] = 0
-        return
-    if outcome[particle] != 0:
-        particle_q[particle] = x1[particle]
-        particle_qd[particle] = velocity[particle]
-    if outcome[particle] & TRUNCATED != 0:
-        status.results.truncated[0] = 1
-    if outcome[particle] & FROZEN != 0:
-        status.results.frozen[0] = 1
-    if outcome[particle] & NOT_FINITE != 0:
-        wp.atomic_add(status.results.not_finite, 0, 1)
-
-
-@wp.kernel
-def write_back_bodies(
-    # in
-    bodies: MovedBodies,
-    # out
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_q_prev: wp.array[wp.transform],
-    status: SolveStatus,
-):
-    """Writes the bodies that the response changed; the others keep every bit of what they are.
-
-    VBD takes the velocity of its next step from ``body_q_prev``, where it has that array.
-    """
-    body = wp.tid()
-    outcome = bodies.outcome[body]
-    if outcome == 0:
-        return
-    body_q[body] = bodies.pose[body]
-    body_qd[body] = bodies.velocity[body]
-    if body_q_prev:
-        body_q_prev[body] = bodies.pose[body]
+@wp.func
+def _write_cuts(outcome: int, status: SolveStatus):
+    """Writes to the status whether a path was truncated, or something was frozen."""
     if outcome & TRUNCATED != 0:
         status.results.truncated[0] = 1
     if outcome & FROZEN != 0:
@@ -67,13 +20,46 @@ def write_back_bodies(
 
 
 @wp.kernel
-def finish_inspection(
+def write_back(
     # in
-    outcome: wp.array[int],
-    particle_count: int,
+    vertices: Vertices,
     # out
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    body_q_prev: wp.array[wp.transform],
     status: SolveStatus,
 ):
+    """Writes the particles and bodies that the response changed; the others keep every bit of what they are.
+
+    VBD takes the velocity of its next step from ``body_q_prev``, where it has that array.
+    """
+    i = wp.tid()
+    bodies = vertices.bodies
+    if i < bodies.outcome.shape[0] and bodies.outcome[i] != 0:
+        body_q[i] = bodies.pose[i]
+        body_qd[i] = bodies.velocity[i]
+        if body_q_prev:
+            body_q_prev[i] = bodies.pose[i]
+        _write_cuts(bodies.outcome[i], status)
+    if i >= vertices.outcome.shape[0]:
+        return
+    outcome = vertices.outcome[i]
+    if i >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
+        if outcome & NOT_FINITE != 0:
+            status.results.certified[0] = 0
+        return
+    if outcome != 0:
+        particle_q[i] = vertices.x1[i]
+        particle_qd[i] = vertices.velocity[i]
+    if outcome & NOT_FINITE != 0:
+        wp.atomic_add(status.results.not_finite, 0, 1)
+    _write_cuts(outcome, status)
+
+
+@wp.kernel
+def finish_inspection(outcome: wp.array[int], particle_count: int, status: SolveStatus):
     """Makes the status of an inspection that of a step in which nothing was changed.
 
     The inspection took vertices without a finite end to stand. Their motion as it is stored is not certified.
@@ -91,20 +77,19 @@ def finish_inspection(
 @wp.kernel
 def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals):
     """Adds a step to the totals."""
+    results = status.results
     # a certified motion of elements that did not cross makes no crossings
-    unchanged = (
-        status.results.certified[0] == 1 and status.results.crossings[0] == 0 and status.results.excluded[0] == 0
-    )
+    unchanged = results.certified[0] == 1 and results.crossings[0] == 0 and results.excluded[0] == 0
     status.loop.recount[0] = wp.where(unchanged, 0, 1)
     totals.steps[0] += wp.int64(1)
     totals.substepped_steps[0] += wp.int64(wp.min(substeps[0], 1))
-    totals.uncertified_steps[0] += wp.int64(1 - status.results.certified[0])
-    totals.undetected_steps[0] += wp.int64(status.results.undetected[0])
-    totals.truncated_steps[0] += wp.int64(status.results.truncated[0])
-    totals.frozen_steps[0] += wp.int64(status.results.frozen[0])
-    totals.not_finite_steps[0] += wp.int64(wp.min(status.results.not_finite[0], 1))
-    totals.remaining[0] += wp.int64(status.results.remaining[0])
-    totals.excluded[0] += wp.int64(status.results.excluded[0])
+    totals.uncertified_steps[0] += wp.int64(1 - results.certified[0])
+    totals.undetected_steps[0] += wp.int64(results.undetected[0])
+    totals.truncated_steps[0] += wp.int64(results.truncated[0])
+    totals.frozen_steps[0] += wp.int64(results.frozen[0])
+    totals.not_finite_steps[0] += wp.int64(wp.min(results.not_finite[0], 1))
+    totals.remaining[0] += wp.int64(results.remaining[0])
+    totals.excluded[0] += wp.int64(results.excluded[0])
 
 
 @wp.kernel
