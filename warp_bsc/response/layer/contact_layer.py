@@ -77,10 +77,10 @@ class ContactLayer(WrappedSolver):
             thickness: Thickness of the layer [m], above the minimum distances. It should be more than the longest path
                 of a step, and less than half of the shortest edge, as neighbours beyond the next push each other as
                 well. Default: a quarter of the median edge length, at most 0.45 of the shortest.
-            friction: As for :class:`.solver_ccd.SolverCCD`.
-            restitution: As for :class:`.solver_ccd.SolverCCD`.
+            friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
+            restitution: Share of the approaching velocity that comes back, in [0, 1].
             min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
-            particle_radius: As for :class:`.solver_ccd.SolverCCD`.
+            particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
 
         Raises:
             TypeError: If an argument has another type.
@@ -109,10 +109,9 @@ class ContactLayer(WrappedSolver):
         layer.thickness, layer.restitution = self.thickness, self.restitution
         layer.motion, layer.planes = self._motion.vertices, self._motion.planes
         layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
-        device = mesh.device
+        device, n = mesh.device, mesh.vertex_count
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
-        n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
         self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
         layer.shares = wp.zeros(n, dtype=wp.float64, device=device)
@@ -143,13 +142,7 @@ class ContactLayer(WrappedSolver):
     ) -> None:
         """Steps the inner solver, and pushes particles that have come into the layer.
 
-        Args:
-            state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same, except on a tape.
-            control: As for the inner solver.
-            contacts: As for the inner solver.
-            dt: Length of the step [s], more than 0.
-            options: As for the inner solver.
+        Arguments are those of :meth:`.stage.CollisionStage.step`; on a tape, ``state_out`` must not be ``state_in``.
 
         Raises:
             TypeError: If ``dt`` is no number.
@@ -223,13 +216,6 @@ class ContactLayer(WrappedSolver):
 
         Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
         from, and of restitution, where these have such arrays.
-
-        Args:
-            layer: The layer as it was recorded.
-            pairs: The pairs that may be in it, of each kind.
-            start_q: Gradient with respect to positions at the start.
-            particle_q: Gradient with respect to the positions at the end.
-            particle_qd: Gradient with respect to the velocities at the end.
         """
         n, particles, device = len(layer.motion.x0), len(particle_q), self.mesh.device
         of_changes = wp.zeros(n, dtype=wp.vec3, device=device)

@@ -96,16 +96,10 @@ class Workspace:
         moves_bodies: bool,
         max_iterations: int,
     ):
-        """Allocates buffers.
+        """Allocates buffers for steps with these options, see :class:`.solver_ccd.SolverCCD`.
 
-        Args:
-            mesh: The mesh.
-            separation: Distance that projection moves contacts apart [m].
-            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
-            differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not
-                divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
-            moves_bodies: Whether motions have bodies that can be moved.
-            max_iterations: Iterations of detect and project.
+        If they are ``differentiable``, steps may be recorded: all sweeps are made then, and paths are truncated, not
+        divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         """
         self.mesh, self.device = mesh, mesh.device
         self.separation, self.restitution = separation, restitution
