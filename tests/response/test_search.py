@@ -10,7 +10,7 @@ from sheets import crumpled
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.response.state.motion import StateArrays
+from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
 from warp_bsc.response.step import inspect
 
@@ -86,9 +86,10 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     for tiny in (False, True):
         solver = stage(model, monkeypatch, tiny=tiny, max_iterations=0)  # so that first contacts are found at once
         work, motion = solver._work, solver._motion
-        motion.set_start(StateArrays.of(model))
-        end_q = wp.array(end, dtype=wp.vec3, device=device)
-        motion.set_end(StateArrays.of(model)._replace(particle_q=end_q), DT)
+        arrays = arrays_of(model)
+        motion.set_start(arrays)
+        arrays.particle_q = wp.array(end, dtype=wp.vec3, device=device)
+        motion.set_end(arrays, DT)
         inspect(work, motion)
         results = work.status.results
         keys = work.vertices.first_contact.numpy()

@@ -9,7 +9,7 @@ from ..detection.host_function import run_on_host
 from .options import checked_min_distance, checked_radii, default_separation, friction_of
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
-from .state.motion import StateArrays
+from .state.motion import arrays_of
 from .step import inspect
 from .write_back import finish_inspection
 
@@ -59,7 +59,7 @@ class CollisionMonitor(CollisionStage):
         self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
-        end = StateArrays.of(state_out)
+        end = arrays_of(state_out)
         run_on_host(lambda: self._inspect(end, dt), self.mesh.device)
 
     @one_at_a_time

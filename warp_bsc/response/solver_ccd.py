@@ -18,7 +18,7 @@ from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
-from .state.motion import StateArrays
+from .state.motion import arrays_of
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
@@ -258,13 +258,13 @@ class SolverCCD(CollisionStage):
             self.solver.step(*arguments, **options)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
-        device, end = self.mesh.device, StateArrays.of(state_out)
+        device, end = self.mesh.device, arrays_of(state_out)
         if self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
         if self._in_substeps is not None:
             run_on_host(lambda: self._resolve_in_substeps(state_out, control, passed, dt), device)
         elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
-            self._record(StateArrays.of(state_in), end, dt, tape)
+            self._record(arrays_of(state_in), end, dt, tape)
         else:
             run_on_host(lambda: self._resolve(end, dt), device)
 
@@ -313,10 +313,10 @@ class SolverCCD(CollisionStage):
     def _resolve_in_substeps(self, state, control, contacts, dt):
         """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
         with self._timed():
-            self._read_end(StateArrays.of(state), dt)
+            self._read_end(arrays_of(state), dt)
             assert self._in_substeps is not None
             self._in_substeps.resolve(state, control, contacts, dt)
-            self._write_end(StateArrays.of(state))
+            self._write_end(arrays_of(state))
 
     def _read_end(self, end, dt):
         """Reads the predicted motion."""
@@ -328,7 +328,7 @@ class SolverCCD(CollisionStage):
         """Writes the resolved motion to the arrays of a state, and counts the step."""
         size = max(self.mesh.vertex_count, self.model.body_count)
         poses = body_q_prev(self.solver) if self._moves_bodies else None
-        outputs = [*end, poses, self._work.status]
+        outputs = [end, poses, self._work.status]
         self._launch(write_back, size, [self._work.vertices], outputs)
         self._count_step()
 

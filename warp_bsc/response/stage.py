@@ -14,7 +14,7 @@ from .report import SolverReport
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh
-from .state.motion import ModelMotion, StateArrays
+from .state.motion import ModelMotion, arrays_of
 from .state.workspace import Workspace
 from .step import prepare
 from .write_back import count_step
@@ -57,8 +57,8 @@ class CollisionStage(CouplingHooks):
             moves_bodies=moves_bodies,
             max_iterations=max_iterations,
         )
-        self._motion.set_start(StateArrays.of(model))
-        self._motion.set_end(StateArrays.of(model), 1.0)
+        self._motion.set_start(arrays_of(model))
+        self._motion.set_end(arrays_of(model), 1.0)
         prepare(self._work, self._motion)
         self._recount_crossings()
         if not model.requires_grad:
@@ -94,7 +94,7 @@ class CollisionStage(CouplingHooks):
         with paused_tape() as tape:
             self._check_tape(tape, state_in, state_out)
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
-            self._motion.set_start(StateArrays.of(start))  # now: some solvers overwrite it
+            self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
             passed = self._begin_step(state_in, contacts)
         self._step_inner(state_in, state_out, control, passed, dt, **options)
         with paused_tape() as tape:

@@ -4,6 +4,7 @@ import warp as wp
 
 from .report import StepTotals
 from .schedule import SolveStatus
+from .state.motion import StateArrays
 from .state.record import RecordCounts
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
 
@@ -20,17 +21,7 @@ def _write_cuts(outcome: int, status: SolveStatus):
 
 
 @wp.kernel
-def write_back(
-    # in
-    vertices: Vertices,
-    # out
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_q_prev: wp.array[wp.transform],
-    status: SolveStatus,
-):
+def write_back(vertices: Vertices, end: StateArrays, body_q_prev: wp.array[wp.transform], status: SolveStatus):
     """Writes the particles and bodies that the response changed; the others keep every bit of what they are.
 
     VBD takes the velocity of its next step from ``body_q_prev``, where it has that array.
@@ -38,21 +29,21 @@ def write_back(
     i = wp.tid()
     bodies = vertices.bodies
     if i < bodies.outcome.shape[0] and bodies.outcome[i] != 0:
-        body_q[i] = bodies.pose[i]
-        body_qd[i] = bodies.velocity[i]
+        end.body_q[i] = bodies.pose[i]
+        end.body_qd[i] = bodies.velocity[i]
         if body_q_prev:
             body_q_prev[i] = bodies.pose[i]
         _write_cuts(bodies.outcome[i], status)
     if i >= vertices.outcome.shape[0]:
         return
     outcome = vertices.outcome[i]
-    if i >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
+    if i >= end.particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
         if outcome & NOT_FINITE != 0:
             status.results.certified[0] = 0
         return
     if outcome != 0:
-        particle_q[i] = vertices.x1[i]
-        particle_qd[i] = vertices.velocity[i]
+        end.particle_q[i] = vertices.x1[i]
+        end.particle_qd[i] = vertices.velocity[i]
     if outcome & NOT_FINITE != 0:
         wp.atomic_add(status.results.not_finite, 0, 1)
     _write_cuts(outcome, status)

@@ -29,7 +29,7 @@ from ..contacts.queue import PairQueue, queues_of
 from ..integration.wrapped_solver import WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion, StateArrays
+from ..state.motion import ModelMotion, arrays_of
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from . import kernels
 
@@ -118,8 +118,8 @@ class ContactLayer(WrappedSolver):
         self._layer = layer
         self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
         self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
-        self._motion.set_start(StateArrays.of(self.model))
-        self._motion.set_end(StateArrays.of(self.model), 1.0)
+        self._motion.set_start(arrays_of(self.model))
+        self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
 
     @property
@@ -160,10 +160,10 @@ class ContactLayer(WrappedSolver):
                     raise NotImplementedError(
                         "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
                     )
-            self._motion.set_start(StateArrays.of(state_in))
+            self._motion.set_start(arrays_of(state_in))
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with paused_tape() as tape:
-            end, device = StateArrays.of(state_out), self.mesh.device
+            end, device = arrays_of(state_out), self.mesh.device
             if end.particle_q is None:
                 return
             if tape is None or not end.particle_q.requires_grad:
@@ -207,8 +207,7 @@ class ContactLayer(WrappedSolver):
         self._launch(kernels.finish_shares, len(self._y), inputs)
         self._launch_over(kernels.sum_pushes, pairs, self._sums)
         recorded = self._recorded(pairs) if record else None
-        inputs = [layer, self._sums, end.particle_q, end.particle_qd]
-        self._launch(kernels.move_particles, len(end.particle_q), inputs)
+        self._launch(kernels.move_particles, len(end.particle_q), [layer, self._sums, end])
         return recorded
 
     def _backward(self, layer, pairs, start_q, particle_q, particle_qd):

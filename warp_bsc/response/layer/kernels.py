@@ -12,6 +12,7 @@ from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
 from ..schedule import has_overflowed
 from ..state.fixed_sum import add_to_sum, from_units, sum_of, to_units, with_delta
+from ..state.motion import StateArrays
 from ..state.planes import MovingPlanes, signed_distance
 from ..state.structs import Motion
 from ..state.vectors import ONE, ZERO, to_double, to_single
@@ -244,9 +245,7 @@ def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], diffe
 
 
 @wp.kernel(enable_backward=False)
-def move_particles(
-    layer: Layer, sums: wp.array2d[wp.int64], particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3]
-):
+def move_particles(layer: Layer, sums: wp.array2d[wp.int64], end: StateArrays):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
     motion, vertex = layer.motion, wp.tid()
     for plane in range(layer.planes.end.shape[0]):
@@ -255,8 +254,8 @@ def move_particles(
     if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
         motion.velocity[vertex] += to_single(change / wp.float64(layer.dt))
-        particle_q[vertex] = motion.x1[vertex]
-        particle_qd[vertex] = motion.velocity[vertex]
+        end.particle_q[vertex] = motion.x1[vertex]
+        end.particle_qd[vertex] = motion.velocity[vertex]
     for axis in range(3):
         sums[vertex, axis] = wp.int64(0)
 

@@ -1,7 +1,5 @@
 """The motion of a model in a step: its vertices and planes at the start, and as predicted at the end."""
 
-from typing import NamedTuple
-
 import newton
 import numpy as np
 import warp as wp
@@ -16,6 +14,24 @@ from .vectors import to_double
 
 _SAME_POSE = 1e-5
 """Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
+
+
+@wp.struct
+class StateArrays:
+    """The arrays of a state, which an attribute of the state may replace later; None where it has none."""
+
+    particle_q: wp.array[wp.vec3]
+    particle_qd: wp.array[wp.vec3]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+
+
+def arrays_of(state: newton.State | newton.Model) -> StateArrays:
+    """Returns the arrays of a state as they are now."""
+    arrays = StateArrays()
+    for name in StateArrays.vars:
+        setattr(arrays, name, getattr(state, name))
+    return arrays
 
 
 @wp.func
@@ -91,14 +107,7 @@ def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, plan
 
 @wp.kernel(enable_backward=False)
 def _write_bodies(
-    # in
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_inv_mass: wp.array[float],
-    body_flags: wp.array[int],
-    worlds: int,
-    # in and out
-    motion: Motion,
+    end: StateArrays, body_inv_mass: wp.array[float], body_flags: wp.array[int], worlds: int, motion: Motion
 ):
     """Writes poses, velocities and inverse masses of bodies at the end of the step.
 
@@ -106,8 +115,8 @@ def _write_bodies(
     worlds.
     """
     body = wp.tid()
-    pose = body_q[body]
-    velocity = body_qd[body]
+    pose = end.body_q[body]
+    velocity = end.body_qd[body]
     movable = wp.isfinite(wp.transform_get_translation(pose)) and wp.isfinite(wp.transform_get_rotation(pose))
     movable = movable and wp.isfinite(wp.length(velocity)) and body_flags[body] & BodyFlags.KINEMATIC == 0
     movable = movable and (worlds <= 1 or motion.bodies.world[body] >= 0)
@@ -154,20 +163,6 @@ def _write_end(
     motion.x1[i] = wp.where(finite, x1, x0)
     motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
     motion.is_not_finite[i] = wp.where(finite, 0, 1)
-
-
-class StateArrays(NamedTuple):
-    """The arrays of a state, which an attribute of the state may replace later."""
-
-    particle_q: wp.array | None
-    particle_qd: wp.array | None
-    body_q: wp.array | None
-    body_qd: wp.array | None
-
-    @classmethod
-    def of(cls, state: newton.State | newton.Model) -> "StateArrays":
-        """Returns the arrays of a state as they are now."""
-        return cls(*(getattr(state, name) for name in cls._fields))
 
 
 def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
@@ -297,14 +292,14 @@ class ModelMotion:
         """
         place = self.mesh.place(end.particle_q, end.body_q)
         if self.moves_bodies:
-            self.set_body_ends(end.body_q, end.body_qd)
+            self.set_body_ends(end)
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, end.body_q)
         inputs = [place, end.particle_qd, dt, self._last, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
-    def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
+    def set_body_ends(self, end: StateArrays) -> None:
         """Copies the predicted poses and velocities of bodies, but not the positions of their vertices."""
         model = self.mesh.model
-        inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
+        inputs = [end, model.body_inv_mass, model.body_flags, model.world_count]
         wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)

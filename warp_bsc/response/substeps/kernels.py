@@ -4,7 +4,7 @@ import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, approach_of
 from ..schedule import SolveStatus
-from ..state.motion import moves_with_body, predicted_position, predicted_velocity
+from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
 from ..state.structs import Constraints, ContactKind, Motion, Vertices
 
@@ -14,16 +14,6 @@ _NOT_PROJECTED = wp.constant(-2)
 """Iteration of the last contact of a world that takes no substeps: no iteration projects its vertices."""
 _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 """Separation of a constraint that no motion violates, so that it never acts [m]."""
-
-
-@wp.struct
-class SubstepState:
-    """Positions and velocities of a ``newton.State``."""
-
-    particle_q: wp.array[wp.vec3]
-    particle_qd: wp.array[wp.vec3]
-    body_q: wp.array[wp.transform]
-    body_qd: wp.array[wp.spatial_vector]
 
 
 @wp.kernel
@@ -92,7 +82,7 @@ def start_substep(
     dt: float,
     remaining: wp.array[int],
     detected: wp.array[int],
-    end: SubstepState,
+    end: StateArrays,
     # in and out
     substep: Motion,
     constraints: Constraints,
@@ -176,7 +166,7 @@ def end_substep(
     vertices: Vertices,
     remaining: wp.array[int],
     substep: Motion,
-    state: SubstepState,
+    state: StateArrays,
     body_q_prev: wp.array[wp.transform],
 ):
     """Makes the end of a substep the start of the next, of vertices and of bodies that the response can move."""
@@ -226,7 +216,7 @@ def _pose_between(start: wp.transform, end: wp.transform, share: float) -> wp.tr
 
 
 @wp.kernel
-def end_body_substeps(takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState):
+def end_body_substeps(takes_substeps: wp.array[int], after: StateArrays, motion: Motion, state: StateArrays):
     """Makes the poses after the substeps the predicted ones, in worlds that take substeps."""
     body = wp.tid()
     if motion.bodies.inverse_mass[body] == 0.0 or takes_substeps[wp.max(motion.bodies.world[body], 0)] == 0:
@@ -239,7 +229,7 @@ def end_body_substeps(takes_substeps: wp.array[int], after: SubstepState, motion
 
 @wp.kernel
 def end_substeps(
-    takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState, vertices: Vertices
+    takes_substeps: wp.array[int], after: StateArrays, motion: Motion, state: StateArrays, vertices: Vertices
 ):
     """Makes the substeps the predicted motion, in worlds that take them, and puts vertices back to the start.
 

@@ -30,7 +30,7 @@ from ..contacts.detect import detect_penetrations
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion
+from ..state.motion import ModelMotion, arrays_of
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts, resolve_contacts
 from . import kernels
@@ -238,7 +238,7 @@ class Substeps:
         attributes.update(kept)
         for array, saved in step.arrays:
             wp.copy(array, saved)
-        inputs = [self._takes_substeps, _arrays_of(start), motion, _arrays_of(step.state)]
+        inputs = [self._takes_substeps, arrays_of(start), motion, arrays_of(step.state)]
         if self._moves_bodies:
             work.launch(kernels.end_body_substeps, mesh.model.body_count, inputs)
         work.launch(kernels.end_substeps, mesh.vertex_count, inputs, [work.vertices])
@@ -247,7 +247,7 @@ class Substeps:
         """Steps the inner solver, and projects its motion onto the constraints."""
         work, mesh, motion, substep = self._work, self._mesh, self._motion, self._substep
         start, end, bodies = self._in, self._out, mesh.model.body_count
-        starts = _arrays_of(start)  # now: solvers may replace arrays of a state
+        starts = arrays_of(start)  # now: solvers may replace arrays of a state
         if bodies:
             inputs = [motion.vertices, self._start.body_q, step.state.body_q, substeps, self._remaining]
             work.launch(kernels.move_bodies, bodies, inputs, [start.body_q, end.body_q])
@@ -257,9 +257,9 @@ class Substeps:
         self._step(start, end, step.control, step.contacts, substep_dt)
         work.motion = substep
         if self._moves_bodies:
-            substep.set_body_ends(end.body_q, end.body_qd)
+            substep.set_body_ends(arrays_of(end))
             work.launch_over_bodies(begin_bodies)
-        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, _arrays_of(end)]
+        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, arrays_of(end)]
         outputs = [substep.vertices, work.constraints, work.status, substep.planes, work.vertices]
         size = max(mesh.vertex_count, len(motion.planes.start))
         work.launch(kernels.start_substep, size, inputs, outputs)
@@ -281,11 +281,3 @@ class Substeps:
         find_contacts(work, self._motion)
         work.launch(kernels.restore_detection, work.worlds, [self._detected, self._is_fast], [work.status])
         resolve_contacts(work, dt)
-
-
-def _arrays_of(state):
-    """Returns positions and velocities of a state as a struct."""
-    arrays = kernels.SubstepState()
-    for name in kernels.SubstepState.vars:
-        setattr(arrays, name, getattr(state, name))
-    return arrays
