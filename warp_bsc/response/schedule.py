@@ -29,7 +29,7 @@ bodies that are left to the inner solver, see :class:`.contacts.rules.ContactCla
 
 import warp as wp
 
-from .state.structs import Constraints
+from .state.structs import Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -247,13 +247,7 @@ def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -
 
 @wp.kernel
 def decide(
-    # in
-    constraints: Constraints,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    can_search: bool,
-    # in and out
-    status: SolveStatus,
+    step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus
 ):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
 
@@ -286,7 +280,7 @@ def decide(
     loop.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
     loop.iteration[0] = loop.iteration[0] + loop.active[0]
     results.iterations[0] = results.iterations[0] + loop.active[0]
-    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
+    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
 
 
 @wp.kernel

@@ -100,7 +100,7 @@ class StepAdjoint:
         self._constraints, self._truncations = len(recorded.constraints.vertices), len(recorded.record.vertex)
         self._gradients = gradients = allocate(restore.Gradients, vertices, device)
         gradients.bodies = of_bodies = allocate(restore.BodyGradients, bodies, device)
-        self._step = step = RestoredStep()
+        self._restored = restored = RestoredStep()
         planes, motion = copied(recorded.planes, ()), copied(recorded.motion, ())
         self._of_planes = attach_gradients(planes, ("start", "end", "friction"))
         self._of_motion = attach_gradients(motion, ("x0", "x1", "velocity", "inverse_mass", "friction"))
@@ -131,9 +131,11 @@ class StepAdjoint:
         self._of_paths = attach_gradients(self._paths, restore.Paths.vars)
         status = copied(work.status, ())
         status.loop = allocate(LoopControl, 1, device)
-        step.motion, step.planes, step.vertices, step.constraints = motion, planes, moved, constraints
-        step.status, step.record, step.cursor = status, recorded.record, allocate(restore.Cursor, 1, device)
-        step.restitution, step.separation, step.dt = work.restitution, work.separation, recorded.dt
+        self._step = step = restored.step
+        step.motion, step.vertices, step.constraints = motion, moved, constraints
+        step.separation, step.restitution = work.step.separation, work.step.restitution
+        restored.planes, restored.status, restored.dt = planes, status, recorded.dt
+        restored.record, restored.cursor = recorded.record, allocate(restore.Cursor, 1, device)
         sums, of_changes = (moved.particle_delta_x, moved.bodies.delta_x), (gradients.x1, of_bodies.shift)
         self._positions = self._projection(motion.x1, "position_multiplier", sums, of_changes)
         sums = moved.particle_delta_v, moved.bodies.delta_v
@@ -163,17 +165,18 @@ class StepAdjoint:
             of_state: The arrays of :class:`.adjoint.restore.StateGradients`, in its order; those of bodies may be
                 omitted if the model has none.
         """
-        recorded, step, gradients, of_motion = self._recorded, self._step, self._gradients, self._of_motion
-        motion, cursor, both = step.motion, step.cursor, self._vertices_and_bodies
+        recorded, restored, gradients, of_motion = self._recorded, self._restored, self._gradients, self._of_motion
+        step, cursor, both = self._step, restored.cursor, self._vertices_and_bodies
+        motion = step.motion
         of_states, of_model = restore.StateGradients(), restore.ModelGradients()
         for name, array in zip(restore.StateGradients.vars, of_state, strict=False):
             setattr(of_states, name, array)
         for name in restore.ModelGradients.vars:
-            array = self._work.restitution if name == "restitution" else getattr(self._mesh.model, name)
+            array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
-        wp.copy(step.status.loop.iteration, recorded.iteration)
+        wp.copy(restored.status.loop.iteration, recorded.iteration)
         self._launch(restore.begin_gradients, both, motion, recorded.undetected, of_states, gradients, of_motion)
-        self._launch(restore.restore_velocities, both, step, gradients)  # as they were before the turn
+        self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)
         self._set_centres(step.vertices.bodies.pose)
         self._through_turn()
@@ -198,20 +201,20 @@ class StepAdjoint:
         shapes, planes = mesh.device_shape_vertices, mesh.device_planes
         inputs = [motion, shapes.body, shapes.position, mesh.model.particle_count, self._recorded.dt]
         self._launch_adjoint(kernels.place_shape_vertices, len(shapes.body), inputs)
-        inputs = [motion, planes.point, planes.normal, planes.body, self._step.planes]
+        inputs = [motion, planes.point, planes.normal, planes.body, self._restored.planes]
         self._launch_adjoint(kernels.place_planes, len(planes.body), inputs)
 
     def _through_turn(self):
         """Goes back through the turn that restores angular momentum."""
-        motion, vertices, constraints = self._step.motion, self._step.vertices, self._step.constraints
-        both, gradients, shape = self._vertices_and_bodies, self._gradients, (self._work.worlds, int(SUMS))
+        step, gradients, shape = self._step, self._gradients, (self._work.worlds, int(SUMS))
+        both = self._vertices_and_bodies
         totals = wp.zeros(shape, dtype=wp.float64, device=self._mesh.device, requires_grad=True)
-        self._launch(kernels.add_torques, self._constraints, motion, vertices, constraints, totals)
-        self._launch(kernels.add_moments, both, motion, vertices, totals)
+        self._launch(kernels.add_torques, self._constraints, step, totals)
+        self._launch(kernels.add_moments, both, step, totals)
         of_outputs = [gradients.velocity, gradients.bodies.velocity]
-        self._launch_adjoint(kernels.turn_velocities, both, [motion, vertices, totals], of_outputs)
-        self._launch_adjoint(kernels.add_moments, both, [motion, vertices, totals])
-        self._launch_adjoint(kernels.add_torques, self._constraints, [motion, vertices, constraints, totals])
+        self._launch_adjoint(kernels.turn_velocities, both, [step, totals], of_outputs)
+        self._launch_adjoint(kernels.add_moments, both, [step, totals])
+        self._launch_adjoint(kernels.add_torques, self._constraints, [step, totals])
 
     def _batch(self, through):
         for _ in range(SWEEPS_PER_BATCH):
@@ -219,18 +222,17 @@ class StepAdjoint:
 
     def _through_velocity_sweep(self):
         """Goes back through a sweep on velocities."""
-        vertices, gradients = self._step.vertices, self._gradients
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._velocities)
+        gradients = self._gradients
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._velocities)
         self._restore_velocities()
         self._through_change(self._velocities)
         self._collect(gradients.velocity, gradients.more_velocity)
-        inputs = [self._step.motion, vertices]
-        self._launch_adjoint(kernels.vertex_velocities, self._shape_vertices, inputs, [gradients.on_bodies])
+        self._launch_adjoint(kernels.vertex_velocities, self._shape_vertices, [self._step], [gradients.on_bodies])
 
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         self._restore_velocities()
-        inputs = [self._step, self._velocities]
+        inputs = [self._restored, self._velocities]
         self._launch_adjoint(kernels.initialize_multipliers, self._constraints, inputs)
         self._of_constraints.previous_multiplier.zero_()
 
@@ -241,15 +243,15 @@ class StepAdjoint:
         self._through_truncation()
         self._move_cursor(Move.SWEEPS)
         if self._moves_bodies:
-            wp.capture_if(self._step.cursor.more_sweeps, self._through_projection)
-        wp.capture_while(self._step.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
+            wp.capture_if(self._restored.cursor.more_sweeps, self._through_projection)
+        wp.capture_while(self._restored.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
         self._move_cursor(Move.DETECTION)
-        inputs = [self._step, self._recorded.constraints]
+        inputs = [self._restored, self._recorded.constraints]
         self._launch_adjoint(kernels.make_constraints, self._constraints, inputs)
 
     def _through_position_sweep(self):
         """Goes back through a sweep on positions."""
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._positions)
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._positions)
         self._restore_positions()
         self._place()
         self._through_change(self._positions)
@@ -257,31 +259,29 @@ class StepAdjoint:
 
     def _through_change(self, swept):
         """Goes back through what a sweep changes."""
-        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._step, swept])
+        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._restored, swept])
         self._step.vertices.active.zero_()
         if self._moves_bodies:
             self._step.vertices.bodies.active.zero_()
 
     def _through_truncation(self):
         """Goes back through the truncation of paths."""
-        step, times, count = self._step, self._times, self._truncations
-        self._launch(restore.restore_paths, count, step, self._gradients, self._of_paths)
+        restored, times, count = self._restored, self._times, self._truncations
+        self._launch(restore.restore_paths, count, restored, self._gradients, self._of_paths)
         self._place()
-        self._launch(kernels.find_truncation_times, count, step, times)
-        self._launch_adjoint(kernels.truncate_paths, count, [step, times, self._paths])
-        self._launch_adjoint(kernels.find_truncation_times, count, [step, times])
+        self._launch(kernels.find_truncation_times, count, restored, times)
+        self._launch_adjoint(kernels.truncate_paths, count, [restored, times, self._paths])
+        self._launch_adjoint(kernels.find_truncation_times, count, [restored, times])
 
     def _through_placement(self, kernel, *inputs):
         """Turns gradients with respect to positions of vertices into those of poses, or of what constraints did."""
         self._collect(self._gradients.x1, self._gradients.more_x1)
-        inputs = [self._step.motion, self._step.vertices, *inputs]
-        self._launch_adjoint(kernel, self._shape_vertices, inputs, [self._gradients.on_bodies])
+        self._launch_adjoint(kernel, self._shape_vertices, [self._step, *inputs], [self._gradients.on_bodies])
 
     def _through_projection(self):
         """Turns gradients with respect to poses into those with respect to what constraints did to them."""
         of_poses = self._gradients.bodies.pose
-        inputs = [self._step.motion, self._step.vertices, self._sums]
-        self._launch_adjoint(kernels.project_poses, self._bodies, inputs, [of_poses])
+        self._launch_adjoint(kernels.project_poses, self._bodies, [self._step, self._sums], [of_poses])
         of_poses.zero_()
 
     def _through_centres(self, poses):
@@ -297,20 +297,18 @@ class StepAdjoint:
         self._launch(kernels.set_centres, self._bodies, self._step.motion, poses, self._step.vertices.bodies)
 
     def _move_cursor(self, move):
-        self._launch(restore.move_cursor, 1, self._step, int(move), self._recorded.complete)
+        self._launch(restore.move_cursor, 1, self._restored, int(move), self._recorded.complete)
 
     def _restore_positions(self):
-        self._launch(restore.restore_positions, self._vertices_and_bodies, self._step, self._gradients, self._sums)
+        self._launch(restore.restore_positions, self._vertices_and_bodies, self._restored, self._gradients, self._sums)
 
     def _restore_velocities(self):
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._step, self._gradients)
-        self._launch(kernels.vertex_velocities, self._shape_vertices, motion, vertices, vertices.velocity)
+        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._restored, self._gradients)
+        self._launch(kernels.vertex_velocities, self._shape_vertices, self._step, self._step.vertices.velocity)
 
     def _place(self):
         """Moves vertices of bodies to where their poses say."""
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(kernels.place_vertices, self._shape_vertices, motion, vertices, vertices.x1)
+        self._launch(kernels.place_vertices, self._shape_vertices, self._step, self._step.vertices.x1)
 
     def _collect(self, of_vertices, more):
         inputs = [self._step.motion, self._gradients, of_vertices, more]

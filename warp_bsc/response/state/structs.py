@@ -159,6 +159,17 @@ class Constraints:
     active_count: wp.array[wp.int64]
 
 
+@wp.struct
+class Step:
+    """A motion, and what the response moves and knows of it, as kernels take them."""
+
+    motion: Motion
+    vertices: Vertices
+    constraints: Constraints
+    separation: wp.float64  # distance that projection moves contacts apart [m]
+    restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
+
+
 @wp.func
 def has_final_velocity(outcome: int) -> bool:
     """Returns whether the velocity of a vertex follows from its path, and constraints do not change it."""

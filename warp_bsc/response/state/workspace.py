@@ -22,7 +22,7 @@ from .structs import (
     Connectivity,
     Constraints,
     DividingPlanes,
-    Motion,
+    Step,
     Vertices,
     allocate_bodies,
     allocate_constraints,
@@ -34,21 +34,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def _begin(
-    # in
-    motion: Motion,
-    worlds: int,
-    # out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatus):
     """Initializes the vertices by their prediction, and clears everything else."""
     i = wp.tid()
+    motion, vertices = step.motion, step.vertices
     if i == 0:
         clear_status(status)
-        constraints.count[0] = 0
+        step.constraints.count[0] = 0
         dividing.count[0] = 0
     if i < worlds:
         status.contact_iteration[i] = -1
@@ -95,23 +87,18 @@ class Workspace:
         crossing_candidates: The detector of edges that may cross faces.
         mesh: The mesh.
         connectivity: Its elements, for kernels.
-        motion: The motion of the step that is being resolved; it is only read.
-        vertices: The vertices and bodies as they are moved.
-        constraints: The constraints.
+        step: The motion of the step that is being resolved, which is only read; vertices and bodies as they are moved;
+            and the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         status: The solve status.
         status_values: The arrays that the parts of ``status`` are views of.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
-        separation: Distance that projection moves contacts apart [m].
         tolerance: Tolerance of constraints on positions [m].
-        restitution: Share of the approaching velocity that comes back, array of one float.
         differentiable: Whether steps may be recorded.
         worlds: Number of worlds.
         device: The device.
     """
-
-    motion: ModelMotion
 
     def __init__(
         self,
@@ -135,7 +122,6 @@ class Workspace:
             max_iterations: Iterations of detect and project.
         """
         self.mesh, self.device = mesh, mesh.device
-        self.separation, self.restitution = separation, restitution
         self.differentiable, self.keeps_distances = differentiable, mesh.distances is not None
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
@@ -152,11 +138,13 @@ class Workspace:
         self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges
         self.connectivity.vertex_edges = mesh.device_vertex_edges
         self.connectivity.edge_faces = mesh.device_edge_faces
-        self.vertices = allocate_vertices(mesh.vertex_count, device)
+        self.step = Step()
+        self.step.separation, self.step.restitution = separation, restitution
+        self.step.vertices = allocate_vertices(mesh.vertex_count, device)
         if moves_bodies:
-            self.vertices.bodies = allocate_bodies(self.body_count, device)
-        self.constraints = allocate_constraints(0, device)
-        self._retired: list[Constraints] = []
+            self.step.vertices.bodies = allocate_bodies(self.body_count, device)
+        self.step.constraints = allocate_constraints(0, device)
+        self._retired: list[wp.array] = []
         capacity = DIVIDING_PLANES * self.particle_count
         self._dividing_planes = allocate_dividing_planes(
             mesh.vertex_count, capacity, device, keep_distances=self.keeps_distances
@@ -172,9 +160,28 @@ class Workspace:
         self.vertices_at_planes = mesh.vertex_count if moves_bodies else self.particle_count
         self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
         self.kept = wp.zeros(1, dtype=int, device=device)
-        self.turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
+        self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self._max_blocks = BLOCKS * device.sm_count
+
+    @property
+    def motion(self) -> ModelMotion:
+        """The motion of the step that is being resolved."""
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: ModelMotion) -> None:
+        self._motion, self.step.motion = motion, motion.vertices
+
+    @property
+    def vertices(self) -> Vertices:
+        """The vertices and bodies as they are moved."""
+        return self.step.vertices
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints."""
+        return self.step.constraints
 
     @property
     def resolution(self) -> Resolution:
@@ -195,9 +202,8 @@ class Workspace:
             elif not len(recorder.record.constraint):
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             self.record = recorder.begin()
-        outputs = [self.vertices, self.constraints, self._dividing_planes, self.status]
         size = max(len(self.vertices.x1), self.worlds + 1)
-        self.launch(_begin, size, [motion.vertices, self.worlds], outputs)
+        self.launch(_begin, size, [self.step, self.worlds, self._dividing_planes, self.status])
 
     @property
     def max_contacts(self) -> int:
@@ -206,17 +212,18 @@ class Workspace:
 
     def reserve(self, more: int) -> None:
         """Reserves ``more`` constraints, and as many for later iterations; does nothing in a CUDA graph."""
-        old = self.constraints
         if self.device.is_capturing:
             return
-        filled = int(old.count.numpy()[0])
-        if len(old.vertices) < filled + more:
+        filled = int(self.constraints.count.numpy()[0])
+        if len(self.constraints.vertices) < filled + more:
             capacity = filled + ITERATIONS_RESERVED * more
-            self.constraints = new = allocate_constraints(capacity, self.device, keep_distances=self.keeps_distances)
-            for name in Constraints.vars if filled else ():
-                array = getattr(old, name)
-                wp.copy(getattr(new, name), array, count=min(filled, len(array)))
-            self._retired.append(old)  # a CUDA graph may still write to it
+            new = allocate_constraints(capacity, self.device, keep_distances=self.keeps_distances)
+            for name in Constraints.vars:
+                old = getattr(self.constraints, name)
+                if filled:
+                    wp.copy(getattr(new, name), old, count=min(filled, len(old)))
+                self._retired.append(old)  # a CUDA graph may still write to it
+            self.step.constraints = new
 
     def grow(self) -> bool:
         """Enlarges the constraints, without the proximities, if those did not fit; returns whether. Synchronizes."""
@@ -230,7 +237,7 @@ class Workspace:
     def record_offsets(self, after: int = 0) -> None:
         """Records, if the step is recorded, where an iteration begins or, with 1, where the last ended."""
         if self.recorder is not None:
-            self.launch(record_offsets, 1, [self.constraints, self.status, self.record, after])
+            self.launch(record_offsets, 1, [self.step, self.status, self.record, after])
 
     def reserve_entries(self, sweeps: int) -> None:
         """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
@@ -277,11 +284,11 @@ class Workspace:
         self.launch(kernel, max(self.particle_count, int(at_least_once)), inputs)
 
     def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the bodies, if they can be moved, with motion and vertices as its first inputs."""
+        """Launches a kernel over the bodies, if they can be moved, with the step as its first input."""
         if self.body_count:
-            self.launch(kernel, self.body_count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, self.body_count, [self.step, *inputs])
 
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
         if self.body_count:
-            self.launch(kernel, self.shape_vertex_count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, self.shape_vertex_count, [self.step, *inputs])

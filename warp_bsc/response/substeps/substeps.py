@@ -206,10 +206,9 @@ class Substeps:
         work = self._work
         add_proximities(work)
         self._has_constraints.zero_()
-        inputs = [self._motion.vertices, work.constraints, self._has_constraints]
-        work.launch_over_constraints(kernels.find_worlds, inputs)
-        inputs, outputs = [work.constraints, work.status], [self._detected, self._is_fast]
-        work.launch(kernels.keep_detection, work.worlds, inputs, outputs)
+        work.launch_over_constraints(kernels.find_worlds, [work.step, self._has_constraints])
+        inputs = [work.step, work.status, self._detected, self._is_fast]
+        work.launch(kernels.keep_detection, work.worlds, inputs)
         for array, saved in step.arrays:
             wp.copy(saved, array)
         for i, substeps in enumerate(self._choices):
@@ -239,10 +238,11 @@ class Substeps:
         attributes.update(kept)
         for array, saved in step.arrays:
             wp.copy(array, saved)
-        inputs = [self._takes_substeps, _arrays_of(start), motion, _arrays_of(step.state)]
+        work.motion = self._motion
+        inputs = [work.step, self._takes_substeps, _arrays_of(start), _arrays_of(step.state)]
         if self._moves_bodies:
             work.launch(kernels.end_body_substeps, mesh.model.body_count, inputs)
-        work.launch(kernels.end_substeps, mesh.vertex_count, inputs, [work.vertices])
+        work.launch(kernels.end_substeps, mesh.vertex_count, inputs)
 
     def _take_substep(self, substeps, step):
         """Steps the inner solver, and projects its motion onto the constraints."""
@@ -261,19 +261,17 @@ class Substeps:
             substep.set_body_ends(end.body_q, end.body_qd)
             work.launch_over_bodies(begin_bodies)
         inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, _arrays_of(end)]
-        outputs = [substep.vertices, work.constraints, work.status, substep.planes, work.vertices]
         size = max(mesh.vertex_count, len(motion.planes.start))
-        work.launch(kernels.start_substep, size, inputs, outputs)
+        work.launch(kernels.start_substep, size, [*inputs, work.step, work.status, substep.planes])
         if work.max_penetrations:
             work.reserve(work.max_penetrations)
             detect_penetrations(work, ahead=True)
-        inputs = [substep.vertices, work.vertices, self._detected, work.constraints, work.status]
-        work.launch_over_constraints(kernels.reset_constraints, inputs)
+        work.launch_over_constraints(kernels.reset_constraints, [work.step, work.status, self._detected])
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
         velocities.project(work, substep_dt)
         start.assign(self._start)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
-        inputs = [work.vertices, self._remaining, substep.vertices, starts, poses]
+        inputs = [work.step, self._remaining, starts, poses]
         work.launch(kernels.end_substep, max(mesh.vertex_count, bodies), inputs)
 
     def _finish(self, dt):
