@@ -87,11 +87,11 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
         work, motion = solver._work, solver._motion
         motion.set_start(model.particle_q, None)
         motion.set_end(wp.array(end, dtype=wp.vec3, device=device), model.particle_qd, None, DT)
-        results = inspect(work, motion).status.results
+        inspect(work, motion)
         keys = work.vertices.first_contact.numpy()
         times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
         numbers = [
-            int(getattr(results, name).numpy()[0])
+            int(getattr(work.status.results, name).numpy()[0])
             for name in ("remaining", "first_hits", "excluded", "undetected", "certified")
         ]
         found.append((times, numbers, work._dividing_planes.count.numpy()[0], work.vertices.changed.numpy()))

@@ -67,7 +67,7 @@ class CollisionMonitor(CollisionStage):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._timed():
             self._set_end(end, dt)
-            resolution = inspect(self._work, self._motion)
-            inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
-            self._launch(finish_inspection, self.mesh.vertex_count, inputs, outputs)
-            self._count_step(resolution)
+            inspect(self._work, self._motion)
+            inputs = [self._work.vertices.outcome, self.model.particle_count]
+            self._launch(finish_inspection, self.mesh.vertex_count, inputs, [self._work.status])
+            self._count_step()

@@ -3,7 +3,6 @@
 import contextlib
 from typing import Literal
 
-import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
@@ -199,38 +198,6 @@ class SolverCCD(CollisionStage):
             self._in_substeps = Substeps(*arguments, moves_bodies=moves_bodies)
             self.report.last_substeps = self._in_substeps.substeps
 
-    def step(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        **options,
-    ) -> None:
-        """Steps the inner solver, and changes positions and velocities of particles and bodies whose motion collides.
-
-        Args:
-            state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same, except on a tape.
-            control: As for the inner solver.
-            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
-                see :mod:`.substeps.inner_contacts`.
-            dt: Length of the step [s], more than 0.
-            options: As for the inner solver.
-
-        Raises:
-            TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
-                ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
-                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
-                ``SolverXPBD``.
-            RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before, or if
-                another thread is using this stage.
-        """
-        super().step(state_in, state_out, control, contacts, dt, **options)
-
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
             return
@@ -281,12 +248,12 @@ class SolverCCD(CollisionStage):
 
         def forward():
             nonlocal recorded
-            resolution, recorded = self._resolve(end, dt, self._recorder), None
-            if device.is_capturing or self._has_changed(resolution.vertices):
-                recorded = RecordedStep(motion, resolution, self._recorder, dt)
-                self._launch(
-                    count_record, 1, [self._recorder.record.counts, recorded.complete], [self.report.device_totals]
-                )
+            self._resolve(end, dt, self._recorder)
+            recorded = None
+            if device.is_capturing or self._has_changed():
+                recorded = RecordedStep(motion, self._work, self._recorder, dt)
+                inputs = [self._recorder.record.counts, recorded.complete]
+                self._launch(count_record, 1, inputs, [self.report.device_totals])
 
         def backward():
             with self._lock:
@@ -296,8 +263,9 @@ class SolverCCD(CollisionStage):
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
-    def _has_changed(self, vertices):
+    def _has_changed(self):
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
+        vertices = self._work.vertices
         outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
         return any(outcome.numpy().any() for outcome in outcomes)
 
@@ -306,9 +274,8 @@ class SolverCCD(CollisionStage):
         """Resolves the motion from the start of the step to its end, and changes the end."""
         with self._timed():
             self._read_end(end, dt)
-            resolution = resolve(self._work, self._motion, dt, recorder)
-            self._write_end(resolution, end)
-        return resolution
+            resolve(self._work, self._motion, dt, recorder)
+            self._write_end(end)
 
     @one_at_a_time
     def _resolve_in_substeps(self, state, control, contacts, dt):
@@ -316,8 +283,8 @@ class SolverCCD(CollisionStage):
         with self._timed():
             self._read_end(StateArrays.of(state), dt)
             assert self._in_substeps is not None
-            resolution = self._in_substeps.resolve(state, control, contacts, dt)
-            self._write_end(resolution, StateArrays.of(state))
+            self._in_substeps.resolve(state, control, contacts, dt)
+            self._write_end(StateArrays.of(state))
 
     def _read_end(self, end, dt):
         """Reads the predicted motion."""
@@ -325,16 +292,16 @@ class SolverCCD(CollisionStage):
             self._motion.friction.read()
         self._set_end(end, dt)
 
-    def _write_end(self, resolution, end):
-        """Writes a resolved motion to the arrays of a state, and counts the step."""
-        vertices = resolution.vertices
+    def _write_end(self, end):
+        """Writes the resolved motion to the arrays of a state, and counts the step."""
+        vertices, status = self._work.vertices, self._work.status
         inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [end.particle_q, end.particle_qd, resolution.status]
+        outputs = [end.particle_q, end.particle_qd, status]
         self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
         if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), resolution.status]
+            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), status]
             self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
-        self._count_step(resolution)
+        self._count_step()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

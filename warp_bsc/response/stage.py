@@ -15,7 +15,7 @@ from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion
-from .state.workspace import Resolution, Workspace
+from .state.workspace import Workspace
 from .step import prepare
 from .write_back import count_step
 
@@ -77,18 +77,27 @@ class CollisionStage(CouplingHooks):
     ) -> None:
         """Steps the inner solver, and detects the collisions of its motion.
 
+        :class:`.solver_ccd.SolverCCD` then changes positions and velocities of the particles and bodies that collide.
+        What is said of tapes and substeps holds for it alone.
+
         Args:
             state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same.
+            state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver.
+            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
+                see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
             options: As for the inner solver.
 
         Raises:
             TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0.
-            RuntimeError: If another thread is using this stage.
+            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
+                ``state_out`` is ``state_in``.
+            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
+                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
+                ``SolverXPBD``.
+            RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
+                recorded no step outside one before.
         """
         checked_number(dt, "dt", 0.0, above=True)
         with paused_tape() as tape:
@@ -123,8 +132,8 @@ class CollisionStage(CouplingHooks):
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
-    def _count_step(self, resolution: Resolution):
-        self._launch(count_step, 1, [resolution.status, self.report.last_substeps], [self.report.device_totals])
+    def _count_step(self):
+        self._launch(count_step, 1, [self._work.status, self.report.last_substeps], [self.report.device_totals])
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""

@@ -16,14 +16,14 @@ from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.motion import ModelMotion
 from .state.record import StepRecorder
-from .state.workspace import Resolution, Workspace
+from .state.workspace import Workspace
 
 
-def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecorder | None = None) -> Resolution:
-    """Returns the motion without its contacts, except for those that cannot be resolved.
+def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecorder | None = None) -> None:
+    """Makes a motion free of its contacts, except for those that cannot be resolved.
 
     Args:
-        work: The buffers, which the next step overwrites.
+        work: The buffers; they hold the result, its constraints and status, until the next step.
         motion: The predicted motion; it is only read.
         dt: Length of the step [s].
         recorder: Records the step for its adjoint; None to record nothing.
@@ -32,7 +32,7 @@ def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecor
         RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
     """
     find_contacts(work, motion, recorder)
-    return resolve_contacts(work, dt)
+    resolve_contacts(work, dt)
 
 
 def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
@@ -47,10 +47,9 @@ def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder |
     work.record_offsets(after=1)
 
 
-def resolve_contacts(work: Workspace, dt: float) -> Resolution:
+def resolve_contacts(work: Workspace, dt: float) -> None:
     """Resolves the contacts that :func:`find_contacts` found, as the second half of :func:`resolve`."""
     wp.capture_if(work.status.loop.unfinished, _resolve_contacts, work=work, dt=dt)
-    return work.resolution
 
 
 def _resolve_contacts(work, dt):
@@ -77,21 +76,14 @@ def add_proximities(work: Workspace) -> None:
 def prepare(work: Workspace, motion: ModelMotion) -> None:
     """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
     resolve(work, motion, 1.0)
-    for values in work.status_values:
-        values.zero_()
+    work.status.values.zero_()
     work.vertices.outcome.zero_()
 
 
-def inspect(work: Workspace, motion: ModelMotion) -> Resolution:
-    """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
-
-    Args:
-        work: The buffers, which the next step overwrites.
-        motion: The predicted motion; it is only read.
-    """
+def inspect(work: Workspace, motion: ModelMotion) -> None:
+    """Detects the contacts of a motion, and leaves it as it is; ``remaining`` of the status counts them."""
     begin(work, motion)
     detect.detect(work)
-    return work.resolution
 
 
 def begin(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:

@@ -43,35 +43,35 @@ class RecordedStep:
         complete: Array of one int, 1 if nothing is missing.
     """
 
-    def __init__(self, motion, resolution, recorder, dt: float):
+    def __init__(self, motion, work, recorder, dt: float):
         """Copies a step.
 
         Args:
             motion: The :class:`.state.motion.ModelMotion` that was resolved.
-            resolution: The :class:`.state.workspace.Resolution`.
+            work: The :class:`.state.workspace.Workspace` in which it was resolved.
             recorder: The :class:`.state.record.StepRecorder` that recorded it.
             dt: Length of the step [s].
         """
         self.dt, self.mesh, self.friction, self.moves_bodies = dt, motion.mesh, motion.friction, motion.moves_bodies
-        constraints, record, device = resolution.constraints, recorder.record, recorder.counts.device
+        constraints, record, device = work.constraints, recorder.record, recorder.counts.device
         if device.is_capturing:
             count, sweeps = len(constraints.vertices), len(record.sweep_ends)
             entries, truncations = len(record.constraint), len(record.vertex)
         else:
             counts = constraints.count, record.counts.sweeps, record.counts.entries, record.counts.truncations
             count, sweeps, entries, truncations = (int(array.numpy()[0]) for array in counts)
-        self.undetected = wp.clone(resolution.status.results.undetected)
-        self.iteration = wp.clone(resolution.status.loop.iteration)
+        self.undetected = wp.clone(work.status.results.undetected)
+        self.iteration = wp.clone(work.status.loop.iteration)
         self.planes = copied(motion.planes, ("start", "end", "friction"))
         self.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
-        self.vertices = copied(resolution.vertices, names)
+        self.vertices = copied(work.vertices, names)
         if motion.keeps_poses:
             names = _MOTION_OF_BODIES if motion.moves_bodies else ("start", "end")
             self.motion.bodies = copied(motion.vertices.bodies, names)
         if motion.moves_bodies:
             names = "pose", "velocity", "delta_x", "delta_v", "outcome"
-            self.vertices.bodies = copied(resolution.vertices.bodies, names)
+            self.vertices.bodies = copied(work.vertices.bodies, names)
         lengths = dict.fromkeys(Constraints.vars.keys() - _UNUSED_OF_CONSTRAINTS, count)
         self.constraints = copied(constraints, {**lengths, "count": 1})
         lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}

@@ -9,7 +9,7 @@ from ...kernels.signs import FREE
 from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Pace, Step, Vertices
+from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from .constraints import (
@@ -37,7 +37,6 @@ from .rules import (
     crosses_face,
     inverse_mass_of,
     is_movable,
-    is_on_body,
     owner_of,
 )
 
@@ -67,9 +66,9 @@ def count_crossings(
 @wp.func
 def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     """Returns whether a plane stops a vertex: not one of its own body, or of a shape that it does not collide with."""
-    if not is_on_body(motion, vertex):
+    body = body_of(motion, vertex)
+    if body < 0:
         return True
-    body = motion.bodies.of_vertex[vertex]
     shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
     return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
 
@@ -82,7 +81,7 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
     predicted to end in it: a body goes no deeper.
     """
     lowest = ZERO
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         before, _error = signed_distance(planes.start[i], motion.x0[vertex])
         lowest = wp.min(before, ZERO)
         if motion.bodies.responds == 0:
@@ -107,7 +106,7 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
 
     Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
     """
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         return level(motion, planes, i, vertex), ZERO
     if not motion.distances.radius:
         return ZERO, ZERO
@@ -154,7 +153,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         else:
             count_contact(status, world)
             vertices.changed[vertex] = 1
-            if status.loop.iteration[0] == 0 and is_on_body(motion, vertex):
+            if status.loop.iteration[0] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
         added = Constraint()

@@ -6,7 +6,7 @@ from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
-from ..state.structs import ContactKind, Motion, Pace, Step
+from ..state.structs import ContactKind, Motion, Pace, Step, body_of, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
 from ..tuning import MAX_SAGITTA, RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
 from .rules import are_on_body, inverse_mass_of
@@ -225,13 +225,12 @@ def sagitta(step: Step, corners: wp.vec4i) -> wp.float64:
     The centre of mass moves straight, so that an arm r that turns by an angle a is off by r (1 - cos(a / 2)).
     """
     off = ZERO
-    motion = step.motion
-    if motion.bodies.of_vertex:
-        for j in range(4):
-            body = motion.bodies.of_vertex[corners[j]]
-            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                turn = turn_between(motion.bodies.start[body], motion.bodies.end[body])
-                half = wp.sin(wp.float64(0.25) * wp.length(turn))
-                arm = to_double(motion.x1[corners[j]]) - step.vertices.bodies.centre[body]
-                off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
+    bodies = step.motion.bodies
+    for j in range(4):
+        body = body_of(step.motion, corners[j])
+        if can_move(step.motion, body):
+            turn = turn_between(bodies.start[body], bodies.end[body])
+            half = wp.sin(wp.float64(0.25) * wp.length(turn))
+            arm = to_double(step.motion.x1[corners[j]]) - step.vertices.bodies.centre[body]
+            off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
     return wp.min(off, MAX_SAGITTA * step.separation)

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..state.fixed_sum import with_delta
 from ..state.poses import centre_of, inertia_at
-from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Step, has_final_velocity
+from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Step, body_of, has_final_velocity
 from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
 
@@ -60,10 +60,9 @@ def torque_of(step: Step, i: int) -> wp.vec3d:
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
     moving = wp.vec4d(weights)
-    if motion.bodies.of_vertex:
-        for j in range(4):
-            if motion.bodies.of_vertex[corners[j]] >= 0:
-                moving[j] = ZERO
+    for j in range(4):
+        if body_of(motion, corners[j]) >= 0:
+            moving[j] = ZERO
     of_positions = wp.cross(constraints.position_multiplier[i], relative(moving, corners, motion.velocity))
     return of_positions + wp.cross(relative(weights, corners, vertices.x1), constraints.velocity_multiplier[i])
 
@@ -82,10 +81,9 @@ def is_held(step: Step, i: int) -> bool:
     held = corners[0] == corners[1]  # on a plane
     for j in range(4):
         free = turns(step, corners[j])
-        if step.motion.bodies.of_vertex:
-            body = step.motion.bodies.of_vertex[corners[j]]
-            if body >= 0:
-                free = body_turns(step, body)
+        body = body_of(step.motion, corners[j])
+        if body >= 0:
+            free = body_turns(step, body)
         held = held or (step.constraints.weights[i][j] != ZERO and not free)
     return held
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..state.fixed_sum import add_to_sum, sums_of
 from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
-from ..state.structs import NEVER, PROJECTED, Bodies, Motion, MovedBodies, Step, has_final_velocity
+from ..state.structs import NEVER, PROJECTED, Bodies, Motion, MovedBodies, Step, body_of, can_move, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +26,7 @@ def _body_of_side(motion: Motion, corners: wp.vec4i, side: int) -> int:
     """Returns the body of the first or second element of a constraint, -1 if there is none; a plane is none."""
     if side == 1 and corners[0] == corners[3]:
         return -1
-    return motion.bodies.of_vertex[corners[3 * side]]
+    return body_of(motion, corners[3 * side])
 
 
 @wp.func
@@ -40,7 +40,7 @@ def _lever(step: Step, i: int, side: int, x: wp.array[wp.vec3]):
     corners = step.constraints.vertices[i]
     weights = step.constraints.weights[i]
     body = _body_of_side(step.motion, corners, side)
-    if body >= 0 and step.motion.bodies.inverse_mass[body] == 0.0:
+    if not can_move(step.motion, body):
         body = -1
     weight = ZERO
     arm = wp.vec3d()
@@ -219,6 +219,6 @@ def set_vertex_velocities(step: Step):
     bodies, moved = step.motion.bodies, step.vertices.bodies
     vertex = bodies.particle_count + wp.tid()
     body = bodies.of_vertex[vertex]
-    if body >= 0 and bodies.inverse_mass[body] > 0.0:
+    if can_move(step.motion, body):
         arm = to_double(step.vertices.x1[vertex]) - moved.centre[body]
         step.vertices.velocity[vertex] = velocity_on_body(moved.velocity[body], arm)

@@ -1,7 +1,6 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -64,21 +63,6 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     dividing.kept[i] = NO_NODE
 
 
-@dataclass(frozen=True)
-class Resolution:
-    """The result of a step; the next step overwrites its arrays.
-
-    Attributes:
-        vertices: The vertices as they were moved.
-        constraints: The constraints that moved them.
-        status: The solve status at the end.
-    """
-
-    vertices: Vertices
-    constraints: Constraints
-    status: SolveStatus
-
-
 class Workspace:
     """The buffers that a step works on, reused from step to step, on one device.
 
@@ -91,7 +75,6 @@ class Workspace:
             and the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         status: The solve status.
-        status_values: The arrays that the parts of ``status`` are views of.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
@@ -151,7 +134,7 @@ class Workspace:
         )
         self.dividing = DividingPlanes() if differentiable else self._dividing_planes
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
-        self.status, self.status_values = allocate_status(self.worlds, device, **limits)
+        self.status = allocate_status(self.worlds, device, **limits)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
@@ -182,11 +165,6 @@ class Workspace:
     def constraints(self) -> Constraints:
         """The constraints."""
         return self.step.constraints
-
-    @property
-    def resolution(self) -> Resolution:
-        """The step as it was resolved last."""
-        return Resolution(self.vertices, self.constraints, self.status)
 
     def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
         """Initializes everything for a step.

@@ -6,7 +6,7 @@ from ..contacts.constraints import NEVER_SWEPT, approach_of
 from ..schedule import SolveStatus
 from ..state.motion import moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
-from ..state.structs import ContactKind, Motion, Step
+from ..state.structs import ContactKind, Motion, Step, can_move
 
 wp.set_module_options({"enable_backward": False})
 
@@ -202,9 +202,8 @@ def move_bodies(
 ):
     """Writes poses at both ends of a substep, between those of the whole step, of bodies that cannot be moved."""
     body = wp.tid()
-    if motion.bodies.of_vertex:
-        if motion.bodies.inverse_mass[body] > 0.0:
-            return
+    if can_move(motion, body):
+        return
     done = substeps - remaining[0]
     body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done))
     body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done + 1))

@@ -31,7 +31,7 @@ from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion
-from ..state.workspace import Resolution, Workspace
+from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts, resolve_contacts
 from . import kernels
 from .strain import choose_substeps, edges_at_rest, measure_strain
@@ -146,8 +146,8 @@ class Substeps:
 
     def resolve(
         self, state: newton.State, control: newton.Control | None, contacts: newton.Contacts | None, dt: float
-    ) -> Resolution:
-        """Returns the motion without its contacts, like :func:`.step.resolve`, and writes it to a state.
+    ) -> None:
+        """Makes the motion free of its contacts, like :func:`.step.resolve`; writes the end of substeps to a state.
 
         Args:
             state: The state at the end of the step, as the inner solver predicted it.
@@ -176,7 +176,6 @@ class Substeps:
         else:
             wp.capture_if(self.substeps, self._take_substeps, step=step)
         wp.capture_if(self.substeps, self._finish, dt=dt)
-        return work.resolution
 
     def _resolve_and_choose(self, dt):
         """Resolves the motion, chooses the substeps of each world, and if there are any, detects its contacts again."""
