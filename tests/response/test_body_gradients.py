@@ -225,7 +225,7 @@ def test_an_incomplete_record_gives_nan(device):
     with wp.Tape():
         scene.solver.step(*scene.states, None, None, DT)
     work = scene.solver._work
-    recorded = RecordedStep(scene.solver._motion, work, scene.solver._recorder, DT)
+    recorded = RecordedStep(work, scene.solver._recorder, DT)
     arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
     for complete in (1, 0):
         for array in scene.arrays.values():

@@ -87,7 +87,7 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
         work, motion = solver._work, solver._motion
         motion.set_start(model.particle_q, None)
         motion.set_end(wp.array(end, dtype=wp.vec3, device=device), model.particle_qd, None, DT)
-        inspect(work, motion)
+        inspect(work)
         keys = work.vertices.first_contact.numpy()
         times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
         numbers = [

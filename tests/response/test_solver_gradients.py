@@ -320,7 +320,7 @@ def test_an_incomplete_record_gives_nan(device):
     scene.backward()
     solver = scene.solver
     work = solver._work
-    recorded = RecordedStep(solver._motion, work, solver._recorder, DT)
+    recorded = RecordedStep(work, solver._recorder, DT)
     arrays = [wp.zeros(scene.model.particle_count, dtype=wp.vec3, device=device) for _ in range(3)]
     StepAdjoint(recorded, work).backward(*arrays)
     assert all(np.isfinite(array.numpy()).all() for array in arrays)

@@ -18,6 +18,7 @@ from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
+from .state.motion import ModelMotion
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
@@ -172,16 +173,13 @@ class SolverCCD(CollisionStage):
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         if self.substeps is not None and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
-        moves_bodies = options.moves_bodies(mesh, inner)
-        self._allocate(
-            mesh,
-            friction_of(mesh, self.friction),
-            separation=self.separation,
-            restitution=self.restitution,
-            moves_bodies=moves_bodies,
-            responds_to_bodies=options.bodies == "separated",
-            max_iterations=self.max_iterations,
-        )
+        bodies = {
+            "moves_bodies": options.moves_bodies(mesh, inner),
+            "responds_to_bodies": options.bodies == "separated",
+        }
+        motion = ModelMotion(mesh, friction_of(mesh, self.friction), **bodies)
+        coefficients = {"separation": self.separation, "restitution": self.restitution}
+        self._allocate(motion, **coefficients, max_iterations=self.max_iterations)
         needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
         if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
             self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)
@@ -192,10 +190,9 @@ class SolverCCD(CollisionStage):
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._in_substeps = None
         if self.substeps is not None:
-            self._inner_contacts = InnerContacts(mesh, moves_bodies=moves_bodies)
+            self._inner_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
-            self._in_substeps = Substeps(*arguments, moves_bodies=moves_bodies)
+            self._in_substeps = Substeps(self._step_inner, solver, self._work, choices)
             self.report.last_substeps = self._in_substeps.substeps
 
     def _check_tape(self, tape, state_in, state_out):
@@ -237,11 +234,11 @@ class SolverCCD(CollisionStage):
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
-        device, model, motion = self.mesh.device, self.model, self._motion
+        device, model, friction = self.mesh.device, self.model, self._motion.friction
         arrays = [start.particle_q, end.particle_q, end.particle_qd]
         if model.body_count:
             arrays += [start.body_q, end.body_q, end.body_qd]
-        read = [motion.friction.of_particles, motion.friction.of_shapes, self.restitution, model.particle_inv_mass]
+        read = [friction.of_particles, friction.of_shapes, self.restitution, model.particle_inv_mass]
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None
@@ -251,9 +248,9 @@ class SolverCCD(CollisionStage):
             self._resolve(end, dt, self._recorder)
             recorded = None
             if device.is_capturing or self._has_changed():
-                recorded = RecordedStep(motion, self._work, self._recorder, dt)
+                recorded = RecordedStep(self._work, self._recorder, dt)
                 inputs = [self._recorder.record.counts, recorded.complete]
-                self._launch(count_record, 1, inputs, [self.report.device_totals])
+                self._work.launch(count_record, 1, inputs, [self.report.device_totals])
 
         def backward():
             with self._lock:
@@ -266,7 +263,7 @@ class SolverCCD(CollisionStage):
     def _has_changed(self):
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
         vertices = self._work.vertices
-        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
+        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._motion.moves_bodies else [vertices.outcome]
         return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
@@ -274,7 +271,7 @@ class SolverCCD(CollisionStage):
         """Resolves the motion from the start of the step to its end, and changes the end."""
         with self._timed():
             self._read_end(end, dt)
-            resolve(self._work, self._motion, dt, recorder)
+            resolve(self._work, dt, recorder)
             self._write_end(end)
 
     @one_at_a_time
@@ -294,13 +291,13 @@ class SolverCCD(CollisionStage):
 
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""
-        vertices, status = self._work.vertices, self._work.status
+        work, vertices = self._work, self._work.vertices
         inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [end.particle_q, end.particle_qd, status]
-        self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
-        if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), status]
-            self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
+        outputs = [end.particle_q, end.particle_qd, work.status]
+        work.launch(write_back, self.mesh.vertex_count, inputs, outputs)
+        if self._motion.moves_bodies:
+            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), work.status]
+            work.launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
         self._count_step()
 
     def update_contacts(self, contacts, state=None):

@@ -12,7 +12,6 @@ from .._private_names.of_warp import paused_tape
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS
-from .state.friction import Friction
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion
 from .state.workspace import Workspace
@@ -35,35 +34,23 @@ class CollisionStage(CouplingHooks):
 
     def _allocate(
         self,
-        mesh: ModelMesh,
-        friction: Friction,
+        motion: ModelMotion,
         *,
         separation: float,
         restitution: wp.array,
-        moves_bodies: bool = False,
-        responds_to_bodies: bool = False,
         max_iterations: int = MAX_ITERATIONS,
         responds: bool = True,
     ):
-        """Allocates the motion and the workspace of steps, and makes the report."""
-        self.mesh, model = mesh, self.model
-        self._moves_bodies = moves_bodies
-        self._motion = ModelMotion(mesh, friction, moves_bodies=moves_bodies, responds_to_bodies=responds_to_bodies)
-        self._work = Workspace(
-            mesh,
-            separation=separation,
-            restitution=restitution,
-            differentiable=model.requires_grad,
-            moves_bodies=moves_bodies,
-            max_iterations=max_iterations,
-        )
-        self._motion.set_start(model.particle_q, model.body_q)
-        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
-        prepare(self._work, self._motion)
+        """Allocates the workspace of steps, and makes the report."""
+        self.mesh, self._motion, model = motion.mesh, motion, self.model
+        self._work = Workspace(motion, separation=separation, restitution=restitution, max_iterations=max_iterations)
+        motion.set_start(model.particle_q, model.body_q)
+        motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
+        prepare(self._work)
         self._recount_crossings()
         if not model.requires_grad:
-            self._motion.remember(self._work.vertices.x1)
-        self.report = SolverReport(self._motion, self._work, responds=responds)
+            motion.remember(self._work.vertices.x1)
+        self.report = SolverReport(self._work, responds=responds)
 
     @one_at_a_time
     def step(
@@ -129,11 +116,9 @@ class CollisionStage(CouplingHooks):
     def _set_end(self, end, dt):
         self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
 
-    def _launch(self, kernel, size, inputs, outputs):
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
-
     def _count_step(self):
-        self._launch(count_step, 1, [self._work.status, self.report.last_substeps], [self.report.device_totals])
+        work, report = self._work, self.report
+        work.launch(count_step, 1, [work.status, report.last_substeps], [report.device_totals])
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""

@@ -43,15 +43,15 @@ class RecordedStep:
         complete: Array of one int, 1 if nothing is missing.
     """
 
-    def __init__(self, motion, work, recorder, dt: float):
+    def __init__(self, work, recorder, dt: float):
         """Copies a step.
 
         Args:
-            motion: The :class:`.state.motion.ModelMotion` that was resolved.
             work: The :class:`.state.workspace.Workspace` in which it was resolved.
             recorder: The :class:`.state.record.StepRecorder` that recorded it.
             dt: Length of the step [s].
         """
+        motion = work.motion
         self.dt, self.mesh, self.friction, self.moves_bodies = dt, motion.mesh, motion.friction, motion.moves_bodies
         constraints, record, device = work.constraints, recorder.record, recorder.counts.device
         if device.is_capturing:

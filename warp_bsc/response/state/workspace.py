@@ -8,9 +8,8 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import SolveStatus, allocate_status, clear_status
+from ..schedule import MAX_ITERATIONS, SolveStatus, allocate_status, clear_status
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
-from .mesh import ModelMesh
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -71,49 +70,43 @@ class Workspace:
         crossing_candidates: The detector of edges that may cross faces.
         mesh: The mesh.
         connectivity: Its elements, for kernels.
-        step: The motion of the step that is being resolved, which is only read; vertices and bodies as they are moved;
-            and the constraints.
+        step: The motion, which is only read, the vertices and bodies as they are moved, and the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         status: The solve status.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
-        differentiable: Whether steps may be recorded.
+        differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
+            as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
         device: The device.
     """
 
     def __init__(
         self,
-        mesh: ModelMesh,
+        motion: ModelMotion,
         *,
         separation: float,
         restitution: wp.array[float],
-        differentiable: bool,
-        moves_bodies: bool,
-        max_iterations: int,
+        max_iterations: int = MAX_ITERATIONS,
     ):
         """Allocates buffers.
 
         Args:
-            mesh: The mesh.
+            motion: The motion of steps.
             separation: Distance that projection moves contacts apart [m].
             restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
-            differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not
-                divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
-            moves_bodies: Whether motions have bodies that can be moved.
             max_iterations: Iterations of detect and project.
         """
-        self.mesh, self.device = mesh, mesh.device
-        self.differentiable, self.keeps_distances = differentiable, mesh.distances is not None
+        self.mesh = mesh = motion.mesh
+        self.device = device = mesh.device
+        self.differentiable = differentiable = mesh.model.requires_grad
+        self.keeps_distances = mesh.distances is not None
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
-        self.particle_count, self.shape_vertex_count = (
-            mesh.model.particle_count,
-            mesh.vertex_count - mesh.model.particle_count,
-        )
-        self.body_count = mesh.model.body_count if moves_bodies else 0
-        device = self.device
+        self.particle_count = mesh.model.particle_count
+        self.shape_vertex_count = mesh.vertex_count - self.particle_count
+        self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
@@ -122,9 +115,10 @@ class Workspace:
         self.connectivity.vertex_edges = mesh.device_vertex_edges
         self.connectivity.edge_faces = mesh.device_edge_faces
         self.step = Step()
+        self.motion = motion
         self.step.separation, self.step.restitution = separation, restitution
         self.step.vertices = allocate_vertices(mesh.vertex_count, device)
-        if moves_bodies:
+        if motion.moves_bodies:
             self.step.vertices.bodies = allocate_bodies(self.body_count, device)
         self.step.constraints = allocate_constraints(0, device)
         self._retired: list[wp.array] = []
@@ -140,7 +134,7 @@ class Workspace:
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
-        self.vertices_at_planes = mesh.vertex_count if moves_bodies else self.particle_count
+        self.vertices_at_planes = mesh.vertex_count if motion.moves_bodies else self.particle_count
         self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
         self.kept = wp.zeros(1, dtype=int, device=device)
         self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
@@ -166,13 +160,13 @@ class Workspace:
         """The constraints."""
         return self.step.constraints
 
-    def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
+    def begin(self, recorder: StepRecorder | None) -> None:
         """Initializes everything for a step.
 
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
-        self.motion, self.recorder = motion, recorder
+        self.recorder = recorder
         self.record = StepRecord()  # which records nothing
         if recorder is not None:
             if not self.device.is_capturing:

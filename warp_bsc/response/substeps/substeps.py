@@ -29,7 +29,6 @@ from ..._private_names.of_newton import attributes_of, body_q_prev, may_allocate
 from ..contacts.detect import detect_penetrations
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
-from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts, resolve_contacts
@@ -80,34 +79,27 @@ class Substeps:
         self,
         step: Callable[..., None],
         solver: SolverBase,
-        mesh: ModelMesh,
-        motion: ModelMotion,
         work: Workspace,
         substeps: Sequence[int],
-        *,
-        moves_bodies: bool = False,
     ):
         """Allocates buffers.
 
         Args:
             step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
-            mesh: The mesh.
-            motion: The motion of the whole step.
-            work: The workspace of the step.
+            work: The workspace of the step, with the motion of the whole step.
             substeps: Numbers of substeps to choose from, each at least 2, sorted; a single one is taken by every step
                 that collides.
-            moves_bodies: Whether the response can move bodies.
 
         Raises:
             RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
         """
         self._choices, self._chooses = substeps, len(substeps) > 1
         self._step, self._solver = step, solver
-        self._mesh, self._motion, self._work = mesh, motion, work
-        self._moves_bodies, self._may_allocate = moves_bodies, may_allocate(solver)
-        self._substep = ModelMotion(mesh, motion.friction, moves_bodies=moves_bodies)
-        model, device, worlds = mesh.model, mesh.device, work.worlds
+        self._mesh, self._motion, self._work = work.mesh, work.motion, work
+        self._moves_bodies, self._may_allocate = work.motion.moves_bodies, may_allocate(solver)
+        self._substep = ModelMotion(work.mesh, work.motion.friction, moves_bodies=self._moves_bodies)
+        model, device, worlds = work.mesh.model, work.device, work.worlds
         self._start, self._in, self._out = model.state(), model.state(), model.state()
         self._copies: dict[str, wp.array] = {}  # of arrays of the inner solver
         self.substeps = wp.zeros(1, dtype=int, device=device)
@@ -160,7 +152,7 @@ class Substeps:
                 allocate memory.
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
-        find_contacts(work, self._motion)
+        find_contacts(work)
         if self._chooses:
             if in_graph and self._may_allocate:
                 solver = type(self._solver).__name__
@@ -198,7 +190,7 @@ class Substeps:
     def _find_contacts_again(self):
         work = self._work
         wp.copy(work.vertices.x1, self._motion.vertices.x0)  # where crossings are counted
-        find_contacts(work, self._motion)
+        find_contacts(work)
 
     def _take_substeps(self, step):
         """Repeats the step in substeps, and writes the end to the predicted motion and to the state."""
@@ -276,7 +268,7 @@ class Substeps:
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""
         work = self._work
-        find_contacts(work, self._motion)
+        find_contacts(work)
         work.launch(kernels.restore_detection, work.worlds, [self._detected, self._is_fast], [work.status])
         resolve_contacts(work, dt)
 
