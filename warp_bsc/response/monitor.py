@@ -58,7 +58,7 @@ class CollisionMonitor(CollisionStage):
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction)
-        self._allocate(motion, separation=default_separation(mesh), restitution=nothing, responds=False)
+        self._allocate(motion, default_separation(mesh), nothing, responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         end = StateArrays.of(state_out)

@@ -173,13 +173,10 @@ class SolverCCD(CollisionStage):
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         if self.substeps is not None and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
-        bodies = {
-            "moves_bodies": options.moves_bodies(mesh, inner),
-            "responds_to_bodies": options.bodies == "separated",
-        }
-        motion = ModelMotion(mesh, friction_of(mesh, self.friction), **bodies)
-        coefficients = {"separation": self.separation, "restitution": self.restitution}
-        self._allocate(motion, **coefficients, max_iterations=self.max_iterations)
+        moves, separates = options.moves_bodies(mesh, inner), options.bodies == "separated"
+        coefficients = friction_of(mesh, self.friction)
+        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
+        self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
         if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
             self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)

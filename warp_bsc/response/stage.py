@@ -35,9 +35,9 @@ class CollisionStage(CouplingHooks):
     def _allocate(
         self,
         motion: ModelMotion,
-        *,
         separation: float,
         restitution: wp.array,
+        *,
         max_iterations: int = MAX_ITERATIONS,
         responds: bool = True,
     ):

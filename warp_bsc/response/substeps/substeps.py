@@ -152,6 +152,7 @@ class Substeps:
                 allocate memory.
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
+        work.motion = self._motion  # also after an error in a substep
         find_contacts(work)
         if self._chooses:
             if in_graph and self._may_allocate:
