@@ -90,12 +90,11 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
         motion.set_start(arrays)
         arrays.particle_q = wp.array(end, dtype=wp.vec3, device=device)
         motion.set_end(arrays, DT)
-        inspect(work, motion)
-        results = work.status.results
+        inspect(work)
         keys = work.vertices.first_contact.numpy()
         times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
         numbers = [
-            int(getattr(results, name).numpy()[0])
+            int(getattr(work.status.results, name).numpy()[0])
             for name in ("remaining", "first_hits", "excluded", "undetected", "certified")
         ]
         found.append((times, numbers, work.dividing.count.numpy()[0], work.vertices.changed.numpy()))

@@ -326,6 +326,6 @@ def test_an_incomplete_record_gives_nan(device):
     assert all(np.isfinite(array.numpy()).all() for array in arrays)
     recorded.counts.complete.zero_()
     for name in ("constraint", "multiplier", "previous_multiplier", "momentum"):  # nothing may be read out of bounds
-        setattr(recorded.step.record, name, getattr(recorded.step.record, name)[:1])
+        setattr(recorded.restored.record, name, getattr(recorded.restored.record, name)[:1])
     StepAdjoint(recorded).backward(*arrays)
     assert all(np.isnan(array.numpy()).all() for array in arrays)

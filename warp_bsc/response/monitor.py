@@ -9,7 +9,7 @@ from ..detection.host_function import run_on_host
 from .options import checked_min_distance, checked_radii, default_separation, friction_of
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
-from .state.motion import arrays_of
+from .state.motion import ModelMotion, arrays_of
 from .step import inspect
 from .write_back import finish_inspection
 
@@ -56,7 +56,8 @@ class CollisionMonitor(CollisionStage):
             mesh.distances = mesh.min_distances(min_distance, radii, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
-        self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)
+        motion = ModelMotion(mesh, friction)
+        self._allocate(motion, default_separation(mesh), nothing, responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         end = arrays_of(state_out)
@@ -67,7 +68,8 @@ class CollisionMonitor(CollisionStage):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._timed():
             self._motion.set_end(end, dt)
-            inspect(self._work, self._motion)
-            inputs, outputs = [self._work.vertices.outcome, self.model.particle_count], [self._work.status]
-            self._launch(finish_inspection, self.mesh.vertex_count, inputs, outputs)
+            work = self._work
+            inspect(work)
+            inputs = [work.vertices.outcome, self.model.particle_count]
+            work.launch(finish_inspection, self.mesh.vertex_count, inputs, [work.status])
             self._count_step()

@@ -9,7 +9,6 @@ import warp as wp
 from ..detection.intersections import find_intersections
 from .inside import Inside, InsideFinder
 from .schedule import views_of
-from .state.motion import ModelMotion
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
 
@@ -90,9 +89,9 @@ class SolverReport:
         speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(self, motion: ModelMotion, work: Workspace, *, responds: bool = True):
+    def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
-        self._motion, self._work, self._responds = motion, work, responds
+        self._motion, self._work, self._responds = work.motion, work, responds
         self.speed_limit_lifted = False
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)

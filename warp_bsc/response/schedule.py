@@ -29,7 +29,7 @@ bodies that are left to the inner solver, see :class:`.contacts.rules.ContactCla
 
 import warp as wp
 
-from .state.structs import Constraints
+from .state.structs import Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,12 +58,12 @@ _WIDEST = wp.constant(wp.float64(5.0))
 class LoopControl:
     """What the conditions of the loop over iterations read; each field is an array of one element."""
 
+    recount: wp.array[int]  # 1 if crossings may have changed since they were counted
     active: wp.array[int]  # 1 while another iteration is needed
     unfinished: wp.array[int]  # 1 if the first detection leaves something to do
     iteration: wp.array[int]  # detections so far, less one; from max_iterations on, all worlds divide
     projecting: wp.array[int]  # 1 if the last detection added constraints
     newly_frozen: wp.array[int]  # vertices and bodies that this iteration froze
-    recount: wp.array[int]  # 1 if crossings may have changed since they were counted
     more_sweeps: wp.array[int]  # 1 while another batch of sweeps is needed
     sweep: wp.array[int]  # sweeps so far
 
@@ -89,11 +89,11 @@ class StepResults:
     remaining: wp.array[int]  # contacts that the last detection found
     excluded: wp.array[int]  # contacts that the last detection found and excluded
     body_contacts: wp.array[int]  # contacts between bodies that the last detection found
-    crossings: wp.array[int]  # edges that cross faces at the start
     iterations: wp.array[int]  # of detect and project or divide
     truncated: wp.array[int]  # 1 if a path was cut
     frozen: wp.array[int]  # 1 if a vertex or a body was frozen
     not_finite: wp.array[int]  # particles whose predicted position or velocity was not finite
+    crossings: wp.array[int]  # edges that cross faces at the start
 
 
 @wp.struct
@@ -103,6 +103,7 @@ class SolveStatus:
     loop: LoopControl
     detection: DetectionCounts
     results: StepResults
+    values: wp.array[int]  # all elements of these three; the first and the last outlast a step
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     max_iterations: int
@@ -120,10 +121,8 @@ def views_of(struct_type: type, values: wp.array):
     return struct
 
 
-def allocate_status(
-    worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool
-) -> tuple[SolveStatus, list[wp.array]]:
-    """Returns a cleared status, and the arrays that its parts are views of.
+def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
+    """Returns a cleared status.
 
     Args:
         worlds: Number of worlds.
@@ -131,10 +130,12 @@ def allocate_status(
         max_iterations: Iterations of detect and project.
         recorded: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided.
     """
-    status, values = SolveStatus(), []
-    for name, struct_type in (("loop", LoopControl), ("detection", DetectionCounts), ("results", StepResults)):
-        values.append(wp.zeros(len(struct_type.vars), dtype=int, device=device))
-        setattr(status, name, views_of(struct_type, values[-1]))
+    status, parts = SolveStatus(), {"loop": LoopControl, "detection": DetectionCounts, "results": StepResults}
+    status.values = wp.zeros(sum(len(part.vars) for part in parts.values()), dtype=int, device=device)
+    first = 0
+    for name, part in parts.items():
+        setattr(status, name, views_of(part, status.values[first:]))
+        first += len(part.vars)
     for name in ("contact_iteration", "is_fast"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
@@ -142,7 +143,7 @@ def allocate_status(
     status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
     status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
     status.slow_velocity_sweeps = int(MAX_SWEEPS) if recorded else SLOW_VELOCITY_SWEEPS
-    return status, values
+    return status
 
 
 @wp.func
@@ -156,23 +157,8 @@ def _clear_detection(detection: DetectionCounts):
 @wp.func
 def clear_status(status: SolveStatus):
     """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
-    status.loop.active[0] = 0
-    status.loop.unfinished[0] = 0
-    status.loop.iteration[0] = 0
-    status.loop.projecting[0] = 0
-    status.loop.newly_frozen[0] = 0
-    _clear_detection(status.detection)
-    status.results.certified[0] = 0
-    status.results.undetected[0] = 0
-    status.results.counted[0] = 0
-    status.results.first_hits[0] = 0
-    status.results.remaining[0] = 0
-    status.results.excluded[0] = 0
-    status.results.body_contacts[0] = 0
-    status.results.iterations[0] = 0
-    status.results.truncated[0] = 0
-    status.results.frozen[0] = 0
-    status.results.not_finite[0] = 0
+    for i in range(1, status.values.shape[0] - 1):
+        status.values[i] = 0
 
 
 @wp.func
@@ -247,13 +233,7 @@ def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -
 
 @wp.kernel
 def decide(
-    # in
-    constraints: Constraints,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    can_search: bool,
-    # in and out
-    status: SolveStatus,
+    step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus
 ):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
 
@@ -286,7 +266,7 @@ def decide(
     loop.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
     loop.iteration[0] = loop.iteration[0] + loop.active[0]
     results.iterations[0] = results.iterations[0] + loop.active[0]
-    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
+    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
 
 
 @wp.kernel

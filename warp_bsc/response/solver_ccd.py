@@ -3,7 +3,6 @@
 import contextlib
 from typing import Literal
 
-import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
@@ -18,7 +17,7 @@ from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
-from .state.motion import arrays_of
+from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
@@ -173,16 +172,10 @@ class SolverCCD(CollisionStage):
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         if self.substeps is not None and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
-        moves_bodies = options.moves_bodies(mesh, inner)
-        self._allocate(
-            mesh,
-            friction_of(mesh, self.friction),
-            separation=self.separation,
-            restitution=self.restitution,
-            moves_bodies=moves_bodies,
-            responds_to_bodies=options.bodies == "separated",
-            max_iterations=self.max_iterations,
-        )
+        moves, separates = options.moves_bodies(mesh, inner), options.bodies == "separated"
+        coefficients = friction_of(mesh, self.friction)
+        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
+        self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
         if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
             self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)
@@ -193,43 +186,10 @@ class SolverCCD(CollisionStage):
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._in_substeps = None
         if self.substeps is not None:
-            self._inner_contacts = InnerContacts(mesh, moves_bodies=moves_bodies)
+            self._inner_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
-            self._in_substeps = Substeps(*arguments, moves_bodies=moves_bodies)
+            self._in_substeps = Substeps(self._step_inner, solver, self._work, choices)
             self.report.last_substeps = self._in_substeps.substeps
-
-    def step(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        **options,
-    ) -> None:
-        """Steps the inner solver, and changes positions and velocities of particles and bodies whose motion collides.
-
-        Args:
-            state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same, except on a tape.
-            control: As for the inner solver.
-            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
-                see :mod:`.substeps.inner_contacts`.
-            dt: Length of the step [s], more than 0.
-            options: As for the inner solver.
-
-        Raises:
-            TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
-                ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
-                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
-                ``SolverXPBD``.
-            RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before, or if
-                another thread is using this stage.
-        """
-        super().step(state_in, state_out, control, contacts, dt, **options)
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -270,11 +230,11 @@ class SolverCCD(CollisionStage):
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
-        device, model, motion = self.mesh.device, self.model, self._motion
+        device, model, friction = self.mesh.device, self.model, self._motion.friction
         arrays = [start.particle_q, end.particle_q, end.particle_qd]
         if model.body_count:
             arrays += [start.body_q, end.body_q, end.body_qd]
-        read = [motion.friction.of_particles, motion.friction.of_shapes, self.restitution, model.particle_inv_mass]
+        read = [friction.of_particles, friction.of_shapes, self.restitution, model.particle_inv_mass]
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None
@@ -285,7 +245,7 @@ class SolverCCD(CollisionStage):
             self._resolve(end, dt, self._recorder)
             if device.is_capturing or self._has_changed():
                 recorded = RecordedStep(self._work, dt)
-                self._launch(count_record, 1, [recorded.counts], [self.report.device_totals])
+                self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
             with self._lock:
@@ -298,7 +258,7 @@ class SolverCCD(CollisionStage):
     def _has_changed(self):
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
         vertices = self._work.vertices
-        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
+        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._motion.moves_bodies else [vertices.outcome]
         return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
@@ -306,7 +266,7 @@ class SolverCCD(CollisionStage):
         """Resolves the motion from the start of the step to its end, and changes the end."""
         with self._timed():
             self._read_end(end, dt)
-            resolve(self._work, self._motion, dt, recorder)
+            resolve(self._work, dt, recorder)
             self._write_end(end)
 
     @one_at_a_time
@@ -327,9 +287,9 @@ class SolverCCD(CollisionStage):
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""
         size = max(self.mesh.vertex_count, self.model.body_count)
-        poses = body_q_prev(self.solver) if self._moves_bodies else None
+        poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
         outputs = [end, poses, self._work.status]
-        self._launch(write_back, size, [self._work.vertices], outputs)
+        self._work.launch(write_back, size, [self._work.vertices], outputs)
         self._count_step()
 
     def update_contacts(self, contacts, state=None):

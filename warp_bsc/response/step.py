@@ -14,31 +14,28 @@ import warp as wp
 from .contacts import detect, proximities
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
-from .state.motion import ModelMotion
 from .state.record import StepRecorder
 from .state.workspace import Workspace
 
 
-def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecorder | None = None) -> None:
-    """Makes a motion free of its contacts, except for those that cannot be resolved; the result is in the buffers.
+def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) -> None:
+    """Makes the predicted motion free of its contacts, except for those that cannot be resolved.
 
     Args:
-        work: The buffers, which the next step overwrites: the vertices as they were moved, the constraints that moved
-            them, and the solve status at the end.
-        motion: The predicted motion; it is only read.
+        work: The motion, which is only read, and buffers, which hold the result until the next step.
         dt: Length of the step [s].
         recorder: Records the step for its adjoint; None to record nothing.
 
     Raises:
         RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
     """
-    find_contacts(work, motion, recorder)
+    find_contacts(work, recorder)
     resolve_contacts(work, dt)
 
 
-def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
-    """Detects the contacts of a motion, as the first half of :func:`resolve`, with the same arguments and errors."""
-    begin(work, motion, recorder)
+def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None:
+    """Detects the contacts of the motion, as the first half of :func:`resolve`, with the same arguments and errors."""
+    begin(work, recorder)
     if work.max_penetrations:
         work.reserve(work.max_contacts)
         detect.detect_penetrations(work, ahead=True)
@@ -74,27 +71,21 @@ def add_proximities(work: Workspace) -> None:
     wp.capture_if(work.status.loop.active, proximities.add_proximities, work=work)
 
 
-def prepare(work: Workspace, motion: ModelMotion) -> None:
-    """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
-    resolve(work, motion, 1.0)
-    for values in work.status_values:
-        values.zero_()
+def prepare(work: Workspace) -> None:
+    """Resolves the motion to allocate buffers, which a CUDA graph cannot; clears the status."""
+    resolve(work, 1.0)
+    work.status.values.zero_()
     work.vertices.outcome.zero_()
 
 
-def inspect(work: Workspace, motion: ModelMotion) -> None:
-    """Detects the contacts of a motion, which stays as it is; ``remaining`` in the solve status counts them.
-
-    Args:
-        work: The buffers, which the next step overwrites.
-        motion: The predicted motion; it is only read.
-    """
-    begin(work, motion)
+def inspect(work: Workspace) -> None:
+    """Detects the contacts of the motion, and leaves it as it is; ``remaining`` of the status counts them."""
+    begin(work)
     detect.detect(work)
 
 
-def begin(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
+def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:
     """Initializes vertices and bodies by their prediction, and counts what crosses at the start, which is excluded."""
-    work.begin(motion, recorder)
+    work.begin(recorder)
     work.launch_over_bodies(begin_bodies)
     detect.detect_crossings(work)

@@ -29,7 +29,7 @@ class RecordedStep:
     """A copy of a step for its adjoint: its record and results, as far as they fit in the buffers of a CUDA graph.
 
     Attributes:
-        step: The step at its end, :class:`.adjoint.restore.RestoredStep` without a cursor.
+        restored: The step at its end, :class:`.adjoint.restore.RestoredStep` without a cursor.
         mesh: The mesh, :class:`.state.mesh.ModelMesh`.
         friction: The coefficients of its vertices and planes, :class:`.state.friction.Friction`.
         moves_bodies: Whether the response can move bodies.
@@ -40,12 +40,12 @@ class RecordedStep:
         """Copies the step that was recorded in a workspace, of length ``dt`` [s]."""
         motion, constraints, record, status = work.motion, work.constraints, work.record, work.status
         self.mesh, self.friction, self.moves_bodies = motion.mesh, motion.friction, motion.moves_bodies
-        self.step = step = RestoredStep()
-        step.restitution, step.separation, step.dt = work.restitution, work.separation, dt
-        step.status = status
-        step.status.loop = copied(status.loop, ["iteration"])
-        step.status.results = copied(status.results, ["undetected"])
-        step.planes = copied(motion.planes, ("start", "end", "friction"))
+        self.restored = restored = RestoredStep()
+        restored.status, restored.dt, restored.step = status, dt, work.step
+        restored.status.loop = copied(status.loop, ["iteration"])
+        restored.status.results = copied(status.results, ["undetected"])
+        restored.planes = copied(motion.planes, ("start", "end", "friction"))
+        step = restored.step
         step.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
         step.vertices = copied(work.vertices, names)
@@ -61,9 +61,9 @@ class RecordedStep:
         lengths = dict.fromkeys(OFFSETS) | {"sweep_ends": filled(record.sweep_ends, record.counts.sweeps)}
         for kind, names in GROWING.items():
             lengths |= dict.fromkeys(names, filled(getattr(record, names[0]), getattr(record.counts, kind)))
-        step.record = copied(record, lengths)
-        self.counts = step.record.counts = copied(record.counts, list(RecordCounts.vars))
-        wp.launch(check_complete, 1, [step.constraints, step.record], device=work.device)
+        restored.record = copied(record, lengths)
+        self.counts = restored.record.counts = copied(record.counts, list(RecordCounts.vars))
+        work.launch(check_complete, 1, [step.constraints, restored.record])
 
 
 class StepAdjoint:
@@ -71,18 +71,19 @@ class StepAdjoint:
 
     def __init__(self, recorded: RecordedStep):
         """Copies what going back through a step changes."""
-        self._recorded, self._mesh, given = recorded, recorded.mesh, recorded.step
+        self._recorded, self._mesh, given = recorded, recorded.mesh, recorded.restored.step
         model, device = self._mesh.model, self._mesh.device
         vertices, bodies = len(given.motion.x0), model.body_count if recorded.moves_bodies else 0
         self._moves_bodies, self._bodies, self._vertices_and_bodies = recorded.moves_bodies, bodies, vertices + bodies
         self._shape_vertices = len(self._mesh.shape_vertices.body) if recorded.moves_bodies else 0
-        self._constraints, self._truncations = len(given.constraints.vertices), len(given.record.vertex)
+        self._constraints, self._truncations = len(given.constraints.vertices), len(recorded.restored.record.vertex)
         self._gradients = gradients = allocate(restore.Gradients, vertices, device)
         gradients.bodies = of_bodies = allocate(restore.BodyGradients, bodies, device)
-        self._step = step = copied(given)
-        step.cursor = allocate(restore.Cursor, 1, device)
-        step.status.loop = copied(given.status.loop, ["iteration"])
-        step.planes, self._of_planes = with_gradients(given.planes, ("start", "end", "friction"))
+        self._restored = restored = copied(recorded.restored)
+        restored.cursor = allocate(restore.Cursor, 1, device)
+        restored.status.loop = copied(restored.status.loop, ["iteration"])
+        restored.planes, self._of_planes = with_gradients(restored.planes, ("start", "end", "friction"))
+        self._step = step = restored.step
         names = "x0", "x1", "velocity", "inverse_mass", "friction"
         step.motion, self._of_motion = with_gradients(given.motion, names)
         if model.body_count:
@@ -134,17 +135,18 @@ class StepAdjoint:
             of_state: The arrays of :class:`.adjoint.restore.StateGradients`, in its order; those of bodies may be
                 omitted if the model has none.
         """
-        recorded, step, gradients, of_motion = self._recorded, self._step, self._gradients, self._of_motion
-        motion, cursor, both = step.motion, step.cursor, self._vertices_and_bodies
+        recorded, restored, gradients, of_motion = self._recorded, self._restored, self._gradients, self._of_motion
+        step, cursor, both = self._step, restored.cursor, self._vertices_and_bodies
+        motion = step.motion
         of_states, of_model = restore.StateGradients(), restore.ModelGradients()
         for name, array in zip(restore.StateGradients.vars, of_state, strict=False):
             setattr(of_states, name, array)
         for name in restore.ModelGradients.vars:
             array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
-        wp.copy(step.status.loop.iteration, recorded.step.status.loop.iteration)
-        self._launch(restore.begin_gradients, both, step, of_states, gradients, of_motion)
-        self._launch(restore.restore_velocities, both, step, gradients)  # as they were before the turn
+        wp.copy(restored.status.loop.iteration, recorded.restored.status.loop.iteration)
+        self._launch(restore.begin_gradients, both, restored, of_states, gradients, of_motion)
+        self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)
         self._launch(kernels.set_centres, self._bodies, motion, step.vertices.bodies.pose, step.vertices.bodies)
         self._through_turn()
@@ -154,7 +156,7 @@ class StepAdjoint:
         self._launch(kernels.set_centres, self._bodies, motion, motion.bodies.end, step.vertices.bodies)
         wp.capture_while(cursor.more_iterations, self._through_iteration)
         self._through_vertices_of_bodies(kernels.place_vertices, "x1")
-        inputs = [step, gradients, of_motion, of_states, of_model]
+        inputs = [restored, gradients, of_motion, of_states, of_model]
         self._launch(restore.finish_gradients, len(motion.x0), *inputs)
         if self._mesh.model.body_count:
             self._through_motion_of_bodies()
@@ -167,23 +169,22 @@ class StepAdjoint:
         self._through_centres(step.motion.bodies.end)
         self._through_poses()
         shapes, planes = mesh.device_shape_vertices, mesh.device_planes
-        inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, step.dt]
+        inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, self._restored.dt]
         self._launch_adjoint(kernels.place_shape_vertices, len(shapes.body), inputs)
-        inputs = [step.motion, planes.point, planes.normal, planes.body, step.planes]
+        inputs = [step.motion, planes.point, planes.normal, planes.body, self._restored.planes]
         self._launch_adjoint(kernels.place_planes, len(planes.body), inputs)
 
     def _through_turn(self):
         """Goes back through the turn that restores angular momentum."""
-        motion, vertices, constraints = self._step.motion, self._step.vertices, self._step.constraints
-        both, gradients, worlds = self._vertices_and_bodies, self._gradients, len(self._step.status.is_fast)
+        both, gradients, worlds = self._vertices_and_bodies, self._gradients, len(self._restored.status.is_fast)
         totals = wp.zeros((worlds, int(SUMS)), dtype=wp.float64, device=self._mesh.device, requires_grad=True)
-        of_contacts, of_elements = [motion, vertices, constraints, totals], [motion, vertices, totals]
-        self._launch(kernels.add_torques, self._constraints, *of_contacts)
-        self._launch(kernels.add_moments, both, *of_elements)
+        inputs = [self._step, totals]
+        self._launch(kernels.add_torques, self._constraints, *inputs)
+        self._launch(kernels.add_moments, both, *inputs)
         of_outputs = [gradients.velocity, gradients.bodies.velocity]
-        self._launch_adjoint(kernels.turn_velocities, both, of_elements, of_outputs)
-        self._launch_adjoint(kernels.add_moments, both, of_elements)
-        self._launch_adjoint(kernels.add_torques, self._constraints, of_contacts)
+        self._launch_adjoint(kernels.turn_velocities, both, inputs, of_outputs)
+        self._launch_adjoint(kernels.add_moments, both, inputs)
+        self._launch_adjoint(kernels.add_torques, self._constraints, inputs)
 
     def _batch(self, through):
         for _ in range(SWEEPS_PER_BATCH):
@@ -191,7 +192,7 @@ class StepAdjoint:
 
     def _through_velocity_sweep(self):
         """Goes back through a sweep on velocities."""
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._velocities)
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._velocities)
         self._restore_velocities()
         self._through_change(self._velocities)
         self._through_vertices_of_bodies(kernels.vertex_velocities, "velocity")
@@ -199,7 +200,7 @@ class StepAdjoint:
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         self._restore_velocities()
-        inputs = [self._step, self._velocities]
+        inputs = [self._restored, self._velocities]
         self._launch_adjoint(kernels.initialize_multipliers, self._constraints, inputs)
         self._of_constraints.previous_multiplier.zero_()
 
@@ -210,15 +211,15 @@ class StepAdjoint:
         self._through_truncation()
         self._move_cursor(Move.SWEEPS)
         if self._moves_bodies:
-            wp.capture_if(self._step.cursor.more_sweeps, self._through_poses)
-        wp.capture_while(self._step.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
+            wp.capture_if(self._restored.cursor.more_sweeps, self._through_poses)
+        wp.capture_while(self._restored.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
         self._move_cursor(Move.DETECTION)
-        inputs = [self._step, self._recorded.step.constraints]
+        inputs = [self._restored, self._recorded.restored.step.constraints]
         self._launch_adjoint(kernels.make_constraints, self._constraints, inputs)
 
     def _through_position_sweep(self):
         """Goes back through a sweep on positions."""
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._positions)
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._positions)
         self._restore_positions()
         self._place()
         self._through_change(self._positions)
@@ -226,32 +227,31 @@ class StepAdjoint:
 
     def _through_change(self, swept):
         """Goes back through what a sweep changes."""
-        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._step, swept])
+        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._restored, swept])
         self._step.vertices.active.zero_()
         if self._moves_bodies:
             self._step.vertices.bodies.active.zero_()
 
     def _through_truncation(self):
         """Goes back through the truncation of paths."""
-        step, times, count = self._step, self._times, self._truncations
-        self._launch(restore.restore_paths, count, step, self._gradients, self._of_paths)
+        restored, times, count = self._restored, self._times, self._truncations
+        self._launch(restore.restore_paths, count, restored, self._gradients, self._of_paths)
         self._place()
-        self._launch(kernels.find_truncation_times, count, step, times)
-        self._launch_adjoint(kernels.truncate_paths, count, [step, times, self._paths])
-        self._launch_adjoint(kernels.find_truncation_times, count, [step, times])
+        self._launch(kernels.find_truncation_times, count, restored, times)
+        self._launch_adjoint(kernels.truncate_paths, count, [restored, times, self._paths])
+        self._launch_adjoint(kernels.find_truncation_times, count, [restored, times])
 
     def _through_vertices_of_bodies(self, kernel, name, *inputs):
         """Turns gradients with respect to positions or velocities of vertices into those with respect to bodies."""
-        motion, vertices, gradients = self._step.motion, self._step.vertices, self._gradients
-        collected = [motion, gradients, getattr(gradients, name), getattr(gradients, f"more_{name}")]
+        gradients = self._gradients
+        collected = [self._step.motion, gradients, getattr(gradients, name), getattr(gradients, f"more_{name}")]
         self._launch(restore.collect_gradients_on_bodies, self._shape_vertices, *collected)
-        self._launch_adjoint(kernel, self._shape_vertices, [motion, vertices, *inputs], [gradients.on_bodies])
+        self._launch_adjoint(kernel, self._shape_vertices, [self._step, *inputs], [gradients.on_bodies])
 
     def _through_poses(self):
         """Turns gradients with respect to poses into those with respect to what constraints did to them."""
         of_poses = self._gradients.bodies.pose
-        inputs = [self._step.motion, self._step.vertices, self._sums]
-        self._launch_adjoint(kernels.project_poses, self._bodies, inputs, [of_poses])
+        self._launch_adjoint(kernels.project_poses, self._bodies, [self._step, self._sums], [of_poses])
         of_poses.zero_()
 
     def _through_centres(self, poses):
@@ -263,20 +263,18 @@ class StepAdjoint:
             self._of_moved_bodies.inverse_inertia.zero_()
 
     def _move_cursor(self, move):
-        self._launch(restore.move_cursor, 1, self._step, int(move))
+        self._launch(restore.move_cursor, 1, self._restored, int(move))
 
     def _restore_positions(self):
-        self._launch(restore.restore_positions, self._vertices_and_bodies, self._step, self._gradients, self._sums)
+        self._launch(restore.restore_positions, self._vertices_and_bodies, self._restored, self._gradients, self._sums)
 
     def _restore_velocities(self):
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._step, self._gradients)
-        self._launch(kernels.vertex_velocities, self._shape_vertices, motion, vertices, vertices.velocity)
+        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._restored, self._gradients)
+        self._launch(kernels.vertex_velocities, self._shape_vertices, self._step, self._step.vertices.velocity)
 
     def _place(self):
         """Moves vertices of bodies to where their poses say."""
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(kernels.place_vertices, self._shape_vertices, motion, vertices, vertices.x1)
+        self._launch(kernels.place_vertices, self._shape_vertices, self._step, self._step.vertices.x1)
 
     def _launch(self, kernel, dim, *arguments):
         wp.launch(kernel, dim, inputs=arguments, device=self._mesh.device)

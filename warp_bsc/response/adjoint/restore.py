@@ -15,7 +15,7 @@ from ..solve.velocities import change_velocity
 from ..state.fixed_sum import sums_of
 from ..state.planes import MovingPlanes
 from ..state.record import StepRecord, truncation_at
-from ..state.structs import Constraints, Motion, Vertices
+from ..state.structs import Motion, Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,15 +36,11 @@ class Cursor:
 class RestoredStep:
     """A recorded step, restored as it was at the cursor."""
 
-    motion: Motion
+    step: Step
     planes: MovingPlanes
-    vertices: Vertices
-    constraints: Constraints
     status: SolveStatus
     record: StepRecord
     cursor: Cursor
-    restitution: wp.array[float]
-    separation: wp.float64  # smallest separation of constraints [m]
     dt: wp.float64  # length of the step [s]
 
 
@@ -149,12 +145,12 @@ def is_movable(motion: Motion, body: int) -> bool:
 
 
 @wp.kernel
-def begin_gradients(step: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
+def begin_gradients(restored: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
     """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
 
     Threads are over vertices and bodies.
     """
-    motion, undetected, vertex = step.motion, step.status.results.undetected[0] == 1, wp.tid()
+    motion, undetected, vertex = restored.step.motion, restored.status.results.undetected[0] == 1, wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
         pose = of_state.body_q[body]
@@ -181,12 +177,12 @@ def begin_gradients(step: RestoredStep, of_state: StateGradients, gradients: Gra
 
 
 @wp.kernel
-def move_cursor(step: RestoredStep, move: int):
+def move_cursor(restored: RestoredStep, move: int):
     """Moves the cursor, and sets the iteration of the status to the one that computed what is there.
 
     There is nothing to go back through in a record that is not complete.
     """
-    record, cursor = step.record, step.cursor
+    record, cursor, status = restored.record, restored.cursor, restored.status
     iteration = cursor.iteration[0]
     first = cursor.first_sweep[0]
     last = cursor.next_sweep[0]
@@ -194,8 +190,8 @@ def move_cursor(step: RestoredStep, move: int):
         first = 0
         last = -1
     elif move == Move.END:
-        iteration = wp.min(step.status.loop.iteration[0], step.status.max_iterations + step.status.max_truncations + 1)
-        step.status.loop.iteration[0] = iteration
+        iteration = wp.min(status.loop.iteration[0], status.max_iterations + status.max_truncations + 1)
+        status.loop.iteration[0] = iteration
         cursor.more_iterations[0] = 1
         first = record.sweep_offsets[iteration + 1]
         last = record.counts.sweeps[0] - 1
@@ -204,7 +200,7 @@ def move_cursor(step: RestoredStep, move: int):
         last = record.sweep_offsets[iteration + 1] - 1
     else:
         iteration -= 1
-        step.status.loop.iteration[0] = wp.max(iteration, 0)
+        status.loop.iteration[0] = wp.max(iteration, 0)
         cursor.more_iterations[0] = wp.where(iteration >= 0, 1, 0)
     cursor.iteration[0] = iteration
     cursor.first_sweep[0] = first
@@ -224,67 +220,68 @@ def _step_back(cursor: Cursor):
 
 
 @wp.kernel
-def restore_multipliers(step: RestoredStep, swept: Projection):
+def restore_multipliers(restored: RestoredStep, swept: Projection):
     """Restores multipliers as they were before a sweep, and the sums of what they changed."""
-    record, constraints, sweep = step.record, step.constraints, step.cursor.next_sweep[0]
+    step, record, sweep = restored.step, restored.record, restored.cursor.next_sweep[0]
     entry = entry_of(record, sweep, wp.tid())
-    if sweep < step.cursor.first_sweep[0] or entry < 0:
+    if sweep < restored.cursor.first_sweep[0] or entry < 0:
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
-    change = old - swept.multiplier[i]
-    add_delta(step.motion, step.vertices, constraints, i, change, swept.x, swept.sums, swept.body_sums)
+    add_delta(step, i, old - swept.multiplier[i], swept.x, swept.sums, swept.body_sums)
     swept.multiplier[i] = old
-    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
-    count_active(step.motion, step.vertices, constraints, i)
+    step.constraints.previous_multiplier[i] = record.previous_multiplier[entry]
+    count_active(step, i)
 
 
 @wp.kernel
-def restore_positions(step: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
+def restore_positions(restored: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
     """Restores positions and poses as they were before a sweep, and adds up the gradients of positions.
 
     Threads are over vertices and bodies. Writes the sums of the changes of poses to ``sums``.
     """
     vertex = wp.tid()
+    step = restored.step
     body = vertex - step.motion.x0.shape[0]
     if body >= 0:
-        move_body(step.motion, step.vertices, body)
+        move_body(step, body)
         shift, turn = sums_of(step.vertices.bodies.delta_x, body)
         sums[body] = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
         return
     if vertex == 0:
-        _step_back(step.cursor)
+        _step_back(restored.cursor)
     gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
     gradients.more_x1[vertex] = wp.vec3()
     if step.vertices.active[vertex] != 0:
-        move_vertex(step.motion, step.vertices, vertex)
+        move_vertex(step, vertex)
 
 
 @wp.kernel
-def restore_velocities(step: RestoredStep, gradients: Gradients):
+def restore_velocities(restored: RestoredStep, gradients: Gradients):
     """Restores velocities as they were before a sweep, and adds up their gradients, over vertices and bodies."""
     vertex = wp.tid()
+    step = restored.step
     body = vertex - step.motion.x0.shape[0]
     if body >= 0:
         change = wp.spatial_vectord()
-        if change_body_velocity(step.motion, step.vertices, body):
+        if change_body_velocity(step, body):
             for i in range(6):
                 change[i] = wp.float64(gradients.bodies.velocity[body][i])
         gradients.bodies.velocity_change[body] = change
         return
     if vertex == 0:
-        _step_back(step.cursor)
+        _step_back(restored.cursor)
     gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
     gradients.more_velocity[vertex] = wp.vec3()
-    is_free = change_velocity(step.motion, step.vertices, vertex)
+    is_free = change_velocity(step, vertex)
     gradients.velocity_change[vertex] = wp.where(is_free, gradients.velocity[vertex], wp.vec3())
 
 
 @wp.kernel
-def restore_paths(step: RestoredStep, gradients: Gradients, of_paths: Paths):
+def restore_paths(restored: RestoredStep, gradients: Gradients, of_paths: Paths):
     """Restores paths before truncation; the gradients of their vertices and bodies move to ``of_paths``."""
-    record = step.record
-    entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
+    step, record = restored.step, restored.record
+    entry = truncation_at(record, restored.cursor.iteration[0], wp.tid())
     if entry < 0:
         return
     vertex = record.vertex[entry]
@@ -319,21 +316,21 @@ def collect_gradients_on_bodies(
 
 
 @wp.func
-def _missing(step: RestoredStep) -> float:
+def _missing(restored: RestoredStep) -> float:
     """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
-    return wp.where(step.record.counts.complete[0] == 0, wp.nan, float(0.0))
+    return wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
 
 
 @wp.kernel
 def finish_gradients(
-    step: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
+    restored: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
 
     Those of vertices of shapes remain gradients with respect to what was predicted of them.
     """
     particle = wp.tid()
-    missing = _missing(step)
+    missing = _missing(restored)
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
@@ -344,7 +341,7 @@ def finish_gradients(
         of_motion.velocity[particle] = velocity
         return
     masses = of_model.particle_inv_mass
-    if masses and step.motion.inverse_mass[particle] > 0.0:
+    if masses and restored.step.motion.inverse_mass[particle] > 0.0:
         masses[particle] = masses[particle] + of_motion.inverse_mass[particle] + missing
     of_state.particle_q[particle] = x1 + wp.vec3(missing)
     of_state.particle_qd[particle] = velocity + wp.vec3(missing)
@@ -353,14 +350,14 @@ def finish_gradients(
 
 @wp.kernel
 def finish_body_gradients(
-    step: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
+    restored: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
 
     Where the response moves no bodies, only those of poses change.
     """
-    motion, body = step.motion, wp.tid()
-    missing = _missing(step)
+    motion, body = restored.step.motion, wp.tid()
+    missing = _missing(restored)
     start = of_state.start_body_q[body] + of_motion.bodies.start[body]
     end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:

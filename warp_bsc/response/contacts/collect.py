@@ -9,9 +9,9 @@ from ...kernels.signs import FREE
 from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Connectivity, Constraints, ContactKind, DividingPlanes, Motion, Pace, Vertices
+from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
-from ..tuning import MAX_SAGITTA, PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
+from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from .constraints import (
     TOUCH,
     Constraint,
@@ -37,7 +37,6 @@ from .rules import (
     crosses_face,
     inverse_mass_of,
     is_movable,
-    is_on_body,
     owner_of,
 )
 
@@ -50,7 +49,7 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 @wp.kernel(enable_backward=False)
 def count_crossings(
-    motion: Motion, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
+    step: Step, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
@@ -59,17 +58,17 @@ def count_crossings(
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    if is_movable(motion, corners) or motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if crosses_face(motion, mesh, edge, face):
+    if is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+        if crosses_face(step.motion, mesh, edge, face):
             wp.atomic_add(count, 0, 1)
 
 
 @wp.func
 def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     """Returns whether a plane stops a vertex: not one of its own body, or of a shape that it does not collide with."""
-    if not is_on_body(motion, vertex):
+    body = body_of(motion, vertex)
+    if body < 0:
         return True
-    body = motion.bodies.of_vertex[vertex]
     shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
     return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
 
@@ -82,7 +81,7 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
     predicted to end in it: a body goes no deeper.
     """
     lowest = ZERO
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         before, _error = signed_distance(planes.start[i], motion.x0[vertex])
         lowest = wp.min(before, ZERO)
         if motion.bodies.responds == 0:
@@ -92,14 +91,12 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
 
 
 @wp.func
-def offset_from(
-    motion: Motion, planes: MovingPlanes, i: int, vertex: int, status: SolveStatus, separation: wp.float64
-) -> wp.float64:
+def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: SolveStatus) -> wp.float64:
     """Returns the offset at which constraints keep a vertex that a plane stops, without a minimum distance [m]."""
-    distance = level(motion, planes, i, vertex)
+    distance = level(step.motion, planes, i, vertex)
     if distance == ZERO:
-        before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-        distance = feasible(motion, wp.vec4i(vertex), widened(separation, status), before, separation)
+        before, _error = signed_distance(planes.start[i], step.motion.x0[vertex])
+        distance = feasible(step, wp.vec4i(vertex), widened(step.separation, status), before)
     return planes.end[i][3] + distance
 
 
@@ -109,7 +106,7 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
 
     Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
     """
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         return level(motion, planes, i, vertex), ZERO
     if not motion.distances.radius:
         return ZERO, ZERO
@@ -119,24 +116,14 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
 
 
 @wp.kernel
-def collect_penetrations(
-    # in
-    motion: Motion,
-    planes: MovingPlanes,
-    separation: wp.float64,
-    ahead: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing: DividingPlanes, status: SolveStatus):
     """Adds constraints for vertices that may have entered solids; after the last projection, dividing planes too.
 
     Vertices that were inside at the start are excluded, like pairs of elements that crossed. Ahead of the first
     detection, contacts are counted as those of the predicted motion only.
     """
     vertex = wp.tid()
+    motion, vertices, separation = step.motion, step.vertices, step.separation
     world = motion.world[vertex]
     if inverse_mass_of(motion, vertex) == 0.0:
         return
@@ -166,7 +153,7 @@ def collect_penetrations(
         else:
             count_contact(status, world)
             vertices.changed[vertex] = 1
-            if status.loop.iteration[0] == 0 and is_on_body(motion, vertex):
+            if status.loop.iteration[0] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
         added = Constraint()
@@ -187,13 +174,13 @@ def collect_penetrations(
         added.vertices = wp.vec4i(vertex)
         added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
         added.min_distance = wp.max(kept, ZERO)
-        added.separation = offset_from(motion, planes, i, vertex, status, separation) + added.min_distance
+        added.separation = offset_from(step, planes, i, vertex, status) + added.min_distance
         added.friction = contact_friction(motion.friction[vertex], planes.friction[i])
         added.kind = ContactKind.PLANE
         added.plane = i
         added.within_tolerance = True
         added.pace = Pace.SLOW
-        add_constraint(motion, vertices, added, constraints)
+        add_constraint(step, added)
 
 
 @wp.func
@@ -205,19 +192,12 @@ def mark_changed(vertices: Vertices, corners: wp.vec4i):
 
 @wp.func
 def _collect_contact(
-    motion: Motion,
-    mesh: Connectivity,
-    contacts: PairQueue,
-    i: int,
-    separation: wp.float64,
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
+    step: Step, mesh: Connectivity, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus
 ):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not has_pair(contacts, i):
         return
+    motion, vertices = step.motion, step.vertices
     near = int(contacts.status[i]) == FREE  # within reach of its minimum distance, but not a contact
     if near and not motion.distances.radius:
         return
@@ -264,7 +244,7 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], toi, added.kind, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, kind, separation, added.min_distance, dividing, True, True)
+        add_dividing_plane(step, corners, kind, added.min_distance, dividing, True, True)
         added.multiplier = TOUCH * added.normal
     else:
         if not near:
@@ -273,11 +253,11 @@ def _collect_contact(
             time = wp.where(near, ZERO, toi)
             if are_occluded(motion, mesh, contacts.pairs[i], corners, added.normal, time):
                 return  # the next detection finds it, if it is still there
-    target = widened(separation, status)
+    target = widened(step.separation, status)
     if added.pace == Pace.SLOW:
         before = wp.dot(added.normal, relative(added.weights, corners, motion.x0)) - added.min_distance
-        target = feasible(motion, corners, target, before, separation)
-    target += sagitta(motion, vertices, corners, MAX_SAGITTA * separation)
+        target = feasible(step, corners, target, before)
+    target += sagitta(step, corners)
     target += added.min_distance
     if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
         status.detection.too_near[0] = 1
@@ -287,23 +267,20 @@ def _collect_contact(
     added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     added.within_tolerance = contacts.within_tolerance[i]
     added.toi = toi
-    add_constraint(motion, vertices, added, constraints)
+    add_constraint(step, added)
 
 
 @wp.kernel
 def collect_contacts(
     # in
-    motion: Motion,
     mesh: Connectivity,
     first: PairQueue,
     second: PairQueue,
-    separation: wp.float64,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     can_search: bool,
     # in and out
-    vertices: Vertices,
-    constraints: Constraints,
+    step: Step,
     dividing: DividingPlanes,
     status: SolveStatus,
 ):
@@ -315,14 +292,14 @@ def collect_contacts(
     i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(motion, mesh, first, i, separation, vertices, constraints, dividing, status)
-    _collect_contact(motion, mesh, second, i, separation, vertices, constraints, dividing, status)
+    _collect_contact(step, mesh, first, i, dividing, status)
+    _collect_contact(step, mesh, second, i, dividing, status)
 
 
 @wp.kernel
-def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
+def drop_if_full(step: Step, record: StepRecord, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
-    if constraints.count[0] > constraints.vertices.shape[0] - needed:
-        constraints.count[0] = 0
+    if step.constraints.count[0] > step.constraints.vertices.shape[0] - needed:
+        step.constraints.count[0] = 0
         if is_recording(record):
             record.counts.dropped[0] = 1

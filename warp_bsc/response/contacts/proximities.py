@@ -7,7 +7,7 @@ from ...detection.launch import retry_until_fits
 from ...kernels.pipeline.pairs import firsts_of
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..schedule import SolveStatus, has_overflowed, is_projecting
-from ..state.structs import Connectivity, Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.structs import Connectivity, ContactKind, Motion, Pace, Step
 from ..state.vectors import ONE, ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
@@ -76,7 +76,7 @@ def _direction(u: wp.vec3d) -> int:
 
 
 @wp.kernel
-def find_nearest(motion: Motion, vertex_face: PairQueue, nearest: wp.array2d[float]):
+def find_nearest(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float]):
     """Finds how far each vertex is from the nearest face in each of six directions [m]; ``nearest`` is infinite before.
 
     Only faces count that have the closest point within them.
@@ -85,7 +85,7 @@ def find_nearest(motion: Motion, vertex_face: PairQueue, nearest: wp.array2d[flo
     if not has_pair(vertex_face, i):
         return
     corners = vertices_of(vertex_face, i)
-    _weights, normal, distance = weights_across(motion, corners, VERTEX_FACE)
+    _weights, normal, distance = weights_across(step.motion, corners, VERTEX_FACE)
     if distance > ZERO:
         wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
 
@@ -106,18 +106,11 @@ def _is_behind(
 
 @wp.func
 def _collect_proximity(
-    motion: Motion,
-    mesh: Connectivity,
-    candidates: PairQueue,
-    nearest: wp.array2d[float],
-    i: int,
-    separation: wp.float64,
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
+    step: Step, mesh: Connectivity, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus
 ):
     if not has_pair(candidates, i):
         return
+    motion, separation = step.motion, step.separation
     kind = candidates.kind
     corners = vertices_of(candidates, i)
     weights, normal, distance = weights_across(motion, corners, kind)
@@ -148,28 +141,23 @@ def _collect_proximity(
     added.vertices = corners
     added.weights = weights
     added.normal = normal
-    added.separation = added.min_distance + feasible(motion, corners, separation, beyond, separation)
+    added.separation = added.min_distance + feasible(step, corners, separation, beyond)
     added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     added.kind = ContactKind.VERTEX_FACE_PROXIMITY
     if kind == EDGE_EDGE:
         added.kind = ContactKind.EDGE_EDGE_PROXIMITY
     added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
-    add_constraint(motion, vertices, added, constraints)
+    add_constraint(step, added)
 
 
 @wp.kernel
 def collect_proximities(
-    # in
-    motion: Motion,
+    step: Step,
     mesh: Connectivity,
     vertex_face: PairQueue,
     edge_edge: PairQueue,
     nearest: wp.array2d[float],
-    separation: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
     status: SolveStatus,
 ):
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
@@ -181,31 +169,26 @@ def collect_proximities(
     behind them.
     """
     i = wp.tid()
-    _collect_proximity(motion, mesh, vertex_face, nearest, i, separation, vertices, constraints, status)
-    _collect_proximity(motion, mesh, edge_edge, nearest, i, separation, vertices, constraints, status)
+    _collect_proximity(step, mesh, vertex_face, nearest, i, status)
+    _collect_proximity(step, mesh, edge_edge, nearest, i, status)
 
 
 @wp.kernel
 def drop_proximities(
-    # in
-    kept: wp.array[int],
-    needed: int,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    # in and out
-    constraints: Constraints,
+    step: Step, kept: wp.array[int], needed: int, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]
 ):
     """Drops all proximities, those from ``kept`` on, if some are missing, or if contacts might not fit behind them.
 
     They only save iterations; but which of them fit would depend on the order of threads.
     """
-    if has_overflowed(counts, capacities) or constraints.count[0] > constraints.vertices.shape[0] - needed:
-        constraints.count[0] = kept[0]
+    count = step.constraints.count
+    if has_overflowed(counts, capacities) or count[0] > step.constraints.vertices.shape[0] - needed:
+        count[0] = kept[0]
 
 
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for proximities, in worlds that have contacts; in a CUDA graph none if not all fit."""
-    detector, motion, nearest = work.detector, work.motion.vertices, work.nearest
+    detector, nearest = work.detector, work.nearest
     retry_until_fits(detector.find_candidates, detector, work.device)
     wp.copy(work.kept, work.constraints.count)
 
@@ -213,11 +196,10 @@ def add_proximities(work: Workspace) -> None:
         queues = queues_of(detector, candidates=True)[:2]
         if nearest is not None:
             nearest.fill_(np.inf)
-            work.launch_over(find_nearest, counted(queues[:1]), [motion, queues[0], nearest])
-        inputs = [motion, work.connectivity, *queues, nearest, work.separation]
-        outputs = [work.vertices, work.constraints, work.status]
-        work.launch_over(collect_proximities, counted(queues), [*inputs, *outputs])
+            work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
+        inputs = [work.step, work.connectivity, *queues, nearest, work.status]
+        work.launch_over(collect_proximities, counted(queues), inputs)
 
     retry_until_fits(collect, work, work.device)
-    inputs = [work.kept, work.max_contacts, detector.counters.array, detector.capacities, work.constraints]
+    inputs = [work.step, work.kept, work.max_contacts, detector.counters.array, detector.capacities]
     work.launch(drop_proximities, 1, inputs)

@@ -9,7 +9,7 @@ from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
-from ..state.structs import Bodies, Connectivity, Motion
+from ..state.structs import Bodies, Connectivity, Motion, body_of, can_move
 from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
 
@@ -28,30 +28,16 @@ class ContactClass(IntEnum):
 @wp.func
 def inverse_mass_of(motion: Motion, vertex: int) -> float:
     """Returns the inverse mass of a vertex, or of the body that it moves with [1/kg]; 0 where nothing can move it."""
-    if motion.bodies.of_vertex:
-        body = motion.bodies.of_vertex[vertex]
-        if body >= 0:
-            return motion.bodies.inverse_mass[body]
+    body = body_of(motion, vertex)
+    if body >= 0:
+        return motion.bodies.inverse_mass[body]
     return motion.inverse_mass[vertex]
-
-
-@wp.func
-def is_on_body(motion: Motion, vertex: int) -> bool:
-    """Returns whether a vertex is of a body; False if the response moves none."""
-    if motion.bodies.of_vertex:
-        return motion.bodies.of_vertex[vertex] >= 0
-    return False
 
 
 @wp.func
 def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
     """Returns whether one of two elements is of a body that can be moved."""
-    if motion.bodies.of_vertex:
-        for side in range(2):
-            body = motion.bodies.of_vertex[corners[3 * side]]
-            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                return True
-    return False
+    return can_move(motion, body_of(motion, corners[0])) or can_move(motion, body_of(motion, corners[3]))
 
 
 @wp.func
@@ -60,15 +46,11 @@ def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
     for j in range(4):
         if motion.inverse_mass[corners[j]] > 0.0:
             return True
-    if not motion.bodies.of_vertex:
+    if not are_on_body(motion, corners):
         return False
-    for side in range(2):
-        body = motion.bodies.of_vertex[corners[3 * side]]
-        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-            if corners[3 - 3 * side] < motion.bodies.particle_count:  # a particle that is held
-                return True
-            return motion.bodies.responds == 1 and bodies_meet(motion, corners)
-    return False
+    if wp.min(corners[0], corners[3]) < motion.bodies.particle_count:  # a particle that is held
+        return True
+    return motion.bodies.responds == 1 and bodies_meet(motion, corners)
 
 
 @wp.func
@@ -93,23 +75,13 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
 @wp.func
 def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
     """Returns whether two elements of shapes are of two that are to collide, one on a body that can be moved."""
-    if not motion.bodies.of_vertex:
-        return False
     particles = motion.bodies.particle_count
-    if corners[0] < particles or corners[3] < particles:
+    if wp.min(corners[0], corners[3]) < particles or not are_on_body(motion, corners):
         return False
-    body = motion.bodies.of_vertex[corners[0]]
-    other = motion.bodies.of_vertex[corners[3]]
-    if body == other:
+    if body_of(motion, corners[0]) == body_of(motion, corners[3]):
         return False
-    movable = bool(False)
-    if body >= 0:
-        movable = motion.bodies.inverse_mass[body] > 0.0
-    if other >= 0:
-        movable = movable or motion.bodies.inverse_mass[other] > 0.0
-    return movable and collides(
-        motion.bodies, motion.bodies.shape[corners[0] - particles], motion.bodies.shape[corners[3] - particles]
-    )
+    shapes = motion.bodies.shape
+    return collides(motion.bodies, shapes[corners[0] - particles], shapes[corners[3] - particles])
 
 
 @wp.func

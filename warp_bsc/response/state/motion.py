@@ -9,7 +9,7 @@ from .friction import Friction
 from .mesh import ModelMesh, Placement, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
-from .structs import Bodies, Motion, add_zeros
+from .structs import Bodies, Motion, add_zeros, body_of, can_move
 from .vectors import to_double
 
 _SAME_POSE = 1e-5
@@ -42,19 +42,9 @@ def _place_plane(place: Placement, i: int, planes: wp.array[wp.vec4d]):
 
 
 @wp.func
-def _is_movable(motion: Motion, body: int) -> bool:
-    """Returns whether the response can move a body, -1 for none."""
-    if body < 0 or not motion.bodies.inverse_mass:
-        return False
-    return motion.bodies.inverse_mass[body] > 0.0
-
-
-@wp.func
 def moves_with_body(motion: Motion, vertex: int) -> bool:
     """Returns whether a vertex is of a body that the response can move."""
-    if not motion.bodies.of_vertex:
-        return False
-    return _is_movable(motion, motion.bodies.of_vertex[vertex])
+    return can_move(motion, body_of(motion, vertex))
 
 
 @wp.func
@@ -143,7 +133,7 @@ def _write_end(
     the last step left it: it would otherwise pass undetected what is in its way, if a program moves it between steps.
     """
     i = wp.tid()
-    if last and i < planes.end.shape[0] and not _is_movable(motion, place.plane_body[i]):
+    if last and i < planes.end.shape[0] and not can_move(motion, place.plane_body[i]):
         if continues(motion, planes.world[i]) and wp.isfinite(planes.end[i]):
             planes.start[i] = planes.end[i]
     _place_plane(place, i, planes.end)

@@ -5,7 +5,7 @@ from typing import Literal
 import warp as wp
 
 from ..schedule import SolveStatus, views_of
-from .structs import Constraints, add_zeros
+from .structs import Constraints, Step, add_zeros
 
 wp.set_module_options({"enable_backward": False})
 
@@ -142,14 +142,14 @@ class StepRecorder:
 
 
 @wp.kernel
-def record_offsets(constraints: Constraints, status: SolveStatus, record: StepRecord, after: int):
+def record_offsets(step: Step, status: SolveStatus, record: StepRecord, after: int):
     """Records the offsets of an iteration, or those after the last; iterations that freeze share one offset."""
     last = status.max_iterations + status.max_truncations + 1
     iteration = status.loop.iteration[0]
     if after == 1 or iteration <= last:
         i = wp.min(iteration, last) + after
         record.sweep_offsets[i] = record.counts.sweeps[0]
-        record.constraint_offsets[i] = constraints.count[0]
+        record.constraint_offsets[i] = step.constraints.count[0]
         record.truncation_offsets[i] = record.counts.truncations[0]
 
 

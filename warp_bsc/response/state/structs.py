@@ -161,6 +161,33 @@ class Constraints:
     active_count: wp.array[wp.int64]
 
 
+@wp.struct
+class Step:
+    """A motion, and what the response moves and knows of it, as kernels take them."""
+
+    motion: Motion
+    vertices: Vertices
+    constraints: Constraints
+    separation: wp.float64  # distance that projection moves contacts apart [m]
+    restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
+
+
+@wp.func
+def body_of(motion: Motion, vertex: int) -> int:
+    """Returns the body of a vertex of a shape; -1 if it has none, or if the response moves no bodies."""
+    if motion.bodies.of_vertex:
+        return motion.bodies.of_vertex[vertex]
+    return -1
+
+
+@wp.func
+def can_move(motion: Motion, body: int) -> bool:
+    """Returns whether the response can move a body in this step, -1 for none."""
+    if body < 0 or not motion.bodies.inverse_mass:
+        return False
+    return motion.bodies.inverse_mass[body] > 0.0
+
+
 @wp.func
 def has_final_velocity(outcome: int) -> bool:
     """Returns whether the velocity of a vertex follows from its path, and constraints do not change it."""

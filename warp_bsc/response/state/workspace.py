@@ -8,9 +8,8 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import SolveStatus, allocate_status, clear_status
+from ..schedule import MAX_ITERATIONS, SolveStatus, allocate_status, clear_status
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
-from .mesh import ModelMesh
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -20,8 +19,8 @@ from .structs import (
     SUMS,
     Constraints,
     DividingPlanes,
-    Motion,
     MovedBodies,
+    Step,
     Vertices,
     allocate,
 )
@@ -30,21 +29,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def _begin(
-    # in
-    motion: Motion,
-    worlds: int,
-    # out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatus):
     """Initializes the vertices by their prediction, and clears everything else."""
     i = wp.tid()
+    motion, vertices = step.motion, step.vertices
     if i == 0:
         clear_status(status)
-        constraints.count[0] = 0
+        step.constraints.count[0] = 0
         if dividing.count:
             dividing.count[0] = 0
     if i < worlds:
@@ -74,77 +65,91 @@ class Workspace:
     """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
     Attributes:
-        motion: The motion of the step that is being resolved; it is only read.
-        vertices: The vertices and bodies as they are moved.
+        step: The motion, which is only read, the vertices and bodies as they are moved, and the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
-        status_values: The arrays that the parts of ``status`` are views of.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
+        differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
+            as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
     """
 
-    motion: ModelMotion
-
     def __init__(
         self,
-        mesh: ModelMesh,
+        motion: ModelMotion,
         *,
         separation: float,
         restitution: wp.array[float],
-        differentiable: bool,
-        moves_bodies: bool,
-        max_iterations: int,
+        max_iterations: int = MAX_ITERATIONS,
     ):
-        """Allocates buffers for steps with these options, see :class:`.solver_ccd.SolverCCD`.
-
-        If they are ``differentiable``, steps may be recorded: all sweeps are made then, and paths are truncated, not
-        divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
-        """
-        self.mesh, self.device = mesh, mesh.device
-        self.separation, self.restitution = separation, restitution
-        self.differentiable = differentiable
+        """Allocates buffers for steps with these options, see :class:`.solver_ccd.SolverCCD`."""
+        self.mesh = mesh = motion.mesh
+        self.device, vertices = mesh.device, mesh.vertex_count
+        self.differentiable = differentiable = mesh.model.requires_grad
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
-        self.particle_count, vertices, device = mesh.model.particle_count, mesh.vertex_count, self.device
-        self.body_count = mesh.model.body_count if moves_bodies else 0
+        self.particle_count, device = mesh.model.particle_count, mesh.device
+        self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
         self.connectivity = mesh.connectivity
+        self.step = step = Step()
+        self.motion = motion
+        step.separation, step.restitution = separation, restitution
         size = vertices, 3
-        self.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
-        if moves_bodies:
+        step.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
+        if motion.moves_bodies:
             size = self.body_count, 6
-            self.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
-        self.constraints = allocate(Constraints, 0, device, count=1, active_count=1)
-        self._retired: list[Constraints] = []
+            step.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
+        step.constraints = allocate(Constraints, 0, device, count=1, active_count=1)
+        self._retired: list[wp.array] = []
         self.dividing = DividingPlanes()
         if not differentiable:
             capacity = DIVIDING_PLANES * self.particle_count
             sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
-        self.status, self.status_values = allocate_status(self.worlds, device, **limits)
+        self.status = allocate_status(self.worlds, device, **limits)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
-        self.vertices_at_planes = mesh.vertex_count if moves_bodies else self.particle_count
+        self.vertices_at_planes = mesh.vertex_count if motion.moves_bodies else self.particle_count
         self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
         self.kept = wp.zeros(1, dtype=int, device=device)
-        self.turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
+        self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self._max_blocks = BLOCKS * device.sm_count
 
-    def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
+    @property
+    def motion(self) -> ModelMotion:
+        """The motion of the step that is being resolved."""
+        return self._motion
+
+    @motion.setter
+    def motion(self, motion: ModelMotion) -> None:
+        self._motion, self.step.motion = motion, motion.vertices
+
+    @property
+    def vertices(self) -> Vertices:
+        """The vertices and bodies as they are moved."""
+        return self.step.vertices
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints."""
+        return self.step.constraints
+
+    def begin(self, recorder: StepRecorder | None) -> None:
         """Initializes everything for a step.
 
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
-        self.motion, self.recorder = motion, recorder
+        self.recorder = recorder
         self.record = StepRecord()  # which records nothing
         if recorder is not None:
             recorder.reserve("entries", MIN_ENTRIES)
@@ -152,9 +157,8 @@ class Workspace:
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             recorder.counts.zero_()
             self.record = recorder.record
-        outputs = [self.vertices, self.constraints, self.dividing, self.status]
         size = max(len(self.vertices.x1), self.worlds + 1)
-        self.launch(_begin, size, [motion.vertices, self.worlds], outputs)
+        self.launch(_begin, size, [self.step, self.worlds, self.dividing, self.status])
 
     def _if_distances(self, capacity):
         """Returns a capacity, or 0 without minimum distances."""
@@ -167,18 +171,19 @@ class Workspace:
 
     def reserve(self, more: int) -> None:
         """Reserves ``more`` constraints, and as many for later iterations; does nothing in a CUDA graph."""
-        old = self.constraints
         if self.device.is_capturing:
             return
-        filled = int(old.count.numpy()[0])
-        if len(old.vertices) < filled + more:
+        filled = int(self.constraints.count.numpy()[0])
+        if len(self.constraints.vertices) < filled + more:
             capacity = filled + ITERATIONS_RESERVED * more
             sizes = {"count": 1, "active_count": 1, "min_distance": self._if_distances(capacity)}
-            self.constraints = new = allocate(Constraints, capacity, self.device, **sizes)
-            for name in Constraints.vars if filled else ():
-                array = getattr(old, name)
-                wp.copy(getattr(new, name), array, count=min(filled, len(array)))
-            self._retired.append(old)  # a CUDA graph may still write to it
+            new = allocate(Constraints, capacity, self.device, **sizes)
+            for name in Constraints.vars:
+                old = getattr(self.constraints, name)
+                if filled:
+                    wp.copy(getattr(new, name), old, count=min(filled, len(old)))
+                self._retired.append(old)  # a CUDA graph may still write to it
+            self.step.constraints = new
 
     def grow(self) -> bool:
         """Enlarges the constraints, without the proximities, if those did not fit; returns whether. Synchronizes."""
@@ -192,7 +197,7 @@ class Workspace:
     def record_offsets(self, after: int = 0) -> None:
         """Records, if the step is recorded, where an iteration begins or, with 1, where the last ended."""
         if self.recorder is not None:
-            self.launch(record_offsets, 1, [self.constraints, self.status, self.record, after])
+            self.launch(record_offsets, 1, [self.step, self.status, self.record, after])
 
     def reserve_entries(self, sweeps: int) -> None:
         """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
@@ -239,12 +244,12 @@ class Workspace:
         self.launch(kernel, max(self.particle_count, int(at_least_once)), inputs)
 
     def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the bodies, if they can be moved, with motion and vertices as its first inputs."""
+        """Launches a kernel over the bodies, if they can be moved, with the step as its first input."""
         if self.body_count:
-            self.launch(kernel, self.body_count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, self.body_count, [self.step, *inputs])
 
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
         if self.body_count:
             count = self.mesh.vertex_count - self.particle_count
-            self.launch(kernel, count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, count, [self.step, *inputs])
