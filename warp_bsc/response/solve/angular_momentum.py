@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from ..state.fixed_sum import with_delta
-from ..state.poses import centre_of, inertia_at
+from ..state.poses import centre_of, in_world
 from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Constraints, Motion, Vertices, has_final_velocity
 from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
@@ -172,7 +172,7 @@ def body_moments(motion: Motion, vertices: Vertices, body: int):
     """Returns the torque by the change of the pose of a body, and what the body adds to the moments of its world."""
     mass = wp.float64(motion.bodies.mass[body])
     x = vertices.bodies.centre[body]
-    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
+    inertia = in_world(motion.bodies.inertia[body], vertices.bodies.pose[body])
     predicted = motion.bodies.velocity[body]
     linear = to_double(wp.spatial_top(predicted))
     angular = to_double(wp.spatial_bottom(predicted))
@@ -180,7 +180,7 @@ def body_moments(motion: Motion, vertices: Vertices, body: int):
     turn = to_double(wp.spatial_bottom(vertices.bodies.velocity[body])) - angular
     moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
     torque = mass * wp.cross(moved, linear)
-    torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
+    torque += (inertia - in_world(motion.bodies.inertia[body], motion.bodies.end[body])) * angular
     half = HALF * wp.trace(inertia)
     square = mass * wp.length_sq(change) + wp.dot(turn, inertia * turn)
     return torque, _moments(mass, x, half, inertia, square)

@@ -24,35 +24,21 @@ _Array = TypeVar("_Array", np.ndarray, wp.array)
 
 
 class ShapeVertices(NamedTuple, Generic[_Array]):
-    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
+    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
-        body: Body that the vertex moves with, -1 for none, int32, shape [n].
-        shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
-    """
-
-    position: _Array
-    body: _Array
-    shape: _Array
+    position: _Array  # [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3]
+    body: _Array  # that the vertex moves with, -1 for none, int32
+    shape: _Array  # that the vertex belongs to, as in ``model.shape_material_mu``, int32
 
 
 class Planes(NamedTuple, Generic[_Array]):
-    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
+    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
-        normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
-        body: Body that the plane moves with, -1 for none, int32, shape [n].
-        shape: Shape of the plane, int32, shape [n].
-        world: World of the plane, -1 for all worlds, int32, shape [n].
-    """
-
-    point: _Array
-    normal: _Array
-    body: _Array
-    shape: _Array
-    world: _Array
+    point: _Array  # of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3]
+    normal: _Array  # of unit length, out of the solid, in the same frame, float32, shape [n, 3]
+    body: _Array  # that the plane moves with, -1 for none, int32
+    shape: _Array  # int32
+    world: _Array  # -1 for all worlds, int32
 
 
 @wp.struct
