@@ -318,12 +318,6 @@ def collect_gradients_on_bodies(
     gradients.on_bodies[vertex] = collected
 
 
-@wp.func
-def _missing(step: RestoredStep) -> float:
-    """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
-    return wp.where(step.record.counts.complete[0] == 0, wp.nan, float(0.0))
-
-
 @wp.kernel
 def finish_gradients(
     step: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
@@ -333,7 +327,7 @@ def finish_gradients(
     Those of vertices of shapes remain gradients with respect to what was predicted of them.
     """
     particle = wp.tid()
-    missing = _missing(step)
+    missing = wp.where(step.record.counts.complete[0] == 0, wp.nan, float(0.0))
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
@@ -360,7 +354,7 @@ def finish_body_gradients(
     Where the response moves no bodies, only those of poses change.
     """
     motion, body = step.motion, wp.tid()
-    missing = _missing(step)
+    missing = wp.where(step.record.counts.complete[0] == 0, wp.nan, float(0.0))
     start = of_state.start_body_q[body] + of_motion.bodies.start[body]
     end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:

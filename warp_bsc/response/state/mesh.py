@@ -111,8 +111,9 @@ class ModelMesh(CollisionMesh):
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
         tessellations = {}
-        shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
-        vertex_count = model.particle_count
+        triangles, vertex_count = elements_of(model.tri_indices, 3), model.particle_count
+        faces = [triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)]
+        shapes, worlds, positions = [], [], [np.empty((0, 3))]
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
             if key not in tessellations:
@@ -192,10 +193,8 @@ class ModelMesh(CollisionMesh):
     def place(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> Placement:
         """Returns where vertices and planes are in a state, with arguments and errors as of :meth:`positions`."""
         place, model = Placement(), self.model
-        for name, array, count in (
-            ("particle_q", particle_q, model.particle_count),
-            ("body_q", body_q, model.body_count),
-        ):
+        given = ("particle_q", particle_q, model.particle_count), ("body_q", body_q, model.body_count)
+        for name, array, count in given:
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
@@ -262,12 +261,6 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
 def are_infinite_planes(model: Model) -> np.ndarray:
     """Returns which shapes of a model are infinite planes, shape [shape_count]."""
     return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)
-
-
-def _soft_faces(model):
-    """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
-    triangles = elements_of(model.tri_indices, 3)
-    return np.concatenate([triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)])
 
 
 def elements_of(indices: wp.array | None, n: int) -> np.ndarray:
