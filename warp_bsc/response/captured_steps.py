@@ -63,7 +63,7 @@ class CapturedSteps:
         self._report = solver.report if isinstance(solver, CollisionStage) else None
         layer = solver.solver if isinstance(solver, CollisionStage) else solver
         self._layer = layer if isinstance(layer, ContactLayer) else None
-        restored = list(state)
+        restored = [] if self._report is None and self._layer is None else list(state)
         if self._report is not None:
             restored.append(self._report.total_values)
         if self._layer is not None:
@@ -94,9 +94,6 @@ class CapturedSteps:
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
-        if self._report is None and self._layer is None:
-            wp.capture_launch(self._graph)
-            return True
         for x, saved in self._saved:
             saved.assign(x)
         lost = self._count_lost()

@@ -39,7 +39,7 @@ from ..solve.sweeps import (
 )
 from ..state.motion import moves_with_body, predicted_velocity
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transformed_plane
-from ..state.poses import centre_of, inverse_inertia_at, pose_between, turned_pose, velocity_between, velocity_on_body
+from ..state.poses import centre_of, in_world, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
 from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
 from ..state.vectors import ONE, ZERO, relative, to_double, to_single
@@ -333,7 +333,7 @@ def set_centres(motion: Motion, poses: wp.array[wp.transform], moved: MovedBodie
     body = wp.tid()
     if is_movable(motion, body):
         moved.centre[body] = centre_of(motion.bodies, body, poses[body])
-        moved.inverse_inertia[body] = inverse_inertia_at(motion.bodies, body, poses[body])
+        moved.inverse_inertia[body] = in_world(motion.bodies.inverse_inertia[body], poses[body])
 
 
 @wp.kernel

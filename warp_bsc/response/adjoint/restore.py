@@ -315,12 +315,6 @@ def collect_gradients_on_bodies(
     gradients.on_bodies[vertex] = collected
 
 
-@wp.func
-def _missing(restored: RestoredStep) -> float:
-    """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
-    return wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
-
-
 @wp.kernel
 def finish_gradients(
     restored: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
@@ -330,7 +324,7 @@ def finish_gradients(
     Those of vertices of shapes remain gradients with respect to what was predicted of them.
     """
     particle = wp.tid()
-    missing = _missing(restored)
+    missing = wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
@@ -357,7 +351,7 @@ def finish_body_gradients(
     Where the response moves no bodies, only those of poses change.
     """
     motion, body = restored.step.motion, wp.tid()
-    missing = _missing(restored)
+    missing = wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
     start = of_state.start_body_q[body] + of_motion.bodies.start[body]
     end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:

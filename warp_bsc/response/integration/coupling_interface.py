@@ -5,7 +5,7 @@ from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..state.motion import ModelMotion, continues
-from ..state.poses import inertia_at
+from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
 from ..substeps.inner_contacts import InnerContacts
@@ -68,7 +68,7 @@ def _add_impulses(
         of_particles[i] += particle_mass[i] * (vertices.velocity[i] - motion.velocity[i])
     if i < vertices.bodies.outcome.shape[0] and vertices.bodies.outcome[i] != 0:
         change = vertices.bodies.velocity[i] - motion.bodies.velocity[i]
-        inertia = inertia_at(motion.bodies, i, vertices.bodies.pose[i])
+        inertia = in_world(motion.bodies.inertia[i], vertices.bodies.pose[i])
         angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 

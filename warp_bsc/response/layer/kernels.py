@@ -111,18 +111,6 @@ def _share_of(layer: Layer, depth: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _shares_of_pair(layer: Layer, queue: PairQueue, i: int):
-    """Returns the four vertices of a pair, and its shares of their masses, 0 if it is not in contact."""
-    corners = vertices_of(queue, i)
-    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
-    shares = wp.vec4d()
-    if depth > ZERO:
-        for j in range(4):
-            shares[j] = wp.abs(weights[j]) * _share_of(layer, depth)
-    return corners, shares
-
-
-@wp.func
 def _push(
     layer: Layer, normal: wp.vec3d, depth: wp.float64, path: wp.vec3d, resistance: wp.float64, friction: float
 ) -> wp.vec3d:
@@ -140,30 +128,6 @@ def _push(
         return along * normal
     holding = wp.float64(friction) * along / (length * part)  # more than 1 if friction could stop the contact
     return along * normal - across * (part * holding / wp.sqrt(ONE + holding * holding))
-
-
-@wp.func
-def _push_of_pair(layer: Layer, queue: PairQueue, i: int):
-    """Returns the four vertices of a pair, how much its push moves each [1/kg], and the push, 0 if there is none."""
-    motion = layer.motion
-    corners = vertices_of(queue, i)
-    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
-    resistance = ZERO
-    for j in range(4):
-        vertex = corners[j]
-        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
-    mobilities = wp.vec4d()
-    if depth <= ZERO or resistance <= ZERO:
-        return corners, mobilities, wp.vec3d()
-    path = wp.vec3d()
-    for j in range(4):
-        vertex = corners[j]
-        path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
-    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    push = _push(layer, normal, depth, path, resistance, friction)
-    for j in range(4):
-        mobilities[j] = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
-    return corners, mobilities, push
 
 
 @wp.func
@@ -191,13 +155,18 @@ def place_vertices_between(layer: Layer, y: wp.array[wp.vec3]):
 def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64], differentiable: wp.array[wp.float64]):
     """Adds the shares of contacts to the sums of their vertices, or to ``differentiable`` ones instead."""
     i = wp.tid()
-    if has_pair(queue, i):
-        corners, shares = _shares_of_pair(layer, queue, i)
-        for j in range(4):
-            if differentiable:
-                wp.atomic_add(differentiable, corners[j], shares[j])
-            else:
-                wp.atomic_add(sums, corners[j], to_units(shares[j]))
+    if not has_pair(queue, i):
+        return
+    corners = vertices_of(queue, i)
+    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    if depth <= ZERO:
+        return
+    for j in range(4):
+        share = wp.abs(weights[j]) * _share_of(layer, depth)
+        if differentiable:
+            wp.atomic_add(differentiable, corners[j], share)
+        else:
+            wp.atomic_add(sums, corners[j], to_units(share))
 
 
 @wp.kernel(enable_backward=False)
@@ -235,13 +204,29 @@ def add_shares_of_planes(layer: Layer, sums: wp.array[wp.float64]):
 def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], differentiable: wp.array[wp.vec3]):
     """Adds what contacts move vertices by to the sums of these, or to ``differentiable`` ones instead."""
     i = wp.tid()
-    if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(layer, queue, i)
-        for j in range(4):
-            if differentiable:
-                wp.atomic_add(differentiable, corners[j], to_single(mobilities[j] * push))
-            else:
-                add_to_sum(sums, corners[j], 0, mobilities[j] * push)
+    if not has_pair(queue, i):
+        return
+    motion = layer.motion
+    corners = vertices_of(queue, i)
+    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    resistance = ZERO
+    for j in range(4):
+        vertex = corners[j]
+        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
+    if depth <= ZERO or resistance <= ZERO:
+        return
+    path = wp.vec3d()
+    for j in range(4):
+        vertex = corners[j]
+        path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
+    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    push = _push(layer, normal, depth, path, resistance, friction)
+    for j in range(4):
+        change = weights[j] * wp.float64(motion.inverse_mass[corners[j]]) * push
+        if differentiable:
+            wp.atomic_add(differentiable, corners[j], to_single(change))
+        else:
+            add_to_sum(sums, corners[j], 0, change)
 
 
 @wp.kernel(enable_backward=False)

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from ..state.fixed_sum import with_delta
-from ..state.poses import centre_of, inertia_at
+from ..state.poses import centre_of, in_world
 from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Step, body_of, has_final_velocity
 from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
@@ -174,14 +174,14 @@ def body_moments(step: Step, body: int):
     bodies, moved = step.motion.bodies, step.vertices.bodies
     mass = wp.float64(bodies.mass[body])
     x = moved.centre[body]
-    inertia = inertia_at(bodies, body, moved.pose[body])
+    inertia = in_world(bodies.inertia[body], moved.pose[body])
     predicted = bodies.velocity[body]
     linear = to_double(wp.spatial_top(predicted))
     angular = to_double(wp.spatial_bottom(predicted))
     change = to_double(wp.spatial_top(moved.velocity[body])) - linear
     turn = to_double(wp.spatial_bottom(moved.velocity[body])) - angular
     torque = mass * wp.cross(x - centre_of(bodies, body, bodies.end[body]), linear)
-    torque += (inertia - inertia_at(bodies, body, bodies.end[body])) * angular
+    torque += (inertia - in_world(bodies.inertia[body], bodies.end[body])) * angular
     half = HALF * wp.trace(inertia)
     square = mass * wp.length_sq(change) + wp.dot(turn, inertia * turn)
     return torque, _moments(mass, x, half, inertia, square)

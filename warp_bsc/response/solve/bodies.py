@@ -9,7 +9,7 @@ pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of
 import warp as wp
 
 from ..state.fixed_sum import add_to_sum, sums_of
-from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
+from ..state.poses import centre_of, in_world, turned_pose, velocity_on_body
 from ..state.structs import NEVER, PROJECTED, Bodies, Motion, MovedBodies, Step, body_of, can_move, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
 
@@ -121,7 +121,7 @@ def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
     """Sets the centre and inverse inertia of a body, where impulses act, to those of its pose."""
     pose = moved.pose[body]
     moved.centre[body] = centre_of(bodies, body, pose)
-    moved.inverse_inertia[body] = inverse_inertia_at(bodies, body, pose)
+    moved.inverse_inertia[body] = in_world(bodies.inverse_inertia[body], pose)
 
 
 @wp.kernel

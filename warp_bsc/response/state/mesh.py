@@ -24,35 +24,21 @@ _Array = TypeVar("_Array", np.ndarray, wp.array)
 
 
 class ShapeVertices(NamedTuple, Generic[_Array]):
-    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
+    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
-        body: Body that the vertex moves with, -1 for none, int32, shape [n].
-        shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
-    """
-
-    position: _Array
-    body: _Array
-    shape: _Array
+    position: _Array  # [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3]
+    body: _Array  # that the vertex moves with, -1 for none, int32
+    shape: _Array  # that the vertex belongs to, as in ``model.shape_material_mu``, int32
 
 
 class Planes(NamedTuple, Generic[_Array]):
-    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
+    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
-        normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
-        body: Body that the plane moves with, -1 for none, int32, shape [n].
-        shape: Shape of the plane, int32, shape [n].
-        world: World of the plane, -1 for all worlds, int32, shape [n].
-    """
-
-    point: _Array
-    normal: _Array
-    body: _Array
-    shape: _Array
-    world: _Array
+    point: _Array  # of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3]
+    normal: _Array  # of unit length, out of the solid, in the same frame, float32, shape [n, 3]
+    body: _Array  # that the plane moves with, -1 for none, int32
+    shape: _Array  # int32
+    world: _Array  # -1 for all worlds, int32
 
 
 @wp.struct
@@ -125,8 +111,9 @@ class ModelMesh(CollisionMesh):
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
         tessellations = {}
-        shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
-        vertex_count = model.particle_count
+        triangles, vertex_count = elements_of(model.tri_indices, 3), model.particle_count
+        faces = [triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)]
+        shapes, worlds, positions = [], [], [np.empty((0, 3))]
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
             if key not in tessellations:
@@ -206,10 +193,8 @@ class ModelMesh(CollisionMesh):
     def place(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> Placement:
         """Returns where vertices and planes are in a state, with arguments and errors as of :meth:`positions`."""
         place, model = Placement(), self.model
-        for name, array, count in (
-            ("particle_q", particle_q, model.particle_count),
-            ("body_q", body_q, model.body_count),
-        ):
+        given = ("particle_q", particle_q, model.particle_count), ("body_q", body_q, model.body_count)
+        for name, array, count in given:
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
@@ -276,12 +261,6 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
 def are_infinite_planes(model: Model) -> np.ndarray:
     """Returns which shapes of a model are infinite planes, shape [shape_count]."""
     return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)
-
-
-def _soft_faces(model):
-    """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
-    triangles = elements_of(model.tri_indices, 3)
-    return np.concatenate([triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)])
 
 
 def elements_of(indices: wp.array | None, n: int) -> np.ndarray:

@@ -260,8 +260,7 @@ class ModelMotion:
         if world_mask is None:
             interrupted.fill_(1)
         else:
-            inputs, outputs = [world_mask], [interrupted]
-            wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
+            wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=self.mesh.device)
 
     def starts(self) -> list[wp.array]:
         """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
