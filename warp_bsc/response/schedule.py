@@ -124,11 +124,7 @@ def views_of(struct_type: type, values: wp.array):
 def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
     """Returns a cleared status.
 
-    Args:
-        worlds: Number of worlds.
-        device: The device.
-        max_iterations: Iterations of detect and project.
-        recorded: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided.
+    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
     """
     status, parts = SolveStatus(), {"loop": LoopControl, "detection": DetectionCounts, "results": StepResults}
     status.values = wp.zeros(sum(len(part.vars) for part in parts.values()), dtype=int, device=device)

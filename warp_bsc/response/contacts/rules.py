@@ -143,18 +143,11 @@ def classify_contact(
     bound: wp.float64,
     may_cross: bool,
 ) -> int:
-    """Returns the ContactClass of a contact.
+    """Returns the ContactClass of a contact of an owner, as of :func:`owner_of`.
 
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        kind: The kind of pair.
-        pair: Its elements.
-        corners: Its vertices.
-        owner: What :func:`owner_of` returns for them.
-        bound: A lower bound of the time of impact, or of the distance at the start. Above 0, the elements did not touch
-            at the start; at 0, which it also is for contacts soon after the start, an exact test decides.
-        may_cross: False if nothing that can be moved crosses at the start.
+    Above a ``bound`` of 0, which is a lower one of the time of impact, or of the distance at the start, the elements
+    did not touch at the start; at 0, which it also is for contacts soon after the start, an exact test decides. Nothing
+    that can be moved crosses at the start unless it ``may_cross``.
     """
     met = bool(False)
     if not bound > ZERO:

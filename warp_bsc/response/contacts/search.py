@@ -196,17 +196,10 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
 def find_contacts_without_queues(
     broad_phase: BroadPhaseHierarchy, mesh: Connectivity, step: Step, dividing: DividingPlanes, status: SolveStatus
 ) -> None:
-    """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
+    """Finds all contacts of the motion that a broad phase has fitted last, as a whole, however many there are.
 
     Counts them, adds dividing planes as far as they fit, and finds the first contact of each vertex. Allocates nothing
     and does not synchronize. Slower than the detector, as neighbouring threads decide pairs of different difficulty.
-
-    Args:
-        broad_phase: The broad phase, fitted to all of the motion.
-        mesh: The elements of the mesh.
-        step: The motion, and the vertices as they were moved so far.
-        dividing: The dividing planes.
-        status: The solve status.
     """
     arguments = _Arguments()
     arguments.faces, arguments.mesh, arguments.step = broad_phase.hierarchy, mesh, step

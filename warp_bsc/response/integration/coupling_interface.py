@@ -105,9 +105,6 @@ class CouplingHooks(WrappedSolver):
 
         ``SolverCoupledADMM`` handles hard attachments of bodies to particles within one entry only if its solver is
         ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
-
-    Attributes:
-        solver: The inner solver.
     """
 
     _motion: ModelMotion

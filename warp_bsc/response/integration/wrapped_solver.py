@@ -37,10 +37,7 @@ class WrappedSolver(SolverBase, CouplingInterface):
     solver: SolverBase
 
     def __init__(self, solver: SolverBase):
-        """Wraps a solver.
-
-        Args:
-            solver: Any Newton solver.
+        """Wraps any solver of Newton.
 
         Raises:
             TypeError: If it is no solver of Newton.

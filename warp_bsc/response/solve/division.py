@@ -302,8 +302,8 @@ def divide(work: Workspace, dt: float) -> None:
     work.reserve_truncations()
     contacts, changed = queues_of(work.detector)[:2], [work.dividing, work.status]
     if not work.differentiable:
-        work.launch_over_constraints(divide_proximities, [work.step, *changed])
-    work.launch_over_particles(truncate_vertices, [work.step, *contacts, *changed, work.record, dt])
+        work.launch_over_constraints(divide_proximities, *changed)
+    work.launch_over_particles(truncate_vertices, *contacts, *changed, work.record, dt)
     work.launch_over_shape_vertices(find_body_shares, *changed, work.record)
     if work.recorder is not None:
         work.launch_over_shape_vertices(record_body_truncations, *contacts, work.record)

@@ -133,10 +133,9 @@ def _leave_planes(work):
 
 def _sweep(work, first, last, tolerance):
     """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    inputs = [work.step, work.status]
     if first:
-        work.launch_over_constraints(activate_position_constraints, [*inputs, tolerance * work.tolerance])
-    work.launch_over_active_set(project_positions, [*inputs, work.record])
-    work.launch_over_particles(update_positions, [*inputs, work.record, last], at_least_once=True)
+        work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
+    work.launch_over_active_set(project_positions, work.status, work.record)
+    work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

@@ -230,9 +230,7 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
 def repeat(work: Workspace, sweep: Callable[[bool, bool], None]) -> None:
     """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds.
 
-    Args:
-        work: The buffers.
-        sweep: Sweeps once. Takes whether it is the first of a batch, which fills the active set, and the last.
+    ``sweep`` sweeps once; it takes whether this is the first of a batch, which fills the active set, and the last.
     """
 
     def batch():

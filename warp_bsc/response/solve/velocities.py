@@ -117,7 +117,7 @@ def project(work: Workspace, dt: float) -> None:
     Then restores angular momentum.
     """
     work.launch_over_bodies(move_to_end)
-    work.launch_over_constraints(initialize_velocity_multipliers, [work.step, dt])
+    work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
     repeat(work, lambda first, last: _sweep(work, first, last, dt))
     _restore_angular_momentum(work)
@@ -125,26 +125,24 @@ def project(work: Workspace, dt: float) -> None:
 
 def _sweep(work, first, last, dt):
     """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    inputs = [work.step, work.status]
     if first:
-        work.launch_over_constraints(activate_velocity_constraints, [*inputs, work.tolerance, dt])
-    work.launch_over_active_set(project_velocities, [*inputs, work.record])
+        work.launch_over_constraints(activate_velocity_constraints, work.status, work.tolerance, dt)
+    work.launch_over_active_set(project_velocities, work.status, work.record)
     _update(work, last)
 
 
 def _update(work, last):
-    inputs = [work.step, work.status, work.record, last]
-    work.launch_over_particles(update_velocities, inputs, at_least_once=True)
+    work.launch_over_particles(update_velocities, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(change_body_velocities, last)
     work.launch_over_shape_vertices(set_vertex_velocities)
 
 
 def _restore_angular_momentum(work):
     """Turns all that collided in each world where nothing is held, which removes the torque that contacts added."""
-    step, sums, threads = work.step, work.moments, work.summing_threads
+    sums, threads = work.moments, work.summing_threads
     sums.zero_()
-    work.launch(sum_torques, threads, [step, threads, sums])
-    work.launch(sum_moments, threads, [step, work.particle_count, threads, sums])
+    work.launch(sum_torques, threads, [work.step, threads, sums])
+    work.launch(sum_moments, threads, [work.step, work.particle_count, threads, sums])
     work.launch_over_bodies(sum_body_moments, sums)
-    work.launch_over_particles(turn_vertices, [step, sums])
+    work.launch_over_particles(turn_vertices, sums)
     work.launch_over_bodies(turn_bodies, sums)

@@ -87,9 +87,8 @@ class Substeps:
         Args:
             step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
-            work: The workspace of the step, with the motion of the whole step.
-            substeps: Numbers of substeps to choose from, each at least 2, sorted; a single one is taken by every step
-                that collides.
+            work: The workspace, with the motion of the whole step.
+            substeps: Numbers to choose from, each at least 2, sorted; one alone is taken by every step that collides.
 
         Raises:
             RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
@@ -198,7 +197,7 @@ class Substeps:
         work = self._work
         add_proximities(work)
         self._has_constraints.zero_()
-        work.launch_over_constraints(kernels.find_worlds, [work.step, self._has_constraints])
+        work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
         inputs = [work.step, work.status, self._detected, self._is_fast]
         work.launch(kernels.keep_detection, work.worlds, inputs)
         for array, saved in step.arrays:
@@ -258,7 +257,7 @@ class Substeps:
         if work.max_penetrations:
             work.reserve(work.max_penetrations)
             detect_penetrations(work, ahead=True)
-        work.launch_over_constraints(kernels.reset_constraints, [work.step, work.status, self._detected])
+        work.launch_over_constraints(kernels.reset_constraints, work.status, self._detected)
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
         velocities.project(work, substep_dt)
         start.assign(self._start)
