@@ -9,7 +9,7 @@ from ...kernels.signs import FREE
 from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
+from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from .constraints import (
@@ -48,18 +48,17 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 
 @wp.kernel(enable_backward=False)
-def count_crossings(
-    step: Step, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
-):
+def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
+    mesh = step.mesh
     if not is_filled(i, pairs, counts, _QUEUED):
         return
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
     if is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if crosses_face(step.motion, mesh, edge, face):
+        if crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
 
 
@@ -191,9 +190,7 @@ def mark_changed(vertices: Vertices, corners: wp.vec4i):
 
 
 @wp.func
-def _collect_contact(
-    step: Step, mesh: Connectivity, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus
-):
+def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not has_pair(contacts, i):
         return
@@ -214,7 +211,7 @@ def _collect_contact(
         added.min_distance = kept
         bound = start
     may_cross = status.results.crossings[0] > 0
-    found = classify_contact(motion, mesh, kind, contacts.pairs[i], corners, owner, bound, may_cross)
+    found = classify_contact(step, kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.CROSSED:
         wp.atomic_add(status.detection.excluded, 0, wp.where(near, 0, 1))
     if found == ContactClass.OF_BODIES:
@@ -251,7 +248,7 @@ def _collect_contact(
             status.loop.projecting[0] = 1
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
-            if are_occluded(motion, mesh, contacts.pairs[i], corners, added.normal, time):
+            if are_occluded(step, contacts.pairs[i], corners, added.normal, time):
                 return  # the next detection finds it, if it is still there
     target = widened(step.separation, status)
     if added.pace == Pace.SLOW:
@@ -273,7 +270,6 @@ def _collect_contact(
 @wp.kernel
 def collect_contacts(
     # in
-    mesh: Connectivity,
     first: PairQueue,
     second: PairQueue,
     counts: wp.array[wp.int64],
@@ -292,8 +288,8 @@ def collect_contacts(
     i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(step, mesh, first, i, dividing, status)
-    _collect_contact(step, mesh, second, i, dividing, status)
+    _collect_contact(step, first, i, dividing, status)
+    _collect_contact(step, second, i, dividing, status)
 
 
 @wp.kernel

@@ -7,7 +7,7 @@ from ...detection.launch import retry_until_fits
 from ...kernels.pipeline.pairs import firsts_of
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..schedule import SolveStatus, has_overflowed, is_projecting
-from ..state.structs import Connectivity, ContactKind, Motion, Pace, Step
+from ..state.structs import ContactKind, Motion, Pace, Step
 from ..state.vectors import ONE, ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
@@ -105,9 +105,7 @@ def _is_behind(
 
 
 @wp.func
-def _collect_proximity(
-    step: Step, mesh: Connectivity, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus
-):
+def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
     if not has_pair(candidates, i):
         return
     motion, separation = step.motion, step.separation
@@ -130,11 +128,11 @@ def _collect_proximity(
     if pace_of(motion, corners, kind) == Pace.FAST:
         return
     if status.results.crossings[0] > 0:
-        if crossed_at_start(motion, mesh, kind, candidates.pairs[i]):
+        if crossed_at_start(step, kind, candidates.pairs[i]):
             return
     elif nearest and _is_behind(corners, kind, normal, distance, nearest):
         return
-    if kind == EDGE_EDGE and are_occluded(motion, mesh, candidates.pairs[i], corners, normal, ZERO):
+    if kind == EDGE_EDGE and are_occluded(step, candidates.pairs[i], corners, normal, ZERO):
         return
     if are_on_body(motion, corners):
         status.is_fast[world] = 1  # as where bodies are in contact, see collect.collect_contacts
@@ -153,12 +151,7 @@ def _collect_proximity(
 
 @wp.kernel
 def collect_proximities(
-    step: Step,
-    mesh: Connectivity,
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
-    nearest: wp.array2d[float],
-    status: SolveStatus,
+    step: Step, vertex_face: PairQueue, edge_edge: PairQueue, nearest: wp.array2d[float], status: SolveStatus
 ):
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
@@ -169,8 +162,8 @@ def collect_proximities(
     behind them.
     """
     i = wp.tid()
-    _collect_proximity(step, mesh, vertex_face, nearest, i, status)
-    _collect_proximity(step, mesh, edge_edge, nearest, i, status)
+    _collect_proximity(step, vertex_face, nearest, i, status)
+    _collect_proximity(step, edge_edge, nearest, i, status)
 
 
 @wp.kernel
@@ -197,7 +190,7 @@ def add_proximities(work: Workspace) -> None:
         if nearest is not None:
             nearest.fill_(np.inf)
             work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
-        inputs = [work.step, work.connectivity, *queues, nearest, work.status]
+        inputs = [work.step, *queues, nearest, work.status]
         work.launch_over(collect_proximities, counted(queues), inputs)
 
     retry_until_fits(collect, work, work.device)

@@ -18,7 +18,7 @@ from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_V
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
 from ..schedule import SolveStatus, count_contact
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Step
+from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
@@ -36,7 +36,6 @@ class _Arguments:
     """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
-    mesh: Connectivity
     step: Step
     dividing: DividingPlanes
     status: SolveStatus
@@ -60,7 +59,7 @@ def _resolve(
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     motion = arguments.step.motion
-    found = classify_contact(motion, arguments.mesh, kind, pair, corners, owner, bound, True)
+    found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
         wp.atomic_add(arguments.status.detection.excluded, 0, 1)
     if found == ContactClass.OF_BODIES:
@@ -194,7 +193,7 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
 
 
 def find_contacts_without_queues(
-    broad_phase: BroadPhaseHierarchy, mesh: Connectivity, step: Step, dividing: DividingPlanes, status: SolveStatus
+    broad_phase: BroadPhaseHierarchy, step: Step, dividing: DividingPlanes, status: SolveStatus
 ) -> None:
     """Finds all contacts of the motion that a broad phase has fitted last, as a whole, however many there are.
 
@@ -202,6 +201,6 @@ def find_contacts_without_queues(
     and does not synchronize. Slower than the detector, as neighbouring threads decide pairs of different difficulty.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.mesh, arguments.step = broad_phase.hierarchy, mesh, step
+    arguments.faces, arguments.step = broad_phase.hierarchy, step
     arguments.dividing, arguments.status = dividing, status
     broad_phase.traverse(_kernel(bool(step.motion.distances.radius)), arguments)

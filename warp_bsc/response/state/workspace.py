@@ -17,7 +17,6 @@ from .structs import (
     NO_NODE,
     NOT_FINITE,
     SUMS,
-    Connectivity,
     Constraints,
     DividingPlanes,
     Step,
@@ -69,8 +68,7 @@ class Workspace:
         detector: The detector of contacts.
         crossing_candidates: The detector of edges that may cross faces.
         mesh: The mesh.
-        connectivity: Its elements, for kernels.
-        step: The motion, which is only read, the vertices and bodies as they are moved, and the constraints.
+        step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         status: The solve status.
         recorder: Records the step for its adjoint, or None.
@@ -103,11 +101,9 @@ class Workspace:
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
-        self.connectivity = Connectivity()
-        self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges
-        self.connectivity.vertex_edges = mesh.device_vertex_edges
-        self.connectivity.edge_faces = mesh.device_edge_faces
         self.step = Step()
+        self.step.mesh.faces, self.step.mesh.edges = mesh.device_faces, mesh.device_edges
+        self.step.mesh.vertex_edges, self.step.mesh.edge_faces = mesh.device_vertex_edges, mesh.device_edge_faces
         self.motion = motion
         self.step.separation, self.step.restitution = separation, restitution
         self.step.vertices = allocate_vertices(mesh.vertex_count, device)
