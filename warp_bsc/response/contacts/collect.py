@@ -3,6 +3,7 @@
 import warp as wp
 
 from ...detection.settings import Count
+from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
@@ -17,7 +18,6 @@ from .constraints import (
     Constraint,
     add_constraint,
     contact_friction,
-    contact_weights,
     distances_at_start,
     feasible,
     is_pushing,

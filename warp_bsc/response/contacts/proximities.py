@@ -4,11 +4,11 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
-from ...kernels.pipeline.pairs import firsts_of
+from ...kernels.closest import weights_across
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..schedule import SolveStatus, has_overflowed, is_projecting
-from ..state.structs import ContactKind, Motion, Pace, Step
-from ..state.vectors import ONE, ZERO, corners_of
+from ..state.structs import ContactKind, Pace, Step
+from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
 from .constraints import (
@@ -24,45 +24,6 @@ from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
 from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
 
 wp.set_module_options({"enable_backward": False})
-
-_PARALLEL = wp.constant(wp.float64(1.0e-12))
-"""Squared sine up to which edges, or two sides of a face, count as parallel."""
-
-
-@wp.func
-def weights_across(motion: Motion, corners: wp.vec4i, kind: int):
-    """Returns where the line across both elements at the start meets them.
-
-    Returns:
-        The weights of the four vertices in the vector between the two points, the unit vector across both elements,
-        from the second to the first, and the distance along it [m], which is 0 unless both points are within the
-        elements: only then are they their closest points.
-    """
-    a, b, c, d = corners_of(motion.x0, corners)
-    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
-    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
-    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
-    n = wp.cross(u, v)
-    nn = wp.length_sq(n)
-    s = wp.dot(wp.cross(w, v), n)
-    r = wp.dot(wp.cross(u, w), n)
-    weights = wp.vec4d()
-    if nn <= _PARALLEL * wp.length_sq(u) * wp.length_sq(v) or not (s > ZERO and s < nn):
-        return weights, n, ZERO
-    height = wp.dot(w, n)
-    s /= nn
-    r /= nn
-    if kind == EDGE_EDGE:
-        height = -height
-        r = -r
-        weights = wp.vec4d(ONE - s, s, r - ONE, -r)
-    else:
-        weights = wp.vec4d(ONE, s + r - ONE, -s, -r)
-    size = wp.sqrt(nn)
-    n *= wp.sign(height) / size
-    if r > ZERO and weights[firsts_of(kind)] < ZERO:
-        return weights, n, wp.abs(height) / size
-    return weights, n, ZERO
 
 
 @wp.func
@@ -85,7 +46,8 @@ def find_nearest(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float])
     if not has_pair(vertex_face, i):
         return
     corners = vertices_of(vertex_face, i)
-    _weights, normal, distance = weights_across(step.motion, corners, VERTEX_FACE)
+    a, b, c, d = corners_of(step.motion.x0, corners)
+    _weights, normal, distance = weights_across(VERTEX_FACE, a, b, c, d)
     if distance > ZERO:
         wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
 
@@ -111,7 +73,8 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     motion, separation = step.motion, step.separation
     kind = candidates.kind
     corners = vertices_of(candidates, i)
-    weights, normal, distance = weights_across(motion, corners, kind)
+    a, b, c, d = corners_of(motion.x0, corners)
+    weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
     added = Constraint()

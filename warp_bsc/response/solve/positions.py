@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from ..contacts.constraints import gap, min_distance_of
+from ..contacts.constraints import gap, min_distance_of, moves_body
 from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import PROJECTED, ContactKind, Pace, Step
-from ..state.vectors import ZERO, relative
+from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
 from .bodies import move_bodies, place_vertices
 from .sweeps import (
     activate,
@@ -22,7 +22,6 @@ from .sweeps import (
     path_of,
     position_multiplier_after,
     repeat,
-    tolerance_of,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -60,7 +59,7 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
             tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (separation - predicted))
     else:
         tolerance = wp.min(tolerance, TOLERANCE_OF_DISTANCE * (separation - min_distance_of(step, i)))
-    tolerance = tolerance_of(step, i, tolerance)
+    tolerance *= wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE)
     active = distance < -tolerance
     if not active and is_reversible(status, constraints.pace[i] != Pace.FAST):
         multiplier = constraints.position_multiplier[i]

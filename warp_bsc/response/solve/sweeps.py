@@ -17,7 +17,7 @@ from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CREEP, RELAXATION, SLIDING, TOLERANCE_OF_BODIES
+from ..tuning import CREEP, RELAXATION, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 
@@ -142,12 +142,6 @@ def activate(step: Step, i: int):
     """Adds a constraint to the active set, and counts it for the vertices and bodies that it moves."""
     step.constraints.active_set[int(take_slot(step.constraints.active_count, 0))] = i
     count_active(step, i)
-
-
-@wp.func
-def tolerance_of(step: Step, i: int, tolerance: wp.float64) -> wp.float64:
-    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
-    return wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance
 
 
 @wp.func

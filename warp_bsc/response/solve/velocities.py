@@ -2,13 +2,14 @@
 
 import warp as wp
 
-from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of
+from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
 from ..schedule import SolveStatus
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
-from ..state.vectors import ZERO, relative
+from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
+from ..tuning import TOLERANCE_OF_BODIES
 from .angular_momentum import sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
 from .sweeps import (
@@ -22,7 +23,6 @@ from .sweeps import (
     max_sweeps,
     momentum_of,
     repeat,
-    tolerance_of,
     velocity_multiplier_after,
 )
 
@@ -64,7 +64,7 @@ def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp
     if wp.length_sq(multiplier) == ZERO:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
             return
-    tolerance = tolerance_of(step, i, tolerance) / dt
+    tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / dt
     excess = excess_speed(step, i)
     active = excess < -tolerance
     if not active and wp.length_sq(multiplier) > ZERO:
