@@ -11,15 +11,7 @@ from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
-from .constraints import (
-    Constraint,
-    add_constraint,
-    contact_friction,
-    distances_at_start,
-    feasible,
-    longest_path,
-    pace_of,
-)
+from . import constraints
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
 from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
 
@@ -77,18 +69,18 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
-    added = Constraint()
+    added = constraints.Constraint()
     if motion.distances.radius:
-        _start, kept = distances_at_start(motion, corners, kind)
+        _start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
     beyond = distance - added.min_distance
-    path = longest_path(motion, corners)
+    path = constraints.longest_path(motion, corners)
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
     if not is_movable(motion, corners) or not is_projecting(status, world):
         return
-    if pace_of(motion, corners, kind) == Pace.FAST:
+    if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
     if status.results.crossings[0] > 0:
         if crossed_at_start(step, kind, candidates.pairs[i]):
@@ -102,14 +94,14 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     added.vertices = corners
     added.weights = weights
     added.normal = normal
-    added.separation = added.min_distance + feasible(step, corners, separation, beyond)
-    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.separation = added.min_distance + constraints.feasible(step, corners, separation, beyond)
+    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     added.kind = ContactKind.VERTEX_FACE_PROXIMITY
     if kind == EDGE_EDGE:
         added.kind = ContactKind.EDGE_EDGE_PROXIMITY
     added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
-    add_constraint(step, added)
+    constraints.add_constraint(step, added)
 
 
 @wp.kernel

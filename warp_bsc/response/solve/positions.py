@@ -10,19 +10,8 @@ from ..state.structs import PROJECTED, ContactKind, Pace, Step
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .sweeps import (
-    activate,
-    add_delta,
-    after_sweep,
-    finish_sweep,
-    is_held_by_friction,
-    max_sweeps,
-    momentum_of,
-    path_of,
-    position_multiplier_after,
-    repeat,
-)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +36,7 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
         start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
         if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
             return
-    past = status.loop.sweep[0] >= max_sweeps(step, status, i, status.slow_position_sweeps)
+    past = status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
     normal = constraints.normal[i]
@@ -65,10 +54,12 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
         multiplier = constraints.position_multiplier[i]
         if wp.length_sq(multiplier) > ZERO:
             friction = wp.float64(constraints.friction[i])
-            path = path_of(step, i)
-            active = distance > tolerance or not is_held_by_friction(multiplier, normal, path, friction, tolerance)
+            path = sweeps.path_of(step, i)
+            active = distance > tolerance or not sweeps.is_held_by_friction(
+                multiplier, normal, path, friction, tolerance
+            )
     if active:
-        activate(step, i)
+        sweeps.activate(step, i)
 
 
 @wp.kernel
@@ -80,16 +71,16 @@ def project_positions(step: Step, status: SolveStatus, record: StepRecord):
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    last_sweep = max_sweeps(step, status, i, status.slow_position_sweeps) - 1
-    momentum = momentum_of(step, status, i, last_sweep)
+    last_sweep = sweeps.max_sweeps(step, status, i, status.slow_position_sweeps) - 1
+    momentum = sweeps.momentum_of(step, status, i, last_sweep)
     if pushes_only:
         violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
-    multiplier = position_multiplier_after(step, i, pushes_only)
+    multiplier = sweeps.position_multiplier_after(step, i, pushes_only)
     old = constraints.position_multiplier[i]
-    new = after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.position_multiplier[i] = new
-    add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
+    sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
 @wp.func
@@ -106,7 +97,7 @@ def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: 
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
     vertices = step.vertices
-    if finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
+    if sweeps.finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
@@ -116,7 +107,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    repeat(work, lambda first, last: _sweep(work, first, last, tolerance))
+    sweeps.repeat(work, lambda first, last: _sweep(work, first, last, tolerance))
 
 
 def leave_planes(work: Workspace) -> None:

@@ -10,21 +10,9 @@ from ..state.structs import Step, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import TOLERANCE_OF_BODIES
+from . import sweeps
 from .angular_momentum import sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
-from .sweeps import (
-    activate,
-    add_delta,
-    after_sweep,
-    excess_speed,
-    finish_sweep,
-    initial_velocity_multiplier,
-    is_held_by_friction,
-    max_sweeps,
-    momentum_of,
-    repeat,
-    velocity_multiplier_after,
-)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,13 +28,13 @@ def initialize_velocity_multipliers(step: Step, dt: wp.float64):
     if i >= constraints.count[0]:
         return
     if has_pushed(step, i):
-        impulse = initial_velocity_multiplier(step, i, dt)
+        impulse = sweeps.initial_velocity_multiplier(step, i, dt)
         constraints.velocity_multiplier[i] = impulse
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         if step.motion.bodies.of_vertex:
             activate_bodies(step, i)
-        add_delta(step, i, impulse, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
+        sweeps.add_delta(step, i, impulse, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
     constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
     constraints.last_sweep[i] = NEVER_SWEPT
 
@@ -58,22 +46,22 @@ def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp
     constraints = step.constraints
     if i >= constraints.count[0]:
         return
-    if status.loop.sweep[0] >= max_sweeps(step, status, i, status.slow_velocity_sweeps):
+    if status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == ZERO:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
             return
     tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / dt
-    excess = excess_speed(step, i)
+    excess = sweeps.excess_speed(step, i)
     active = excess < -tolerance
     if not active and wp.length_sq(multiplier) > ZERO:
         velocity = relative(constraints.weights[i], constraints.vertices[i], step.vertices.velocity)
         friction = wp.float64(constraints.friction[i])
-        held = is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, tolerance)
+        held = sweeps.is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, tolerance)
         active = excess > tolerance or not held
     if active:
-        activate(step, i)
+        sweeps.activate(step, i)
 
 
 @wp.kernel
@@ -84,13 +72,13 @@ def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    last_sweep = max_sweeps(step, status, i, status.slow_velocity_sweeps) - 1
-    momentum = momentum_of(step, status, i, last_sweep)
-    multiplier = velocity_multiplier_after(step, i)
+    last_sweep = sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps) - 1
+    momentum = sweeps.momentum_of(step, status, i, last_sweep)
+    multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
-    new = after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.velocity_multiplier[i] = new
-    add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
+    sweeps.add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
 
 
 @wp.func
@@ -107,7 +95,7 @@ def change_velocity(step: Step, vertex: int) -> bool:
 def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    if finish_sweep(step, status, record, last, vertex):
+    if sweeps.finish_sweep(step, status, record, last, vertex):
         change_velocity(step, vertex)
 
 
@@ -119,7 +107,7 @@ def project(work: Workspace, dt: float) -> None:
     work.launch_over_bodies(move_to_end)
     work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
-    repeat(work, lambda first, last: _sweep(work, first, last, dt))
+    sweeps.repeat(work, lambda first, last: _sweep(work, first, last, dt))
     _restore_angular_momentum(work)
 
 
