@@ -149,10 +149,7 @@ def _torque_and_moments(totals: wp.array2d[wp.float64], world: int):
 
 @wp.kernel
 def turn_velocities(
-    step: Step,
-    totals: wp.array2d[wp.float64],
-    changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vector],
+    step: Step, totals: wp.array2d[wp.float64], changes: wp.array[wp.vec3], body_changes: wp.array[wp.spatial_vector]
 ):
     """Computes how the turn of each world changes the velocities of its vertices and bodies.
 

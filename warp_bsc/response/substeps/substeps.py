@@ -75,13 +75,7 @@ class Substeps:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not repeated.
     """
 
-    def __init__(
-        self,
-        step: Callable[..., None],
-        solver: SolverBase,
-        work: Workspace,
-        substeps: Sequence[int],
-    ):
+    def __init__(self, step: Callable[..., None], solver: SolverBase, work: Workspace, substeps: Sequence[int]):
         """Allocates buffers.
 
         Args:
@@ -210,14 +204,14 @@ class Substeps:
 
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
-        work, mesh, start, motion = self._work, self._mesh, self._in, self._motion.vertices
+        work, mesh, start = self._work, self._mesh, self._in
         self._remaining.fill_(substeps)
         inputs = [self._has_constraints, self._number, substeps, work.status]
         work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
-        wp.copy(self._substep.vertices.x0, motion.x0)
+        wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
         if poses is not None:
             wp.copy(poses, self._start.body_q)
