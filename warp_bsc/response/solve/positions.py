@@ -107,7 +107,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    sweeps.repeat(work, lambda first, last: _sweep(work, first, last, tolerance))
+    sweeps.repeat(work, lambda: _activate(work, tolerance), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -117,15 +117,14 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    work.reserve_entries(1)
-    _sweep(work, True, True, 1.0)
+    sweeps.sweep(work, 1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
-def _sweep(work, first, last, tolerance):
-    """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    if first:
-        work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
-    work.launch_over_active_set(project_positions, work.status, work.record)
+def _activate(work, tolerance):
+    work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
+
+
+def _update(work, last):
     work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

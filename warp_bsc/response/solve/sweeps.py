@@ -221,16 +221,20 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
     return active
 
 
-def repeat(work: Workspace, sweep: Callable[[bool, bool], None]) -> None:
-    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds.
+def sweep(work: Workspace, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    """Sweeps a number of times over one active set, which ``activate`` fills.
 
-    ``sweep`` sweeps once; it takes whether this is the first of a batch, which fills the active set, and the last.
+    The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
     """
+    work.reserve_entries(number)
+    activate()
+    for i in range(number):
+        work.launch_over_active_set(project, work.status, work.record)
+        update(work, i == number - 1)
 
-    def batch():
-        work.reserve_entries(int(SWEEPS_PER_BATCH))
-        for i in range(SWEEPS_PER_BATCH):
-            sweep(i == 0, i == SWEEPS_PER_BATCH - 1)
 
+def repeat(work: Workspace, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
     work.launch(start_sweeps, 1, [work.status])
-    wp.capture_while(work.status.loop.more_sweeps, batch)
+    batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+    wp.capture_while(work.status.loop.more_sweeps, sweep, work=work, **batch)

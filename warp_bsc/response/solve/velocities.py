@@ -107,16 +107,12 @@ def project(work: Workspace, dt: float) -> None:
     work.launch_over_bodies(move_to_end)
     work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
-    sweeps.repeat(work, lambda first, last: _sweep(work, first, last, dt))
+    sweeps.repeat(work, lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 
-def _sweep(work, first, last, dt):
-    """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    if first:
-        work.launch_over_constraints(activate_velocity_constraints, work.status, work.tolerance, dt)
-    work.launch_over_active_set(project_velocities, work.status, work.record)
-    _update(work, last)
+def _activate(work, dt):
+    work.launch_over_constraints(activate_velocity_constraints, work.status, work.tolerance, dt)
 
 
 def _update(work, last):
