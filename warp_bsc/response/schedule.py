@@ -103,7 +103,7 @@ class SolveStatus:
     loop: LoopControl
     detection: DetectionCounts
     results: StepResults
-    values: wp.array[int]  # all elements of these three; the first and the last outlast a step
+    values: wp.array[int]  # all elements of these; the first, recount, and the last, crossings, outlast a step
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     max_iterations: int
@@ -152,7 +152,7 @@ def _clear_detection(detection: DetectionCounts):
 
 @wp.func
 def clear_status(status: SolveStatus):
-    """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
+    """Clears everything for a step, except for the crossings, of the last step until recounted, and ``recount``."""
     for i in range(1, status.values.shape[0] - 1):
         status.values[i] = 0
 

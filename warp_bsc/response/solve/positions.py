@@ -71,8 +71,7 @@ def project_positions(step: Step, status: SolveStatus, record: StepRecord):
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    last_sweep = sweeps.max_sweeps(step, status, i, status.slow_position_sweeps) - 1
-    momentum = sweeps.momentum_of(step, status, i, last_sweep)
+    momentum = sweeps.momentum_of(step, status, i, status.slow_position_sweeps)
     if pushes_only:
         violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)

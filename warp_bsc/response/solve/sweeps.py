@@ -152,12 +152,12 @@ def max_sweeps(step: Step, status: SolveStatus, i: int, slow: int) -> int:
 
 
 @wp.func
-def momentum_of(step: Step, status: SolveStatus, i: int, last_sweep: int) -> wp.float64:
+def momentum_of(step: Step, status: SolveStatus, i: int, slow: int) -> wp.float64:
     """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
     sweep = status.loop.sweep[0]
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
-    if last != sweep - 1 or sweep == last_sweep:
+    if last != sweep - 1 or sweep == max_sweeps(step, status, i, slow) - 1:
         return ZERO
     return wp.float64(sweep) / wp.float64(sweep + 3)
 

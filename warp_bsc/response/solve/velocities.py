@@ -72,8 +72,7 @@ def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    last_sweep = sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps) - 1
-    momentum = sweeps.momentum_of(step, status, i, last_sweep)
+    momentum = sweeps.momentum_of(step, status, i, status.slow_velocity_sweeps)
     multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
     new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
