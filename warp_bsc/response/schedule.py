@@ -103,7 +103,7 @@ class SolveStatus:
     loop: LoopControl
     detection: DetectionCounts
     results: StepResults
-    values: wp.array[int]  # all elements of these three; the first and the last outlast a step
+    values: wp.array[int]  # all elements of these; the first, recount, and the last, crossings, outlast a step
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     max_iterations: int
@@ -124,11 +124,7 @@ def views_of(struct_type: type, values: wp.array):
 def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
     """Returns a cleared status.
 
-    Args:
-        worlds: Number of worlds.
-        device: The device.
-        max_iterations: Iterations of detect and project.
-        recorded: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided.
+    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
     """
     status, parts = SolveStatus(), {"loop": LoopControl, "detection": DetectionCounts, "results": StepResults}
     status.values = wp.zeros(sum(len(part.vars) for part in parts.values()), dtype=int, device=device)
@@ -156,7 +152,7 @@ def _clear_detection(detection: DetectionCounts):
 
 @wp.func
 def clear_status(status: SolveStatus):
-    """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
+    """Clears everything for a step, except for the crossings, of the last step until recounted, and ``recount``."""
     for i in range(1, status.values.shape[0] - 1):
         status.values[i] = 0
 

@@ -1,6 +1,7 @@
 """The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
 
 import contextlib
+import functools
 from typing import Literal
 
 import numpy as np
@@ -222,11 +223,12 @@ class SolverCCD(CollisionStage):
         if self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
         if self._in_substeps is not None:
-            run_on_host(lambda: self._resolve_in_substeps(state_out, control, passed, dt), device)
+            solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
+            run_on_host(lambda: self._resolve(end, dt, solve), device)
         elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
             self._record(arrays_of(state_in), end, dt, tape)
         else:
-            run_on_host(lambda: self._resolve(end, dt), device)
+            run_on_host(lambda: self._resolve(end, dt, functools.partial(resolve, self._work, dt)), device)
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
@@ -241,8 +243,8 @@ class SolverCCD(CollisionStage):
 
         def forward():
             nonlocal recorded
+            self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder))
             recorded = None
-            self._resolve(end, dt, self._recorder)
             if device.is_capturing or self._has_changed():
                 recorded = RecordedStep(self._work, dt)
                 self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
@@ -262,27 +264,14 @@ class SolverCCD(CollisionStage):
         return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
-    def _resolve(self, end, dt, recorder=None):
-        """Resolves the motion from the start of the step to its end, and changes the end."""
+    def _resolve(self, end, dt, solve):
+        """Solves the motion from the start of the step to its end, as it was predicted, and changes the end."""
         with self._timed():
-            self._read_end(end, dt)
-            resolve(self._work, dt, recorder)
+            if self._reads_friction:
+                self._motion.friction.read()
+            self._motion.set_end(end, dt)
+            solve()
             self._write_end(end)
-
-    @one_at_a_time
-    def _resolve_in_substeps(self, state, control, contacts, dt):
-        """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
-        with self._timed():
-            self._read_end(arrays_of(state), dt)
-            assert self._in_substeps is not None
-            self._in_substeps.resolve(state, control, contacts, dt)
-            self._write_end(arrays_of(state))
-
-    def _read_end(self, end, dt):
-        """Reads the predicted motion."""
-        if self._reads_friction:
-            self._motion.friction.read()
-        self._motion.set_end(end, dt)
 
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""

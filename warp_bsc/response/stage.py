@@ -20,17 +20,10 @@ from .write_back import count_step
 
 
 class CollisionStage(CouplingHooks):
-    """A stage behind another solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are.
-
-    Attributes:
-        solver: The inner solver.
-        mesh: The triangles that collide.
-        report: What the stage found and did.
-    """
-
-    report: SolverReport
+    """A stage behind a solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are."""
 
     mesh: ModelMesh
+    report: SolverReport
 
     def _allocate(
         self,

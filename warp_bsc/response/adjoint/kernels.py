@@ -5,11 +5,11 @@ For launches over vertices and bodies see :mod:`.adjoint.restore`.
 
 import warp as wp
 
+from ...kernels.closest import contact_weights, weights_across
 from ..contacts.collect import level, offset_from
 from ..contacts.constraints import (
     approach_of,
     contact_friction,
-    contact_weights,
     feasible,
     has_pushed,
     kind_of_pair,
@@ -17,7 +17,6 @@ from ..contacts.constraints import (
 )
 from ..contacts.first_contact import share_before, truncated_path
 from ..contacts.impacts import impact_of
-from ..contacts.proximities import weights_across
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
     Moments,
@@ -42,7 +41,7 @@ from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transfo
 from ..state.poses import centre_of, in_world, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
 from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
+from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
 from .restore import Paths, Projection, RestoredStep, entry_of, is_movable
 
 
@@ -150,10 +149,7 @@ def _torque_and_moments(totals: wp.array2d[wp.float64], world: int):
 
 @wp.kernel
 def turn_velocities(
-    step: Step,
-    totals: wp.array2d[wp.float64],
-    changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vector],
+    step: Step, totals: wp.array2d[wp.float64], changes: wp.array[wp.vec3], body_changes: wp.array[wp.spatial_vector]
 ):
     """Computes how the turn of each world changes the velocities of its vertices and bodies.
 
@@ -215,7 +211,8 @@ def make_constraints(restored: RestoredStep, found: Constraints):
             separation = feasible(step, corners, separation, before)
         separation += sagitta(step, corners)
     elif kind > ContactKind.PLANE:
-        across, direction, distance = weights_across(motion, corners, kind_of_pair(kind))
+        a, b, c, d = corners_of(motion.x0, corners)
+        across, direction, distance = weights_across(kind_of_pair(kind), a, b, c, d)
         weight = across
         normal = direction
         separation = feasible(step, corners, step.separation, distance)

@@ -3,42 +3,22 @@
 import warp as wp
 
 from ...detection.settings import Count
+from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
+from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
-from .constraints import (
-    TOUCH,
-    Constraint,
-    add_constraint,
-    contact_friction,
-    contact_weights,
-    distances_at_start,
-    feasible,
-    is_pushing,
-    kind_of_contact,
-    pace_of,
-    sagitta,
-)
+from . import constraints, rules
+from .constraints import TOUCH
 from .dividing_planes import add_dividing_plane, add_plane
 from .first_contact import update_first_contact
 from .queue import PairQueue, has_pair, vertices_of
-from .rules import (
-    ContactClass,
-    are_occluded,
-    are_on_body,
-    classify_contact,
-    collides,
-    crosses_face,
-    inverse_mass_of,
-    is_movable,
-    owner_of,
-)
+from .rules import ContactClass
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,18 +28,17 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 
 @wp.kernel(enable_backward=False)
-def count_crossings(
-    step: Step, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
-):
+def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
+    mesh = step.mesh
     if not is_filled(i, pairs, counts, _QUEUED):
         return
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    if is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if crosses_face(step.motion, mesh, edge, face):
+    if rules.is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+        if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
 
 
@@ -70,7 +49,7 @@ def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     if body < 0:
         return True
     shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
-    return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
+    return body != planes.body[i] and rules.collides(motion.bodies, shape, planes.shape[i])
 
 
 @wp.func
@@ -96,7 +75,7 @@ def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: S
     distance = level(step.motion, planes, i, vertex)
     if distance == ZERO:
         before, _error = signed_distance(planes.start[i], step.motion.x0[vertex])
-        distance = feasible(step, wp.vec4i(vertex), widened(step.separation, status), before)
+        distance = constraints.feasible(step, wp.vec4i(vertex), widened(step.separation, status), before)
     return planes.end[i][3] + distance
 
 
@@ -125,7 +104,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
     vertex = wp.tid()
     motion, vertices, separation = step.motion, step.vertices, step.separation
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0:
+    if rules.inverse_mass_of(motion, vertex) == 0.0:
         return
     for i in range(planes.end.shape[0]):
         if planes.world[i] >= 0 and planes.world[i] != world:
@@ -156,7 +135,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             if status.loop.iteration[0] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
-        added = Constraint()
+        added = constraints.Constraint()
         added.normal = wp.vec3d(plane[0], plane[1], plane[2])
         if is_dividing(status, world, status.loop.iteration[0]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
@@ -175,12 +154,12 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
         added.min_distance = wp.max(kept, ZERO)
         added.separation = offset_from(step, planes, i, vertex, status) + added.min_distance
-        added.friction = contact_friction(motion.friction[vertex], planes.friction[i])
+        added.friction = constraints.contact_friction(motion.friction[vertex], planes.friction[i])
         added.kind = ContactKind.PLANE
         added.plane = i
         added.within_tolerance = True
         added.pace = Pace.SLOW
-        add_constraint(step, added)
+        constraints.add_constraint(step, added)
 
 
 @wp.func
@@ -191,9 +170,7 @@ def mark_changed(vertices: Vertices, corners: wp.vec4i):
 
 
 @wp.func
-def _collect_contact(
-    step: Step, mesh: Connectivity, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus
-):
+def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not has_pair(contacts, i):
         return
@@ -204,17 +181,17 @@ def _collect_contact(
     kind = contacts.kind
     toi = contacts.toi[i]
     corners = vertices_of(contacts, i)
-    owner = owner_of(motion, corners)
+    owner = rules.owner_of(motion, corners)
     if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
         return
-    added = Constraint()
+    added = constraints.Constraint()
     bound = toi
     if motion.distances.radius:
-        start, kept = distances_at_start(motion, corners, kind)
+        start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
         bound = start
     may_cross = status.results.crossings[0] > 0
-    found = classify_contact(motion, mesh, kind, contacts.pairs[i], corners, owner, bound, may_cross)
+    found = rules.classify_contact(step, kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.CROSSED:
         wp.atomic_add(status.detection.excluded, 0, wp.where(near, 0, 1))
     if found == ContactClass.OF_BODIES:
@@ -225,17 +202,17 @@ def _collect_contact(
     world = motion.world[corners[0]]
     iteration = status.loop.iteration[0]
     added.vertices = corners
-    added.pace = pace_of(motion, corners, kind)
+    added.pace = constraints.pace_of(motion, corners, kind)
     added.weights = contact_weights(kind, contacts.coordinates[i])
     added.normal = contacts.normal[i]
-    added.kind = kind_of_contact(kind)
+    added.kind = constraints.kind_of_contact(kind)
     if not near:
         count_contact(status, world)
         mark_changed(vertices, corners)
         if iteration == 0:
             # dividing planes do not move: they would stop a body that takes along what it pushes
-            moves = added.pace == Pace.FAST or are_on_body(motion, corners)
-            if moves or is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
+            moves = added.pace == Pace.FAST or rules.are_on_body(motion, corners)
+            if moves or constraints.is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
                 status.is_fast[world] = 1
     if is_dividing(status, world, iteration):
         if near:
@@ -251,29 +228,28 @@ def _collect_contact(
             status.loop.projecting[0] = 1
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
-            if are_occluded(motion, mesh, contacts.pairs[i], corners, added.normal, time):
+            if rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time):
                 return  # the next detection finds it, if it is still there
     target = widened(step.separation, status)
     if added.pace == Pace.SLOW:
         before = wp.dot(added.normal, relative(added.weights, corners, motion.x0)) - added.min_distance
-        target = feasible(step, corners, target, before)
-    target += sagitta(step, corners)
+        target = constraints.feasible(step, corners, target, before)
+    target += constraints.sagitta(step, corners)
     target += added.min_distance
     if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
         status.detection.too_near[0] = 1
         status.loop.projecting[0] = 1
         status.contact_iteration[world] = iteration
     added.separation = target
-    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     added.within_tolerance = contacts.within_tolerance[i]
     added.toi = toi
-    add_constraint(step, added)
+    constraints.add_constraint(step, added)
 
 
 @wp.kernel
 def collect_contacts(
     # in
-    mesh: Connectivity,
     first: PairQueue,
     second: PairQueue,
     counts: wp.array[wp.int64],
@@ -292,8 +268,8 @@ def collect_contacts(
     i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(step, mesh, first, i, dividing, status)
-    _collect_contact(step, mesh, second, i, dividing, status)
+    _collect_contact(step, first, i, dividing, status)
+    _collect_contact(step, second, i, dividing, status)
 
 
 @wp.kernel

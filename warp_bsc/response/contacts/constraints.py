@@ -4,7 +4,7 @@ import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
 from ..state.structs import ContactKind, Motion, Pace, Step, body_of, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
@@ -47,18 +47,6 @@ def kind_of_pair(kind: int) -> int:
     """Returns EDGE_EDGE for contacts and proximities of two edges, given a ContactKind, else VERTEX_FACE."""
     of_edges = kind == ContactKind.EDGE_EDGE or kind == ContactKind.EDGE_EDGE_PROXIMITY
     return wp.where(of_edges, EDGE_EDGE, VERTEX_FACE)
-
-
-@wp.func
-def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between contact points, by kind and coordinates of a pair."""
-    if kind == EDGE_EDGE:
-        return wp.vec4d(ONE - c[0], c[0], c[1] - ONE, -c[1])
-    if kind == VERTEX_EDGE:
-        return wp.vec4d(ONE, c[0] - ONE, -c[0], ZERO)
-    if kind == VERTEX_VERTEX:
-        return wp.vec4d(ONE, -ONE, ZERO, ZERO)
-    return wp.vec4d(ONE, -c[0], -c[1], -c[2])
 
 
 @wp.func

@@ -22,7 +22,7 @@ def _count_crossings(work):
     candidates, crossings = work.crossing_candidates, work.status.results.crossings
     crossings.zero_()
     retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
-    inputs = [work.step, work.connectivity, candidates.pairs, candidates.counts, crossings]
+    inputs = [work.step, candidates.pairs, candidates.counts, crossings]
     work.launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
 
 
@@ -48,14 +48,14 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
         work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
-    queues, mesh = queues_of(detector), work.connectivity
+    queues = queues_of(detector)
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
-        inputs = [mesh, *pair, *overflow, work.step, work.dividing, work.status]
+        inputs = [*pair, *overflow, work.step, work.dividing, work.status]
         work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
-        work.launch_over(count_grazing, counted(queues[:2]), [work.step, mesh, *queues[:2], work.record])
+        work.launch_over(count_grazing, counted(queues[:2]), [work.step, *queues[:2], work.record])
     _decide(work, overflow)
     if can_search:
         wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
@@ -65,7 +65,7 @@ def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase = work.detector.broad_phase
     broad_phase.fit(work.step.motion.x0, work.vertices.x1)
-    find_contacts_without_queues(broad_phase, work.connectivity, work.step, work.dividing, work.status)
+    find_contacts_without_queues(broad_phase, work.step, work.dividing, work.status)
     _decide(work, overflow)
 
 

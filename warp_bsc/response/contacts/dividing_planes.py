@@ -123,16 +123,8 @@ def add_dividing_plane(
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
-    cannot bring together.
-
-    Args:
-        step: The motion, and the vertices as they were moved so far.
-        corners: The vertices of both elements.
-        kind: The kind of pair.
-        min_distance: Distance that the elements must keep [m]: half of it is on either side.
-        planes: The planes, which the new one is added to.
-        is_contact: Whether the elements are in contact.
-        may_stop: Whether elements get a plane that stops them although their closest points do not meet.
+    cannot bring together. Of the distance that the elements must keep, ``min_distance`` [m], half is on either side.
+    With ``may_stop``, elements get a plane that stops them although their closest points do not meet.
 
     Returns:
         Whether the elements meet at the end, or nearly, without planes.

@@ -7,7 +7,7 @@ from ...kernels.gradients import with_gradients
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import Impact
 from ..state.record import StepRecord
-from ..state.structs import Connectivity, Step
+from ..state.structs import Step
 from ..state.vectors import corners_of
 from .constraints import kind_of_contact, kind_of_pair
 from .queue import PairQueue, has_pair, vertices_of
@@ -39,7 +39,7 @@ def impact_of(
 
 
 @wp.func
-def _count_grazing(step: Step, mesh: Connectivity, contacts: PairQueue, i: int, record: StepRecord):
+def _count_grazing(step: Step, contacts: PairQueue, i: int, record: StepRecord):
     if not has_pair(contacts, i) or int(contacts.status[i]) == FREE:
         return
     corners = vertices_of(contacts, i)
@@ -48,7 +48,7 @@ def _count_grazing(step: Step, mesh: Connectivity, contacts: PairQueue, i: int, 
         return
     kind = contacts.kind
     toi = contacts.toi[i]
-    found = classify_contact(step.motion, mesh, kind, contacts.pairs[i], corners, owner, toi, True)
+    found = classify_contact(step, kind, contacts.pairs[i], corners, owner, toi, True)
     if found != ContactClass.OURS:
         return
     coordinates = contacts.coordinates[i]
@@ -58,8 +58,8 @@ def _count_grazing(step: Step, mesh: Connectivity, contacts: PairQueue, i: int, 
 
 
 @wp.kernel(enable_backward=False)
-def count_grazing(step: Step, mesh: Connectivity, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord):
+def count_grazing(step: Step, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord):
     """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
     i = wp.tid()
-    _count_grazing(step, mesh, vertex_face, i, record)
-    _count_grazing(step, mesh, edge_edge, i, record)
+    _count_grazing(step, vertex_face, i, record)
+    _count_grazing(step, edge_edge, i, record)

@@ -4,65 +4,18 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
-from ...kernels.pipeline.pairs import firsts_of
+from ...kernels.closest import weights_across
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..schedule import SolveStatus, has_overflowed, is_projecting
-from ..state.structs import Connectivity, ContactKind, Motion, Pace, Step
-from ..state.vectors import ONE, ZERO, corners_of
+from ..state.structs import ContactKind, Pace, Step
+from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
-from .constraints import (
-    Constraint,
-    add_constraint,
-    contact_friction,
-    distances_at_start,
-    feasible,
-    longest_path,
-    pace_of,
-)
+from . import constraints
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
 from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
 
 wp.set_module_options({"enable_backward": False})
-
-_PARALLEL = wp.constant(wp.float64(1.0e-12))
-"""Squared sine up to which edges, or two sides of a face, count as parallel."""
-
-
-@wp.func
-def weights_across(motion: Motion, corners: wp.vec4i, kind: int):
-    """Returns where the line across both elements at the start meets them.
-
-    Returns:
-        The weights of the four vertices in the vector between the two points, the unit vector across both elements,
-        from the second to the first, and the distance along it [m], which is 0 unless both points are within the
-        elements: only then are they their closest points.
-    """
-    a, b, c, d = corners_of(motion.x0, corners)
-    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
-    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
-    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
-    n = wp.cross(u, v)
-    nn = wp.length_sq(n)
-    s = wp.dot(wp.cross(w, v), n)
-    r = wp.dot(wp.cross(u, w), n)
-    weights = wp.vec4d()
-    if nn <= _PARALLEL * wp.length_sq(u) * wp.length_sq(v) or not (s > ZERO and s < nn):
-        return weights, n, ZERO
-    height = wp.dot(w, n)
-    s /= nn
-    r /= nn
-    if kind == EDGE_EDGE:
-        height = -height
-        r = -r
-        weights = wp.vec4d(ONE - s, s, r - ONE, -r)
-    else:
-        weights = wp.vec4d(ONE, s + r - ONE, -s, -r)
-    size = wp.sqrt(nn)
-    n *= wp.sign(height) / size
-    if r > ZERO and weights[firsts_of(kind)] < ZERO:
-        return weights, n, wp.abs(height) / size
-    return weights, n, ZERO
 
 
 @wp.func
@@ -85,7 +38,8 @@ def find_nearest(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float])
     if not has_pair(vertex_face, i):
         return
     corners = vertices_of(vertex_face, i)
-    _weights, normal, distance = weights_across(step.motion, corners, VERTEX_FACE)
+    a, b, c, d = corners_of(step.motion.x0, corners)
+    _weights, normal, distance = weights_across(VERTEX_FACE, a, b, c, d)
     if distance > ZERO:
         wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
 
@@ -105,60 +59,53 @@ def _is_behind(
 
 
 @wp.func
-def _collect_proximity(
-    step: Step, mesh: Connectivity, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus
-):
+def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
     if not has_pair(candidates, i):
         return
     motion, separation = step.motion, step.separation
     kind = candidates.kind
     corners = vertices_of(candidates, i)
-    weights, normal, distance = weights_across(motion, corners, kind)
+    a, b, c, d = corners_of(motion.x0, corners)
+    weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
-    added = Constraint()
+    added = constraints.Constraint()
     if motion.distances.radius:
-        _start, kept = distances_at_start(motion, corners, kind)
+        _start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
     beyond = distance - added.min_distance
-    path = longest_path(motion, corners)
+    path = constraints.longest_path(motion, corners)
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
     if not is_movable(motion, corners) or not is_projecting(status, world):
         return
-    if pace_of(motion, corners, kind) == Pace.FAST:
+    if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
     if status.results.crossings[0] > 0:
-        if crossed_at_start(motion, mesh, kind, candidates.pairs[i]):
+        if crossed_at_start(step, kind, candidates.pairs[i]):
             return
     elif nearest and _is_behind(corners, kind, normal, distance, nearest):
         return
-    if kind == EDGE_EDGE and are_occluded(motion, mesh, candidates.pairs[i], corners, normal, ZERO):
+    if kind == EDGE_EDGE and are_occluded(step, candidates.pairs[i], corners, normal, ZERO):
         return
     if are_on_body(motion, corners):
         status.is_fast[world] = 1  # as where bodies are in contact, see collect.collect_contacts
     added.vertices = corners
     added.weights = weights
     added.normal = normal
-    added.separation = added.min_distance + feasible(step, corners, separation, beyond)
-    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    added.kind = ContactKind.VERTEX_FACE_PROXIMITY
-    if kind == EDGE_EDGE:
-        added.kind = ContactKind.EDGE_EDGE_PROXIMITY
+    added.separation = added.min_distance + constraints.feasible(step, corners, separation, beyond)
+    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    of_faces, of_edges = int(ContactKind.VERTEX_FACE_PROXIMITY), int(ContactKind.EDGE_EDGE_PROXIMITY)
+    added.kind = wp.where(kind == EDGE_EDGE, of_edges, of_faces)
     added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
-    add_constraint(step, added)
+    constraints.add_constraint(step, added)
 
 
 @wp.kernel
 def collect_proximities(
-    step: Step,
-    mesh: Connectivity,
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
-    nearest: wp.array2d[float],
-    status: SolveStatus,
+    step: Step, vertex_face: PairQueue, edge_edge: PairQueue, nearest: wp.array2d[float], status: SolveStatus
 ):
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
@@ -169,8 +116,8 @@ def collect_proximities(
     behind them.
     """
     i = wp.tid()
-    _collect_proximity(step, mesh, vertex_face, nearest, i, status)
-    _collect_proximity(step, mesh, edge_edge, nearest, i, status)
+    _collect_proximity(step, vertex_face, nearest, i, status)
+    _collect_proximity(step, edge_edge, nearest, i, status)
 
 
 @wp.kernel
@@ -197,7 +144,7 @@ def add_proximities(work: Workspace) -> None:
         if nearest is not None:
             nearest.fill_(np.inf)
             work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
-        inputs = [work.step, work.connectivity, *queues, nearest, work.status]
+        inputs = [work.step, *queues, nearest, work.status]
         work.launch_over(collect_proximities, counted(queues), inputs)
 
     retry_until_fits(collect, work, work.device)

@@ -9,7 +9,7 @@ from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
-from ..state.structs import Bodies, Connectivity, Motion, body_of, can_move
+from ..state.structs import Bodies, Motion, Step, body_of, can_move
 from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
 
@@ -85,13 +85,14 @@ def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
-def crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bool:
+def crosses_face(step: Step, edge: int, face: int) -> bool:
     """Returns whether an edge certainly crosses a face at the start."""
+    mesh = step.mesh
     for end in range(2):
         for corner in range(3):
             if mesh.edges[edge, end] == mesh.faces[face, corner]:
                 return False
-    x = motion.x0
+    x = step.motion.x0
     p = mesh.edges[edge, 0]
     q = mesh.edges[edge, 1]
     a = x[mesh.faces[face, 0]]
@@ -101,7 +102,7 @@ def crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bo
 
 
 @wp.func
-def crossed_at_start(motion: Motion, mesh: Connectivity, kind: int, pair: wp.vec2i) -> bool:
+def crossed_at_start(step: Step, kind: int, pair: wp.vec2i) -> bool:
     """Returns whether a contact belongs to elements that certainly crossed at the start of the step.
 
     A vertex that passes through a face changes which of the vertex's edges cross that face; an edge that passes through
@@ -109,15 +110,16 @@ def crossed_at_start(motion: Motion, mesh: Connectivity, kind: int, pair: wp.vec
     to a crossing if one of the vertex's edges crosses that face, and the contact of two edges if one of them crosses a
     face of the other. Crossing surfaces come apart by these contacts. Points cross nothing.
     """
+    mesh = step.mesh
     if kind == EDGE_EDGE:
         for side in range(2):
             other = pair[1 - side]
             for i in range(mesh.edge_faces.first[other], mesh.edge_faces.first[other + 1]):
-                if crosses_face(motion, mesh, pair[side], mesh.edge_faces.items[i]):
+                if crosses_face(step, pair[side], mesh.edge_faces.items[i]):
                     return True
     if kind == VERTEX_FACE:
         for i in range(mesh.vertex_edges.first[pair[0]], mesh.vertex_edges.first[pair[0] + 1]):
-            if crosses_face(motion, mesh, mesh.vertex_edges.items[i], pair[1]):
+            if crosses_face(step, mesh.vertex_edges.items[i], pair[1]):
                 return True
     return False
 
@@ -134,35 +136,21 @@ def owner_of(motion: Motion, corners: wp.vec4i) -> int:
 
 @wp.func
 def classify_contact(
-    motion: Motion,
-    mesh: Connectivity,
-    kind: int,
-    pair: wp.vec2i,
-    corners: wp.vec4i,
-    owner: int,
-    bound: wp.float64,
-    may_cross: bool,
+    step: Step, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int, bound: wp.float64, may_cross: bool
 ) -> int:
-    """Returns the ContactClass of a contact.
+    """Returns the ContactClass of a contact of an owner, as of :func:`owner_of`.
 
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        kind: The kind of pair.
-        pair: Its elements.
-        corners: Its vertices.
-        owner: What :func:`owner_of` returns for them.
-        bound: A lower bound of the time of impact, or of the distance at the start. Above 0, the elements did not touch
-            at the start; at 0, which it also is for contacts soon after the start, an exact test decides.
-        may_cross: False if nothing that can be moved crosses at the start.
+    Above a ``bound`` of 0, which is a lower one of the time of impact, or of the distance at the start, the elements
+    did not touch at the start; at 0, which it also is for contacts soon after the start, an exact test decides. Nothing
+    that can be moved crosses at the start unless it ``may_cross``.
     """
     met = bool(False)
     if not bound > ZERO:
-        x = motion.x0
+        x = step.motion.x0
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         met = meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
     if not met and (may_cross or owner != ContactClass.OURS):
-        met = crossed_at_start(motion, mesh, kind, pair)
+        met = crossed_at_start(step, kind, pair)
     if not met:
         return owner
     return wp.where(owner == ContactClass.OURS, int(ContactClass.CROSSED), int(ContactClass.NONE))
@@ -175,9 +163,7 @@ def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def are_occluded(
-    motion: Motion, mesh: Connectivity, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64
-) -> bool:
+def are_occluded(step: Step, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64) -> bool:
     """Returns whether a face next to one of two edges shields it from the other along the normal, at a time in [0, 1].
 
     Only pairs with an edge of a body that can be moved are occluded. The face reaches farther along the normal than
@@ -185,6 +171,7 @@ def are_occluded(
     above. A push along this normal would hold what slides. Sheets may bend around a body by 30 degrees to either side,
     bodies do not bend.
     """
+    motion, mesh = step.motion, step.mesh
     if not are_on_body(motion, corners):
         return False
     for side in range(2):

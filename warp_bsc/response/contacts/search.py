@@ -18,7 +18,7 @@ from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_V
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
 from ..schedule import SolveStatus, count_contact
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Step
+from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
@@ -36,15 +36,9 @@ class _Arguments:
     """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
-    mesh: Connectivity
     step: Step
     dividing: DividingPlanes
     status: SolveStatus
-
-
-@wp.func
-def _next(corner: int) -> int:
-    return wp.where(corner == 2, 0, corner + 1)
 
 
 @wp.func
@@ -59,8 +53,7 @@ def _resolve(
     min_distance: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
-    motion = arguments.step.motion
-    found = classify_contact(motion, arguments.mesh, kind, pair, corners, owner, bound, True)
+    found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
         wp.atomic_add(arguments.status.detection.excluded, 0, 1)
     if found == ContactClass.OF_BODIES:
@@ -68,7 +61,7 @@ def _resolve(
         mark_changed(arguments.step.vertices, corners)
     if found != ContactClass.OURS:
         return
-    count_contact(arguments.status, motion.world[corners[0]])
+    count_contact(arguments.status, arguments.step.motion.world[corners[0]])
     add_dividing_plane(arguments.step, corners, kind, min_distance, arguments.dividing, True, True)
     mark_changed(arguments.step.vertices, corners)
     for j in range(4):
@@ -82,12 +75,9 @@ def _ends(x0: wp.array[wp.vec3], x1: wp.array[wp.vec3], v: wp.vec4i):
 
 
 @wp.func
-def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it comes nearer than it may."""
     motion = arguments.step.motion
-    owner = owner_of(motion, corners)
-    if owner == ContactClass.NONE:
-        return
     a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     most = distance_of_corners(kind, corners, motion.distances.radius)
@@ -101,13 +91,9 @@ def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: 
 
 
 @wp.func
-def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it is in contact."""
-    motion = arguments.step.motion
-    owner = owner_of(motion, corners)
-    if owner == ContactClass.NONE:
-        return
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(arguments.step.motion.x0, arguments.step.vertices.x1, corners)
     relative = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
     y = coplanarity(relative)
     if certified_sign_cubic(y.k, y.bound) != 0:
@@ -141,9 +127,9 @@ def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
     other_side = (bit - 6) % 3
     corners = wp.vec4i(
         mesh.faces[place, side],
-        mesh.faces[place, _next(side)],
+        mesh.faces[place, (side + 1) % 3],
         mesh.faces[other, other_side],
-        mesh.faces[other, _next(other_side)],
+        mesh.faces[other, (other_side + 1) % 3],
     )
     return EDGE_EDGE, wp.vec2i(mesh.face_edges[place, side], mesh.face_edges[other, other_side]), corners
 
@@ -187,28 +173,24 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
                 if wp.static(keep_distances):
                     if bit == _POINT_BIT:
                         kind, pair, corners = _point_pair(mesh, point, place + other - point)
+                owner = int(ContactClass.NONE)
                 if kind >= 0:
-                    decide(arguments, kind, pair, corners)
+                    owner = owner_of(arguments.step.motion, corners)
+                if owner != ContactClass.NONE:
+                    decide(arguments, kind, pair, corners, owner)
 
     return traversal_kernel(visit, _Arguments)
 
 
 def find_contacts_without_queues(
-    broad_phase: BroadPhaseHierarchy, mesh: Connectivity, step: Step, dividing: DividingPlanes, status: SolveStatus
+    broad_phase: BroadPhaseHierarchy, step: Step, dividing: DividingPlanes, status: SolveStatus
 ) -> None:
-    """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
+    """Finds all contacts of the motion that a broad phase has fitted last, as a whole, however many there are.
 
     Counts them, adds dividing planes as far as they fit, and finds the first contact of each vertex. Allocates nothing
     and does not synchronize. Slower than the detector, as neighbouring threads decide pairs of different difficulty.
-
-    Args:
-        broad_phase: The broad phase, fitted to all of the motion.
-        mesh: The elements of the mesh.
-        step: The motion, and the vertices as they were moved so far.
-        dividing: The dividing planes.
-        status: The solve status.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.mesh, arguments.step = broad_phase.hierarchy, mesh, step
+    arguments.faces, arguments.step = broad_phase.hierarchy, step
     arguments.dividing, arguments.status = dividing, status
     broad_phase.traverse(_kernel(bool(step.motion.distances.radius)), arguments)

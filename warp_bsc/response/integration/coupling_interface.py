@@ -105,9 +105,6 @@ class CouplingHooks(WrappedSolver):
 
         ``SolverCoupledADMM`` handles hard attachments of bodies to particles within one entry only if its solver is
         ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
-
-    Attributes:
-        solver: The inner solver.
     """
 
     _motion: ModelMotion
@@ -132,23 +129,22 @@ class CouplingHooks(WrappedSolver):
 
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
-        impulses = None if self._coupled is None else self._coupled.body_impulses
-        hook = "coupling_harvest_proxy_wrenches"
-        self._harvest(hook, _add_wrenches, impulses, body_local_to_proxy_global, out_body_f, options)
+        kind = "coupling_harvest_proxy_wrenches", "body_impulses", _add_wrenches
+        self._harvest(*kind, body_local_to_proxy_global, out_body_f, options)
 
     def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
-        impulses = None if self._coupled is None else self._coupled.particle_impulses
-        hook = "coupling_harvest_proxy_particle_forces"
-        self._harvest(hook, _add_forces, impulses, particle_local_to_proxy_global, out_particle_f, options)
+        kind = "coupling_harvest_proxy_particle_forces", "particle_impulses", _add_forces
+        self._harvest(*kind, particle_local_to_proxy_global, out_particle_f, options)
 
-    def _harvest(self, hook, kernel, impulses, proxy, forces, options):
+    def _harvest(self, hook, impulses, kernel, proxy, forces, options):
         if self._inner_contacts is not None and options["contacts"] is not None:
             options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
-        if impulses is not None and not _is_default(self.solver, hook):  # the default includes changes of velocities
-            inputs = [impulses, proxy, options["dt"]]
-            wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
+        if self._coupled is not None and not _is_default(self.solver, hook):  # which includes changes of velocities
+            added = getattr(self._coupled, impulses)
+            inputs = [added, proxy, options["dt"]]
+            wp.launch(kernel, len(added), inputs=inputs, outputs=[forces], device=added.device)
 
 
 class _Coupled:

@@ -20,10 +20,7 @@ class WrappedSolver(SolverBase, CouplingInterface):
     solver: SolverBase
 
     def __init__(self, solver: SolverBase):
-        """Wraps a solver.
-
-        Args:
-            solver: Any Newton solver.
+        """Wraps any solver of Newton.
 
         Raises:
             TypeError: If it is no solver of Newton.
@@ -62,24 +59,15 @@ class WrappedSolver(SolverBase, CouplingInterface):
         return getattr(self.solver, name)
 
 
-def _delegated_method(name):
-    """Returns a method that is that of the inner solver."""
+def _delegated_method(name, owner):
+    """Returns a method that is that of the inner solver; hooks of the coupling interface have a default."""
 
-    @functools.wraps(getattr(SolverBase, name))
+    @functools.wraps(getattr(owner, name))
     def method(self, *arguments, **options):
-        return getattr(self.solver, name)(*arguments, **options)
+        inner = self._hook(name) if owner is CouplingInterface else getattr(self.solver, name)
+        return inner(*arguments, **options)
 
     return method
-
-
-def _delegated_hook(name):
-    """Returns a hook of the coupling interface that is that of the inner solver."""
-
-    @functools.wraps(getattr(CouplingInterface, name))
-    def hook(self, *arguments, **options):
-        return self._hook(name)(*arguments, **options)
-
-    return hook
 
 
 def _delegated_property(name):
@@ -95,9 +83,9 @@ for _name in (
     "update_contacts",
     "validate_observables",
 ):
-    setattr(WrappedSolver, _name, _delegated_method(_name))
+    setattr(WrappedSolver, _name, _delegated_method(_name, SolverBase))
 for _name in ("collision_frequency", "collision_frequency_type", "supported_observables"):
     setattr(WrappedSolver, _name, _delegated_property(_name))
 for _name in dir(CouplingInterface):
     if _name.startswith("coupling_"):
-        setattr(WrappedSolver, _name, _delegated_hook(_name))
+        setattr(WrappedSolver, _name, _delegated_method(_name, CouplingInterface))

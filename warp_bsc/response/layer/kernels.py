@@ -4,9 +4,10 @@ import warp as wp
 
 from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
+from ...kernels.closest import closest_weights
 from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE
-from ..contacts.closest import closest_vector, closest_weights
+from ..contacts.closest import closest_vector
 from ..contacts.constraints import contact_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body

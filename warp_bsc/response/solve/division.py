@@ -7,17 +7,10 @@ start.
 
 import warp as wp
 
+from ..contacts import first_contact
 from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
-from ..contacts.first_contact import (
-    TIME_UNITS,
-    contact_index,
-    contact_kind,
-    contact_time,
-    packed_vertex,
-    share_before,
-    truncated_path,
-)
+from ..contacts.first_contact import TIME_UNITS
 from ..contacts.queue import PairQueue, queues_of, vertices_of
 from ..schedule import SolveStatus, divides_all_proximities, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
@@ -86,7 +79,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
     if packed == NEVER or body < 0:
         return
     if is_recording(record):
-        wp.atomic_min(vertices.bodies.first_contact, body, packed_vertex(packed, vertex))
+        wp.atomic_min(vertices.bodies.first_contact, body, first_contact.packed_vertex(packed, vertex))
     else:
         vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
@@ -99,8 +92,8 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, share_before(contact_time(packed)))
-    if not complete or contact_kind(packed) == ContactKind.NONE:
+        share = wp.min(share, first_contact.share_before(first_contact.contact_time(packed)))
+    if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
 
@@ -161,7 +154,7 @@ def _record_truncation(
     record.body[entry] = body
     if body >= 0:
         record.pose[entry] = step.vertices.bodies.pose[body]
-    if contact_kind(packed) == ContactKind.EDGE_EDGE:
+    if first_contact.contact_kind(packed) == ContactKind.EDGE_EDGE:
         _record_contact(vertex, cuts, packed, edge_edge, entry, record)
     else:
         _record_contact(vertex, cuts, packed, vertex_face, entry, record)
@@ -170,11 +163,11 @@ def _record_truncation(
 @wp.func
 def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
     """Records the contact that a path is truncated before."""
-    kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
-    i = contact_index(packed)
+    kind = wp.where(cuts, first_contact.contact_kind(packed), NO_CONTACT)
+    i = first_contact.contact_index(packed)
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = contact_time(packed)
+    record.toi[entry] = first_contact.contact_time(packed)
     if kind != ContactKind.PLANE and kind != NO_CONTACT:
         record.contact[entry] = vertices_of(contacts, i)
         record.within_tolerance[entry] = contacts.within_tolerance[i]
@@ -254,12 +247,12 @@ def truncate_vertices(
         end, truncated = position_on_sides(dividing, vertex, x0, end)
         outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
     if not complete:
-        path = truncated_path(to_double(x0), to_double(end), contact_time(packed))
+        path = first_contact.truncated_path(to_double(x0), to_double(end), first_contact.contact_time(packed))
         end = to_single(to_double(x0) + path)
         outcome = outcome | TRUNCATED
         if not divides:
             vertices.velocity[vertex] = to_single(path / dt)
-    if divides and contact_kind(packed) == ContactKind.NONE:
+    if divides and first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.velocity[vertex] = (end - x0) / float(dt)
         outcome = outcome | UNCONSTRAINED
     vertices.x1[vertex] = end
@@ -278,7 +271,7 @@ def record_body_truncations(step: Step, vertex_face: PairQueue, edge_edge: PairQ
     body = bodies.of_vertex[vertex]
     if body < 0 or bodies.inverse_mass[body] == 0.0 or moved.outcome[body] & FROZEN != 0:
         return
-    if moved.first_contact[body] == packed_vertex(packed, vertex):
+    if moved.first_contact[body] == first_contact.packed_vertex(packed, vertex):
         cuts = moved.share[body] != FREEZES
         _record_truncation(step, vertex, body, cuts, packed, vertex_face, edge_edge, record)
 
@@ -302,8 +295,8 @@ def divide(work: Workspace, dt: float) -> None:
     work.reserve_truncations()
     contacts, changed = queues_of(work.detector)[:2], [work.dividing, work.status]
     if not work.differentiable:
-        work.launch_over_constraints(divide_proximities, [work.step, *changed])
-    work.launch_over_particles(truncate_vertices, [work.step, *contacts, *changed, work.record, dt])
+        work.launch_over_constraints(divide_proximities, *changed)
+    work.launch_over_particles(truncate_vertices, *contacts, *changed, work.record, dt)
     work.launch_over_shape_vertices(find_body_shares, *changed, work.record)
     if work.recorder is not None:
         work.launch_over_shape_vertices(record_body_truncations, *contacts, work.record)

@@ -2,28 +2,16 @@
 
 import warp as wp
 
-from ..contacts.constraints import gap, min_distance_of
+from ..contacts.constraints import gap, min_distance_of, moves_body
 from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import PROJECTED, ContactKind, Pace, Step
-from ..state.vectors import ZERO, relative
+from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .sweeps import (
-    activate,
-    add_delta,
-    after_sweep,
-    finish_sweep,
-    is_held_by_friction,
-    max_sweeps,
-    momentum_of,
-    path_of,
-    position_multiplier_after,
-    repeat,
-    tolerance_of,
-)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,7 +36,7 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
         start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
         if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
             return
-    past = status.loop.sweep[0] >= max_sweeps(step, status, i, status.slow_position_sweeps)
+    past = status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
     normal = constraints.normal[i]
@@ -60,16 +48,18 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
             tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (separation - predicted))
     else:
         tolerance = wp.min(tolerance, TOLERANCE_OF_DISTANCE * (separation - min_distance_of(step, i)))
-    tolerance = tolerance_of(step, i, tolerance)
+    tolerance *= wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE)
     active = distance < -tolerance
     if not active and is_reversible(status, constraints.pace[i] != Pace.FAST):
         multiplier = constraints.position_multiplier[i]
         if wp.length_sq(multiplier) > ZERO:
             friction = wp.float64(constraints.friction[i])
-            path = path_of(step, i)
-            active = distance > tolerance or not is_held_by_friction(multiplier, normal, path, friction, tolerance)
+            path = sweeps.path_of(step, i)
+            active = distance > tolerance or not sweeps.is_held_by_friction(
+                multiplier, normal, path, friction, tolerance
+            )
     if active:
-        activate(step, i)
+        sweeps.activate(step, i)
 
 
 @wp.kernel
@@ -81,16 +71,15 @@ def project_positions(step: Step, status: SolveStatus, record: StepRecord):
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    last_sweep = max_sweeps(step, status, i, status.slow_position_sweeps) - 1
-    momentum = momentum_of(step, status, i, last_sweep)
+    momentum = sweeps.momentum_of(step, status, i, status.slow_position_sweeps)
     if pushes_only:
         violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
-    multiplier = position_multiplier_after(step, i, pushes_only)
+    multiplier = sweeps.position_multiplier_after(step, i, pushes_only)
     old = constraints.position_multiplier[i]
-    new = after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.position_multiplier[i] = new
-    add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
+    sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
 @wp.func
@@ -107,7 +96,7 @@ def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: 
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
     vertices = step.vertices
-    if finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
+    if sweeps.finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
@@ -117,7 +106,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    repeat(work, lambda first, last: _sweep(work, first, last, tolerance))
+    sweeps.repeat(work, lambda: _activate(work, tolerance), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -127,16 +116,14 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    work.reserve_entries(1)
-    _sweep(work, True, True, 1.0)
+    sweeps.sweep(work, 1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
-def _sweep(work, first, last, tolerance):
-    """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    inputs = [work.step, work.status]
-    if first:
-        work.launch_over_constraints(activate_position_constraints, [*inputs, tolerance * work.tolerance])
-    work.launch_over_active_set(project_positions, [*inputs, work.record])
-    work.launch_over_particles(update_positions, [*inputs, work.record, last], at_least_once=True)
+def _activate(work, tolerance):
+    work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
+
+
+def _update(work, last):
+    work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

@@ -17,7 +17,7 @@ from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CREEP, RELAXATION, SLIDING, TOLERANCE_OF_BODIES
+from ..tuning import CREEP, RELAXATION, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 
@@ -145,12 +145,6 @@ def activate(step: Step, i: int):
 
 
 @wp.func
-def tolerance_of(step: Step, i: int, tolerance: wp.float64) -> wp.float64:
-    """Returns the tolerance of a constraint, less than ``tolerance`` if it moves a body."""
-    return wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance
-
-
-@wp.func
 def max_sweeps(step: Step, status: SolveStatus, i: int, slow: int) -> int:
     """Returns the most sweeps of a constraint: ``slow`` if it moves no body, and its world has no fast contacts."""
     world = step.motion.world[step.constraints.vertices[i][0]]
@@ -158,12 +152,12 @@ def max_sweeps(step: Step, status: SolveStatus, i: int, slow: int) -> int:
 
 
 @wp.func
-def momentum_of(step: Step, status: SolveStatus, i: int, last_sweep: int) -> wp.float64:
+def momentum_of(step: Step, status: SolveStatus, i: int, slow: int) -> wp.float64:
     """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
     sweep = status.loop.sweep[0]
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
-    if last != sweep - 1 or sweep == last_sweep:
+    if last != sweep - 1 or sweep == max_sweeps(step, status, i, slow) - 1:
         return ZERO
     return wp.float64(sweep) / wp.float64(sweep + 3)
 
@@ -227,18 +221,20 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
     return active
 
 
-def repeat(work: Workspace, sweep: Callable[[bool, bool], None]) -> None:
-    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds.
+def sweep(work: Workspace, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    """Sweeps a number of times over one active set, which ``activate`` fills.
 
-    Args:
-        work: The buffers.
-        sweep: Sweeps once. Takes whether it is the first of a batch, which fills the active set, and the last.
+    The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
     """
+    work.reserve_entries(number)
+    activate()
+    for i in range(number):
+        work.launch_over_active_set(project, work.status, work.record)
+        update(work, i == number - 1)
 
-    def batch():
-        work.reserve_entries(int(SWEEPS_PER_BATCH))
-        for i in range(SWEEPS_PER_BATCH):
-            sweep(i == 0, i == SWEEPS_PER_BATCH - 1)
 
+def repeat(work: Workspace, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
     work.launch(start_sweeps, 1, [work.status])
-    wp.capture_while(work.status.loop.more_sweeps, batch)
+    batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+    wp.capture_while(work.status.loop.more_sweeps, sweep, work=work, **batch)

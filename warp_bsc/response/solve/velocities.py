@@ -2,29 +2,17 @@
 
 import warp as wp
 
-from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of
+from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
 from ..schedule import SolveStatus
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
-from ..state.vectors import ZERO, relative
+from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
+from ..tuning import TOLERANCE_OF_BODIES
+from . import sweeps
 from .angular_momentum import sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
-from .sweeps import (
-    activate,
-    add_delta,
-    after_sweep,
-    excess_speed,
-    finish_sweep,
-    initial_velocity_multiplier,
-    is_held_by_friction,
-    max_sweeps,
-    momentum_of,
-    repeat,
-    tolerance_of,
-    velocity_multiplier_after,
-)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,13 +28,13 @@ def initialize_velocity_multipliers(step: Step, dt: wp.float64):
     if i >= constraints.count[0]:
         return
     if has_pushed(step, i):
-        impulse = initial_velocity_multiplier(step, i, dt)
+        impulse = sweeps.initial_velocity_multiplier(step, i, dt)
         constraints.velocity_multiplier[i] = impulse
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
         if step.motion.bodies.of_vertex:
             activate_bodies(step, i)
-        add_delta(step, i, impulse, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
+        sweeps.add_delta(step, i, impulse, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
     constraints.previous_multiplier[i] = constraints.velocity_multiplier[i]
     constraints.last_sweep[i] = NEVER_SWEPT
 
@@ -58,22 +46,22 @@ def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp
     constraints = step.constraints
     if i >= constraints.count[0]:
         return
-    if status.loop.sweep[0] >= max_sweeps(step, status, i, status.slow_velocity_sweeps):
+    if status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == ZERO:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
             return
-    tolerance = tolerance_of(step, i, tolerance) / dt
-    excess = excess_speed(step, i)
+    tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / dt
+    excess = sweeps.excess_speed(step, i)
     active = excess < -tolerance
     if not active and wp.length_sq(multiplier) > ZERO:
         velocity = relative(constraints.weights[i], constraints.vertices[i], step.vertices.velocity)
         friction = wp.float64(constraints.friction[i])
-        held = is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, tolerance)
+        held = sweeps.is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, tolerance)
         active = excess > tolerance or not held
     if active:
-        activate(step, i)
+        sweeps.activate(step, i)
 
 
 @wp.kernel
@@ -84,13 +72,12 @@ def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
-    last_sweep = max_sweeps(step, status, i, status.slow_velocity_sweeps) - 1
-    momentum = momentum_of(step, status, i, last_sweep)
-    multiplier = velocity_multiplier_after(step, i)
+    momentum = sweeps.momentum_of(step, status, i, status.slow_velocity_sweeps)
+    multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
-    new = after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.velocity_multiplier[i] = new
-    add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
+    sweeps.add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
 
 
 @wp.func
@@ -107,7 +94,7 @@ def change_velocity(step: Step, vertex: int) -> bool:
 def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    if finish_sweep(step, status, record, last, vertex):
+    if sweeps.finish_sweep(step, status, record, last, vertex):
         change_velocity(step, vertex)
 
 
@@ -117,34 +104,28 @@ def project(work: Workspace, dt: float) -> None:
     Then restores angular momentum.
     """
     work.launch_over_bodies(move_to_end)
-    work.launch_over_constraints(initialize_velocity_multipliers, [work.step, dt])
+    work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
-    repeat(work, lambda first, last: _sweep(work, first, last, dt))
+    sweeps.repeat(work, lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 
-def _sweep(work, first, last, dt):
-    """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    inputs = [work.step, work.status]
-    if first:
-        work.launch_over_constraints(activate_velocity_constraints, [*inputs, work.tolerance, dt])
-    work.launch_over_active_set(project_velocities, [*inputs, work.record])
-    _update(work, last)
+def _activate(work, dt):
+    work.launch_over_constraints(activate_velocity_constraints, work.status, work.tolerance, dt)
 
 
 def _update(work, last):
-    inputs = [work.step, work.status, work.record, last]
-    work.launch_over_particles(update_velocities, inputs, at_least_once=True)
+    work.launch_over_particles(update_velocities, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(change_body_velocities, last)
     work.launch_over_shape_vertices(set_vertex_velocities)
 
 
 def _restore_angular_momentum(work):
     """Turns all that collided in each world where nothing is held, which removes the torque that contacts added."""
-    step, sums, threads = work.step, work.moments, work.summing_threads
+    sums, threads = work.moments, work.summing_threads
     sums.zero_()
-    work.launch(sum_torques, threads, [step, threads, sums])
-    work.launch(sum_moments, threads, [step, work.particle_count, threads, sums])
+    work.launch(sum_torques, threads, [work.step, threads, sums])
+    work.launch(sum_moments, threads, [work.step, work.particle_count, threads, sums])
     work.launch_over_bodies(sum_body_moments, sums)
-    work.launch_over_particles(turn_vertices, [step, sums])
+    work.launch_over_particles(turn_vertices, sums)
     work.launch_over_bodies(turn_bodies, sums)

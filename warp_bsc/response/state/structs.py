@@ -163,8 +163,9 @@ class Constraints:
 
 @wp.struct
 class Step:
-    """A motion, and what the response moves and knows of it, as kernels take them."""
+    """A mesh, its motion, and what the response moves and knows of it, as kernels take them."""
 
+    mesh: Connectivity
     motion: Motion
     vertices: Vertices
     constraints: Constraints

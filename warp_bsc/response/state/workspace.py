@@ -65,7 +65,7 @@ class Workspace:
     """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
     Attributes:
-        step: The motion, which is only read, the vertices and bodies as they are moved, and the constraints.
+        step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
@@ -83,7 +83,7 @@ class Workspace:
         restitution: wp.array[float],
         max_iterations: int = MAX_ITERATIONS,
     ):
-        """Allocates buffers for steps with these options, see :class:`.solver_ccd.SolverCCD`."""
+        """Allocates buffers for steps of a motion; separation [m] and restitution are those of :class:`.Step`."""
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
         self.differentiable = differentiable = mesh.model.requires_grad
@@ -94,8 +94,8 @@ class Workspace:
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
-        self.connectivity = mesh.connectivity
         self.step = step = Step()
+        step.mesh = mesh.connectivity
         self.motion = motion
         step.separation, step.restitution = separation, restitution
         size = vertices, 3
@@ -218,11 +218,7 @@ class Workspace:
 
         On the CPU it runs on one thread, unlike :func:`warp_bsc.detection.launch.launch_over_queue`, because Warp's
         additions are not atomic there. On a GPU each thread takes several entries, so that capacity costs little.
-
-        Args:
-            kernel: The kernel, which takes an entry of each queue.
-            queues: Queues, each with its counts and the index of its own count.
-            inputs: Arguments of the kernel.
+        Queues have their counts and the index of their own count with them; a thread takes an entry of each.
         """
         if self.device.is_cpu:
             entries = max(min(len(queue), int(counts.numpy()[count])) for queue, counts, count in queues)
@@ -231,25 +227,27 @@ class Workspace:
             entries = max(len(queue) for queue, _counts, _count in queues)
             wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._max_blocks)
 
-    def launch_over_constraints(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel over the constraints."""
-        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
+    def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
+        """Launches a kernel over the constraints, with the step as its first input, as in all that follow."""
+        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], [self.step, *inputs])
 
-    def launch_over_active_set(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+    def launch_over_active_set(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the active constraints."""
-        self.launch_over(kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], inputs)
+        self.launch_over(
+            kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], [self.step, *inputs]
+        )
 
-    def launch_over_particles(self, kernel: wp.Kernel, inputs: Sequence, *, at_least_once: bool = False) -> None:
+    def launch_over_particles(self, kernel: wp.Kernel, *inputs, at_least_once: bool = False) -> None:
         """Launches a kernel over the particles; ``at_least_once`` even if there are none."""
-        self.launch(kernel, max(self.particle_count, int(at_least_once)), inputs)
+        self.launch(kernel, max(self.particle_count, int(at_least_once)), [self.step, *inputs])
 
     def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the bodies, if they can be moved, with the step as its first input."""
+        """Launches a kernel over the bodies, if they can be moved."""
         if self.body_count:
             self.launch(kernel, self.body_count, [self.step, *inputs])
 
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
+        """Launches a kernel over the vertices of shapes, if bodies can be moved."""
         if self.body_count:
             count = self.mesh.vertex_count - self.particle_count
             self.launch(kernel, count, [self.step, *inputs])

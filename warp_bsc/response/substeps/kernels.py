@@ -67,12 +67,6 @@ def begin_substeps(
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
 
-@wp.func
-def _share(substeps: int, done: int) -> float:
-    """Returns the share of the whole step that a number of substeps makes."""
-    return float(done) / float(substeps)
-
-
 @wp.kernel
 def start_substep(
     # in
@@ -95,8 +89,9 @@ def start_substep(
     their path in the whole step.
     """
     i = wp.tid()
-    before = _share(substeps, substeps - remaining[0])
-    after = _share(substeps, substeps - remaining[0] + 1)
+    done = substeps - remaining[0]
+    before = float(done) / float(substeps)
+    after = float(done + 1) / float(substeps)
     substep, vertices = step.motion, step.vertices
     if i == 0:
         step.constraints.count[0] = detected[0]
@@ -195,8 +190,8 @@ def move_bodies(
     if can_move(motion, body):
         return
     done = substeps - remaining[0]
-    body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done))
-    body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done + 1))
+    body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], float(done) / float(substeps))
+    body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], float(done + 1) / float(substeps))
 
 
 @wp.func

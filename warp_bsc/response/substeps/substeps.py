@@ -75,21 +75,14 @@ class Substeps:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not repeated.
     """
 
-    def __init__(
-        self,
-        step: Callable[..., None],
-        solver: SolverBase,
-        work: Workspace,
-        substeps: Sequence[int],
-    ):
+    def __init__(self, step: Callable[..., None], solver: SolverBase, work: Workspace, substeps: Sequence[int]):
         """Allocates buffers.
 
         Args:
             step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
-            work: The workspace of the step, with the motion of the whole step.
-            substeps: Numbers of substeps to choose from, each at least 2, sorted; a single one is taken by every step
-                that collides.
+            work: The workspace, with the motion of the whole step.
+            substeps: Numbers to choose from, each at least 2, sorted; one alone is taken by every step that collides.
 
         Raises:
             RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
@@ -198,7 +191,7 @@ class Substeps:
         work = self._work
         add_proximities(work)
         self._has_constraints.zero_()
-        work.launch_over_constraints(kernels.find_worlds, [work.step, self._has_constraints])
+        work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
         inputs = [work.step, work.status, self._detected, self._is_fast]
         work.launch(kernels.keep_detection, work.worlds, inputs)
         for array, saved in step.arrays:
@@ -211,14 +204,14 @@ class Substeps:
 
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
-        work, mesh, start, motion = self._work, self._mesh, self._in, self._motion.vertices
+        work, mesh, start = self._work, self._mesh, self._in
         self._remaining.fill_(substeps)
         inputs = [self._has_constraints, self._number, substeps, work.status]
         work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
-        wp.copy(self._substep.vertices.x0, motion.x0)
+        wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
         if poses is not None:
             wp.copy(poses, self._start.body_q)
@@ -258,7 +251,7 @@ class Substeps:
         if work.max_penetrations:
             work.reserve(work.max_penetrations)
             detect_penetrations(work, ahead=True)
-        work.launch_over_constraints(kernels.reset_constraints, [work.step, work.status, self._detected])
+        work.launch_over_constraints(kernels.reset_constraints, work.status, self._detected)
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
         velocities.project(work, substep_dt)
         start.assign(self._start)
