@@ -200,8 +200,7 @@ class StepAdjoint:
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         self._restore_velocities()
-        inputs = [self._restored, self._velocities]
-        self._launch_adjoint(kernels.initialize_multipliers, self._constraints, inputs)
+        self._launch_adjoint(kernels.initialize_multipliers, self._constraints, [self._restored, self._velocities])
         self._of_constraints.previous_multiplier.zero_()
 
     def _through_iteration(self):

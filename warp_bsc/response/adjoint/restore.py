@@ -94,10 +94,7 @@ class Gradients:
 
 @wp.struct
 class StateGradients:
-    """Gradients with respect to the states of a step: first its results, then what the inner solver predicted.
-
-    Those of the start are added to.
-    """
+    """Gradients with respect to results of a step, then to what was predicted; those of the start are added to."""
 
     start_q: wp.array[wp.vec3]
     particle_q: wp.array[wp.vec3]
@@ -146,10 +143,7 @@ def is_movable(motion: Motion, body: int) -> bool:
 
 @wp.kernel
 def begin_gradients(restored: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
-    """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
-
-    Threads are over vertices and bodies.
-    """
+    """Initializes gradients by those of results; where an undetected step froze everything, only those of starts."""
     motion, undetected, vertex = restored.step.motion, restored.status.results.undetected[0] == 1, wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
@@ -236,10 +230,7 @@ def restore_multipliers(restored: RestoredStep, swept: Projection):
 
 @wp.kernel
 def restore_positions(restored: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
-    """Restores positions and poses as they were before a sweep, and adds up the gradients of positions.
-
-    Threads are over vertices and bodies. Writes the sums of the changes of poses to ``sums``.
-    """
+    """Restores positions, poses and ``sums`` of their changes before a sweep, and adds up gradients of positions."""
     vertex = wp.tid()
     step = restored.step
     body = vertex - step.motion.x0.shape[0]
