@@ -29,6 +29,7 @@ bodies that are left to the inner solver, see :class:`.contacts.rules.ContactCla
 
 import warp as wp
 
+from ..kernels.pipeline.queues import has_overflowed
 from .state.structs import Step
 
 wp.set_module_options({"enable_backward": False})
@@ -216,15 +217,6 @@ def count_contact(status: SolveStatus, world: int):
     """Counts a contact that a detection found."""
     wp.atomic_add(status.detection.hits, 0, 1)
     status.contact_iteration[world] = status.loop.iteration[0]
-
-
-@wp.func
-def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
-    """Returns whether a queue of the detector was too small for a detection."""
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        if counts[i] > capacities[i]:
-            return True
-    return False
 
 
 @wp.kernel

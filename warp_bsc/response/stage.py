@@ -20,7 +20,7 @@ from .write_back import count_step
 
 
 class CollisionStage(CouplingHooks):
-    """A stage behind another solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are."""
+    """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
     mesh: ModelMesh
     report: SolverReport

@@ -4,10 +4,10 @@ import warp as wp
 
 from ...detection.settings import Count
 from ...kernels.closest import contact_weights
-from ...kernels.pipeline.queues import is_filled
+from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
+from ..schedule import SolveStatus, count_contact, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of

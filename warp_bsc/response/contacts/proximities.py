@@ -5,8 +5,9 @@ import warp as wp
 
 from ...detection.launch import retry_until_fits
 from ...kernels.closest import weights_across
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..schedule import SolveStatus, has_overflowed, is_projecting
+from ..schedule import SolveStatus, is_projecting
 from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace

@@ -29,6 +29,7 @@ from ..state.structs import (
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
+from ..tuning import SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -92,7 +93,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, first_contact.share_before(first_contact.contact_time(packed)))
+        share = wp.min(share, SHARE_OF_PATH * first_contact.contact_time(packed))
     if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
