@@ -37,7 +37,8 @@ def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.i
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    if rules.is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+    movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
+    if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
         if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
 

@@ -14,7 +14,7 @@ from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
 from . import constraints
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
-from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
+from .rules import ContactClass, are_occluded, are_on_body, crossed_at_start, owner_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -79,7 +79,7 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
-    if not is_movable(motion, corners) or not is_projecting(status, world):
+    if owner_of(motion, corners) != ContactClass.OURS or not is_projecting(status, world):
         return
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
