@@ -3,7 +3,7 @@
 import warp as wp
 
 from .report import StepTotals
-from .schedule import SolveStatus
+from .schedule import Loop, Result, SolveStatus
 from .state.record import RecordCounts
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, MovedBodies
 
@@ -25,17 +25,17 @@ def write_back(
     particle = wp.tid()
     if particle >= particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
         if outcome[particle] & NOT_FINITE != 0:
-            status.results.certified[0] = 0
+            status.results[Result.CERTIFIED] = 0
         return
     if outcome[particle] != 0:
         particle_q[particle] = x1[particle]
         particle_qd[particle] = velocity[particle]
     if outcome[particle] & TRUNCATED != 0:
-        status.results.truncated[0] = 1
+        status.results[Result.TRUNCATED] = 1
     if outcome[particle] & FROZEN != 0:
-        status.results.frozen[0] = 1
+        status.results[Result.FROZEN] = 1
     if outcome[particle] & NOT_FINITE != 0:
-        wp.atomic_add(status.results.not_finite, 0, 1)
+        wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
 
 
 @wp.kernel
@@ -61,9 +61,9 @@ def write_back_bodies(
     if body_q_prev:
         body_q_prev[body] = bodies.pose[body]
     if outcome & TRUNCATED != 0:
-        status.results.truncated[0] = 1
+        status.results[Result.TRUNCATED] = 1
     if outcome & FROZEN != 0:
-        status.results.frozen[0] = 1
+        status.results[Result.FROZEN] = 1
 
 
 @wp.kernel
@@ -80,31 +80,30 @@ def finish_inspection(
     """
     vertex = wp.tid()
     if vertex == 0:
-        status.results.first_hits[0] = status.results.remaining[0]
-        status.results.iterations[0] = 0
+        status.results[Result.FIRST_HITS] = status.results[Result.REMAINING]
+        status.results[Result.ITERATIONS] = 0
     if outcome[vertex] & NOT_FINITE != 0:
-        status.results.certified[0] = 0
+        status.results[Result.CERTIFIED] = 0
         if vertex < particle_count:
-            wp.atomic_add(status.results.not_finite, 0, 1)
+            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
 
 
 @wp.kernel
 def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals):
     """Adds a step to the totals."""
     # a certified motion of elements that did not cross makes no crossings
-    unchanged = (
-        status.results.certified[0] == 1 and status.results.crossings[0] == 0 and status.results.excluded[0] == 0
-    )
-    status.loop.recount[0] = wp.where(unchanged, 0, 1)
+    results = status.results
+    unchanged = results[Result.CERTIFIED] == 1 and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
+    status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
     totals.steps[0] += wp.int64(1)
     totals.substepped_steps[0] += wp.int64(wp.min(substeps[0], 1))
-    totals.uncertified_steps[0] += wp.int64(1 - status.results.certified[0])
-    totals.undetected_steps[0] += wp.int64(status.results.undetected[0])
-    totals.truncated_steps[0] += wp.int64(status.results.truncated[0])
-    totals.frozen_steps[0] += wp.int64(status.results.frozen[0])
-    totals.not_finite_steps[0] += wp.int64(wp.min(status.results.not_finite[0], 1))
-    totals.remaining[0] += wp.int64(status.results.remaining[0])
-    totals.excluded[0] += wp.int64(status.results.excluded[0])
+    totals.uncertified_steps[0] += wp.int64(1 - status.results[Result.CERTIFIED])
+    totals.undetected_steps[0] += wp.int64(status.results[Result.UNDETECTED])
+    totals.truncated_steps[0] += wp.int64(status.results[Result.TRUNCATED])
+    totals.frozen_steps[0] += wp.int64(status.results[Result.FROZEN])
+    totals.not_finite_steps[0] += wp.int64(wp.min(status.results[Result.NOT_FINITE], 1))
+    totals.remaining[0] += wp.int64(status.results[Result.REMAINING])
+    totals.excluded[0] += wp.int64(status.results[Result.EXCLUDED])
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ are integers.
 
 import warp as wp
 
-from ..schedule import SWEEPS_PER_BATCH, LoopControl, views_of
+from ..schedule import SWEEPS_PER_BATCH, Loop, Result, views_of
 from ..state.record import OFFSETS, PER_ENTRY, PER_TRUNCATION, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, MovedBodies, allocate
 from ..state.workspace import Workspace
@@ -60,8 +60,8 @@ class RecordedStep:
         else:
             counts = constraints.count, record.counts.sweeps, record.counts.entries, record.counts.truncations
             count, sweeps, entries, truncations = (int(array.numpy()[0]) for array in counts)
-        self.undetected = wp.clone(work.status.results.undetected)
-        self.iteration = wp.clone(work.status.loop.iteration)
+        self.undetected = wp.clone(work.results[Result.UNDETECTED])
+        self.iteration = wp.clone(work.loop[Loop.ITERATION])
         self.planes = copied(motion.planes, ("start", "end", "friction"))
         self.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
@@ -129,8 +129,7 @@ class StepAdjoint:
         self._times.grad = wp.zeros_like(self._times)
         self._paths = allocate(restore.Paths, self._truncations, device)
         self._of_paths = attach_gradients(self._paths, restore.Paths.vars)
-        status = copied(work.status, ())
-        status.loop = allocate(LoopControl, 1, device)
+        status = copied(work.status, ("loop",))
         self._step = step = restored.step
         step.motion, step.vertices, step.constraints = motion, moved, constraints
         step.separation, step.restitution = work.step.separation, work.step.restitution
@@ -174,7 +173,7 @@ class StepAdjoint:
         for name in restore.ModelGradients.vars:
             array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
-        wp.copy(restored.status.loop.iteration, recorded.iteration)
+        wp.copy(restored.status.loop, recorded.iteration, dest_offset=int(Loop.ITERATION))
         self._launch(restore.begin_gradients, both, motion, recorded.undetected, of_states, gradients, of_motion)
         self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)

@@ -7,7 +7,7 @@ import enum
 
 import warp as wp
 
-from ..schedule import SolveStatus
+from ..schedule import Loop, SolveStatus
 from ..solve.bodies import change_body_velocity, move_body
 from ..solve.positions import move_vertex
 from ..solve.sweeps import add_delta, count_active
@@ -192,8 +192,8 @@ def move_cursor(restored: RestoredStep, move: int, complete: wp.array[int]):
         first = 0
         last = -1
     elif move == Move.END:
-        iteration = wp.min(status.loop.iteration[0], status.max_iterations + status.max_truncations + 1)
-        status.loop.iteration[0] = iteration
+        iteration = wp.min(status.loop[Loop.ITERATION], status.max_iterations + status.max_truncations + 1)
+        status.loop[Loop.ITERATION] = iteration
         cursor.more_iterations[0] = 1
         first = record.sweep_offsets[iteration + 1]
         last = record.counts.sweeps[0] - 1
@@ -202,7 +202,7 @@ def move_cursor(restored: RestoredStep, move: int, complete: wp.array[int]):
         last = record.sweep_offsets[iteration + 1] - 1
     else:
         iteration -= 1
-        status.loop.iteration[0] = wp.max(iteration, 0)
+        status.loop[Loop.ITERATION] = wp.max(iteration, 0)
         cursor.more_iterations[0] = wp.where(iteration >= 0, 1, 0)
     cursor.iteration[0] = iteration
     cursor.first_sweep[0] = first

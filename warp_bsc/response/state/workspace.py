@@ -8,7 +8,7 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import MAX_ITERATIONS, SolveStatus, allocate_status, clear_status
+from ..schedule import MAX_ITERATIONS, Loop, SolveStatus, allocate_status, clear_status, elements_of
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
@@ -48,7 +48,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         return
     for axis in range(3):
         if motion.x0[i][axis] != vertices.x1[i][axis]:  # moved between steps
-            status.loop.recount[0] = 1
+            status.loop[Loop.RECOUNT] = 1
     vertices.x1[i] = motion.x1[i]
     vertices.velocity[i] = motion.velocity[i]
     for axis in range(3):
@@ -71,6 +71,8 @@ class Workspace:
         step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
         status: The solve status.
+        loop: The elements of its array of that name, by :class:`.schedule.Loop`, as conditions on the device read them.
+        results: The same by :class:`.schedule.Result`.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
@@ -118,6 +120,7 @@ class Workspace:
         self.dividing = DividingPlanes() if differentiable else self._dividing_planes
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status = allocate_status(self.worlds, device, **limits)
+        self.loop, self.results = elements_of(self.status.loop), elements_of(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
