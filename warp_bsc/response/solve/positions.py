@@ -106,7 +106,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    sweeps.repeat(work, lambda: _activate(work, tolerance), project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -116,7 +116,7 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    sweeps.sweep(work, 1, lambda: _activate(work, 1.0), project_positions, _update)
+    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
 def _activate(work, tolerance):

@@ -5,18 +5,15 @@ momentum, because a contact changes its two sides oppositely and equally. Moment
 et al. 2015) carries it through a stack in few sweeps.
 """
 
-from collections.abc import Callable
-
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot
 from ..contacts.constraints import gap, moves_body
-from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus, start_sweeps
+from ..schedule import MAX_SWEEPS, Loop, SolveStatus
 from ..state.fixed_sum import add_to_sum
 from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
-from ..state.workspace import Workspace
 from ..tuning import CREEP, RELAXATION, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
@@ -219,22 +216,3 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
     if active and last:
         step.vertices.active[vertex] = 0
     return active
-
-
-def sweep(work: Workspace, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
-    """Sweeps a number of times over one active set, which ``activate`` fills.
-
-    The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
-    """
-    work.reserve_entries(number)
-    activate()
-    for i in range(number):
-        work.launch_over_active_set(project, work.status, work.record)
-        update(work, i == number - 1)
-
-
-def repeat(work: Workspace, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
-    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
-    work.launch(start_sweeps, 1, [work.status])
-    batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
-    wp.capture_while(work.loop[Loop.MORE_SWEEPS], sweep, work=work, **batch)

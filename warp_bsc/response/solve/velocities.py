@@ -106,7 +106,7 @@ def project(work: Workspace, dt: float) -> None:
     work.launch_over_bodies(move_to_end)
     work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
-    sweeps.repeat(work, lambda: _activate(work, dt), project_velocities, _update)
+    work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 

@@ -1,6 +1,6 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -8,7 +8,16 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import MAX_ITERATIONS, Loop, SolveStatus, allocate_status, clear_status, elements_of
+from ..schedule import (
+    MAX_ITERATIONS,
+    SWEEPS_PER_BATCH,
+    Loop,
+    SolveStatus,
+    allocate_status,
+    clear_status,
+    elements_of,
+    start_sweeps,
+)
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
@@ -254,3 +263,20 @@ class Workspace:
         """Launches a kernel over the vertices of shapes, if bodies can be moved."""
         if self.body_count:
             self.launch(kernel, self.shape_vertex_count, [self.step, *inputs])
+
+    def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
+
+        The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
+        """
+        self.reserve_entries(number)
+        activate()
+        for i in range(number):
+            self.launch_over_active_set(project, self.status, self.record)
+            update(self, i == number - 1)
+
+    def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
+        self.launch(start_sweeps, 1, [self.status])
+        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+        wp.capture_while(self.loop[Loop.MORE_SWEEPS], self.sweep, **batch)
