@@ -10,6 +10,7 @@ from sheets import crumpled
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.response.schedule import Result
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
 from warp_bsc.response.step import inspect
@@ -94,7 +95,7 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
         keys = work.vertices.first_contact.numpy()
         times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
         numbers = [
-            int(getattr(work.status.results, name).numpy()[0])
+            int(work.results[Result[name.upper()]].numpy()[0])
             for name in ("remaining", "first_hits", "excluded", "undetected", "certified")
         ]
         found.append((times, numbers, work.dividing.count.numpy()[0], work.vertices.changed.numpy()))

@@ -11,7 +11,7 @@ from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
-from .schedule import MAX_ITERATIONS
+from .schedule import MAX_ITERATIONS, Loop
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.workspace import Workspace
@@ -20,7 +20,7 @@ from .write_back import count_step
 
 
 class CollisionStage(CouplingHooks):
-    """A stage behind a solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are."""
+    """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
     mesh: ModelMesh
     report: SolverReport
@@ -112,7 +112,7 @@ class CollisionStage(CouplingHooks):
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
-        self._work.status.loop.recount.fill_(1)
+        self._work.loop[Loop.RECOUNT].fill_(1)
 
     @contextlib.contextmanager
     def _timed(self):

@@ -12,6 +12,7 @@ minimum distances, a contact is a pair that comes nearer than it may.
 import warp as wp
 
 from .contacts import detect, proximities
+from .schedule import Loop
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
@@ -47,12 +48,12 @@ def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None
 
 def resolve_contacts(work: Workspace, dt: float) -> None:
     """Resolves the contacts that :func:`find_contacts` found, as the second half of :func:`resolve`."""
-    wp.capture_if(work.status.loop.unfinished, _resolve_contacts, work=work, dt=dt)
+    wp.capture_if(work.loop[Loop.UNFINISHED], _resolve_contacts, work=work, dt=dt)
 
 
 def _resolve_contacts(work, dt):
     add_proximities(work)
-    wp.capture_while(work.status.loop.active, _iterate, work=work, dt=dt)
+    wp.capture_while(work.loop[Loop.ACTIVE], _iterate, work=work, dt=dt)
     work.record_offsets(after=1)
     wp.capture_if(work.constraints.count, velocities.project, work=work, dt=dt)
     division.freeze_if_undetected(work)
@@ -68,13 +69,14 @@ def _iterate(work, dt):
 
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
-    wp.capture_if(work.status.loop.active, proximities.add_proximities, work=work)
+    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
 
 
 def prepare(work: Workspace) -> None:
     """Resolves the motion to allocate buffers, which a CUDA graph cannot; clears the status."""
     resolve(work, 1.0)
-    work.status.values.zero_()
+    for values in (work.status.loop, work.status.detection, work.status.results):
+        values.zero_()
     work.vertices.outcome.zero_()
 
 

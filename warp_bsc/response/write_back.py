@@ -3,7 +3,7 @@
 import warp as wp
 
 from .report import StepTotals
-from .schedule import SolveStatus
+from .schedule import Loop, Result, SolveStatus
 from .state.motion import StateArrays
 from .state.record import RecordCounts
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
@@ -15,9 +15,9 @@ wp.set_module_options({"enable_backward": False})
 def _write_cuts(outcome: int, status: SolveStatus):
     """Writes to the status whether a path was truncated, or something was frozen."""
     if outcome & TRUNCATED != 0:
-        status.results.truncated[0] = 1
+        status.results[Result.TRUNCATED] = 1
     if outcome & FROZEN != 0:
-        status.results.frozen[0] = 1
+        status.results[Result.FROZEN] = 1
 
 
 @wp.kernel
@@ -39,13 +39,13 @@ def write_back(vertices: Vertices, end: StateArrays, body_q_prev: wp.array[wp.tr
     outcome = vertices.outcome[i]
     if i >= end.particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
         if outcome & NOT_FINITE != 0:
-            status.results.certified[0] = 0
+            status.results[Result.CERTIFIED] = 0
         return
     if outcome != 0:
         end.particle_q[i] = vertices.x1[i]
         end.particle_qd[i] = vertices.velocity[i]
     if outcome & NOT_FINITE != 0:
-        wp.atomic_add(status.results.not_finite, 0, 1)
+        wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
     _write_cuts(outcome, status)
 
 
@@ -57,12 +57,12 @@ def finish_inspection(outcome: wp.array[int], particle_count: int, status: Solve
     """
     vertex = wp.tid()
     if vertex == 0:
-        status.results.first_hits[0] = status.results.remaining[0]
-        status.results.iterations[0] = 0
+        status.results[Result.FIRST_HITS] = status.results[Result.REMAINING]
+        status.results[Result.ITERATIONS] = 0
     if outcome[vertex] & NOT_FINITE != 0:
-        status.results.certified[0] = 0
+        status.results[Result.CERTIFIED] = 0
         if vertex < particle_count:
-            wp.atomic_add(status.results.not_finite, 0, 1)
+            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
 
 
 @wp.kernel
@@ -70,17 +70,17 @@ def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals)
     """Adds a step to the totals."""
     results = status.results
     # a certified motion of elements that did not cross makes no crossings
-    unchanged = results.certified[0] == 1 and results.crossings[0] == 0 and results.excluded[0] == 0
-    status.loop.recount[0] = wp.where(unchanged, 0, 1)
+    unchanged = results[Result.CERTIFIED] == 1 and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
+    status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
     totals.steps[0] += wp.int64(1)
     totals.substepped_steps[0] += wp.int64(wp.min(substeps[0], 1))
-    totals.uncertified_steps[0] += wp.int64(1 - results.certified[0])
-    totals.undetected_steps[0] += wp.int64(results.undetected[0])
-    totals.truncated_steps[0] += wp.int64(results.truncated[0])
-    totals.frozen_steps[0] += wp.int64(results.frozen[0])
-    totals.not_finite_steps[0] += wp.int64(wp.min(results.not_finite[0], 1))
-    totals.remaining[0] += wp.int64(results.remaining[0])
-    totals.excluded[0] += wp.int64(results.excluded[0])
+    totals.uncertified_steps[0] += wp.int64(1 - results[Result.CERTIFIED])
+    totals.undetected_steps[0] += wp.int64(results[Result.UNDETECTED])
+    totals.truncated_steps[0] += wp.int64(results[Result.TRUNCATED])
+    totals.frozen_steps[0] += wp.int64(results[Result.FROZEN])
+    totals.not_finite_steps[0] += wp.int64(wp.min(results[Result.NOT_FINITE], 1))
+    totals.remaining[0] += wp.int64(results[Result.REMAINING])
+    totals.excluded[0] += wp.int64(results[Result.EXCLUDED])
 
 
 @wp.kernel

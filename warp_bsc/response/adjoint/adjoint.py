@@ -38,12 +38,10 @@ class RecordedStep:
 
     def __init__(self, work: Workspace, dt: float):
         """Copies the step that was recorded in a workspace, of length ``dt`` [s]."""
-        motion, constraints, record, status = work.motion, work.constraints, work.record, work.status
+        motion, constraints, record = work.motion, work.constraints, work.record
         self.mesh, self.friction, self.moves_bodies = motion.mesh, motion.friction, motion.moves_bodies
         self.restored = restored = RestoredStep()
-        restored.status, restored.dt, restored.step = status, dt, work.step
-        restored.status.loop = copied(status.loop, ["iteration"])
-        restored.status.results = copied(status.results, ["undetected"])
+        restored.status, restored.dt, restored.step = copied(work.status, ["loop", "results"]), dt, work.step
         restored.planes = copied(motion.planes, ("start", "end", "friction"))
         step = restored.step
         step.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
@@ -81,7 +79,7 @@ class StepAdjoint:
         gradients.bodies = of_bodies = allocate(restore.BodyGradients, bodies, device)
         self._restored = restored = copied(recorded.restored)
         restored.cursor = allocate(restore.Cursor, 1, device)
-        restored.status.loop = copied(restored.status.loop, ["iteration"])
+        restored.status = copied(restored.status, ["loop"])
         restored.planes, self._of_planes = with_gradients(restored.planes, ("start", "end", "friction"))
         self._step = step = restored.step
         names = "x0", "x1", "velocity", "inverse_mass", "friction"
@@ -144,7 +142,7 @@ class StepAdjoint:
         for name in restore.ModelGradients.vars:
             array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
-        wp.copy(restored.status.loop.iteration, recorded.restored.status.loop.iteration)
+        wp.copy(restored.status.loop, recorded.restored.status.loop)
         self._launch(restore.begin_gradients, both, restored, of_states, gradients, of_motion)
         self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)

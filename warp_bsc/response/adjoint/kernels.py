@@ -15,7 +15,7 @@ from ..contacts.constraints import (
     kind_of_pair,
     sagitta,
 )
-from ..contacts.first_contact import share_before, truncated_path
+from ..contacts.first_contact import truncated_path
 from ..contacts.impacts import impact_of
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
@@ -42,6 +42,7 @@ from ..state.poses import centre_of, in_world, pose_between, turned_pose, veloci
 from ..state.record import NO_CONTACT, truncation_at
 from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
+from ..tuning import SHARE_OF_PATH
 from .restore import Paths, Projection, RestoredStep, entry_of, is_movable
 
 
@@ -268,7 +269,7 @@ def truncate_paths(restored: RestoredStep, times: wp.array[wp.float64], paths: P
             paths.pose[entry] = start
             paths.twist[entry] = wp.spatial_vector()
         else:
-            share = share_before(times[entry])
+            share = SHARE_OF_PATH * times[entry]
             end = pose_between(motion.bodies, body, start, vertices.bodies.pose[body], share)
             paths.pose[entry] = end
             paths.twist[entry] = velocity_between(motion.bodies, body, start, end, restored.dt)

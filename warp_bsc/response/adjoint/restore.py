@@ -7,7 +7,7 @@ import enum
 
 import warp as wp
 
-from ..schedule import SolveStatus
+from ..schedule import Loop, Result, SolveStatus
 from ..solve.bodies import change_body_velocity, move_body
 from ..solve.positions import move_vertex
 from ..solve.sweeps import add_delta, count_active
@@ -144,7 +144,7 @@ def is_movable(motion: Motion, body: int) -> bool:
 @wp.kernel
 def begin_gradients(restored: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
     """Initializes gradients by those of results; where an undetected step froze everything, only those of starts."""
-    motion, undetected, vertex = restored.step.motion, restored.status.results.undetected[0] == 1, wp.tid()
+    motion, undetected, vertex = restored.step.motion, restored.status.results[Result.UNDETECTED] == 1, wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
         pose = of_state.body_q[body]
@@ -184,8 +184,8 @@ def move_cursor(restored: RestoredStep, move: int):
         first = 0
         last = -1
     elif move == Move.END:
-        iteration = wp.min(status.loop.iteration[0], status.max_iterations + status.max_truncations + 1)
-        status.loop.iteration[0] = iteration
+        iteration = wp.min(status.loop[Loop.ITERATION], status.max_iterations + status.max_truncations + 1)
+        status.loop[Loop.ITERATION] = iteration
         cursor.more_iterations[0] = 1
         first = record.sweep_offsets[iteration + 1]
         last = record.counts.sweeps[0] - 1
@@ -194,7 +194,7 @@ def move_cursor(restored: RestoredStep, move: int):
         last = record.sweep_offsets[iteration + 1] - 1
     else:
         iteration -= 1
-        status.loop.iteration[0] = wp.max(iteration, 0)
+        status.loop[Loop.ITERATION] = wp.max(iteration, 0)
         cursor.more_iterations[0] = wp.where(iteration >= 0, 1, 0)
     cursor.iteration[0] = iteration
     cursor.first_sweep[0] = first

@@ -4,10 +4,10 @@ import warp as wp
 
 from ...detection.settings import Count
 from ...kernels.closest import contact_weights
-from ...kernels.pipeline.queues import is_filled
+from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
+from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
@@ -37,7 +37,8 @@ def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.i
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    if rules.is_movable(step.motion, corners) or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+    movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
+    if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
         if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
 
@@ -125,19 +126,19 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         after -= kept
         if before < -error_before:
             if not ahead:
-                wp.atomic_add(status.detection.excluded, 0, 1)
+                wp.atomic_add(status.detection, int(Detection.EXCLUDED), 1)
             continue
         if ahead:
-            wp.atomic_add(status.results.first_hits, 0, wp.where(near, 0, 1))
+            wp.atomic_add(status.results, int(Result.FIRST_HITS), wp.where(near, 0, 1))
         else:
             count_contact(status, world)
             vertices.changed[vertex] = 1
-            if status.loop.iteration[0] == 0 and body_of(motion, vertex) >= 0:
+            if status.loop[Loop.ITERATION] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
         added = constraints.Constraint()
         added.normal = wp.vec3d(plane[0], plane[1], plane[2])
-        if is_dividing(status, world, status.loop.iteration[0]):
+        if is_dividing(status, world, status.loop[Loop.ITERATION]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
             if not dividing.first:
                 continue
@@ -149,7 +150,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, added.normal, offset, margin, ZERO)
             added.multiplier = TOUCH * added.normal
         else:
-            status.loop.projecting[0] = 1
+            status.loop[Loop.PROJECTING] = 1
         added.vertices = wp.vec4i(vertex)
         added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
         added.min_distance = wp.max(kept, ZERO)
@@ -190,17 +191,17 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
         bound = start
-    may_cross = status.results.crossings[0] > 0
+    may_cross = status.results[Result.CROSSINGS] > 0
     found = rules.classify_contact(step, kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.CROSSED:
-        wp.atomic_add(status.detection.excluded, 0, wp.where(near, 0, 1))
+        wp.atomic_add(status.detection, int(Detection.EXCLUDED), wp.where(near, 0, 1))
     if found == ContactClass.OF_BODIES:
-        wp.atomic_add(status.detection.of_bodies, 0, 1)
+        wp.atomic_add(status.detection, int(Detection.OF_BODIES), 1)
         mark_changed(vertices, corners)
     if found != ContactClass.OURS:
         return
     world = motion.world[corners[0]]
-    iteration = status.loop.iteration[0]
+    iteration = status.loop[Loop.ITERATION]
     added.vertices = corners
     added.pace = constraints.pace_of(motion, corners, kind)
     added.weights = contact_weights(kind, contacts.coordinates[i])
@@ -225,7 +226,7 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         added.multiplier = TOUCH * added.normal
     else:
         if not near:
-            status.loop.projecting[0] = 1
+            status.loop[Loop.PROJECTING] = 1
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
             if rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time):
@@ -237,8 +238,8 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
     target += constraints.sagitta(step, corners)
     target += added.min_distance
     if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
-        status.detection.too_near[0] = 1
-        status.loop.projecting[0] = 1
+        status.detection[Detection.TOO_NEAR] = 1
+        status.loop[Loop.PROJECTING] = 1
         status.contact_iteration[world] = iteration
     added.separation = target
     added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])

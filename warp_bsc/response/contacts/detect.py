@@ -5,7 +5,7 @@ import warp as wp
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ...detection.settings import Count
-from ..schedule import decide
+from ..schedule import Loop, Result, decide
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
 from .impacts import count_grazing
@@ -15,11 +15,11 @@ from .search import find_contacts_without_queues
 
 def detect_crossings(work: Workspace) -> None:
     """Counts the edges that cross faces at the start of the step, if they may have changed since the last."""
-    wp.capture_if(work.status.loop.recount, _count_crossings, work=work)
+    wp.capture_if(work.loop[Loop.RECOUNT], _count_crossings, work=work)
 
 
 def _count_crossings(work):
-    candidates, crossings = work.crossing_candidates, work.status.results.crossings
+    candidates, crossings = work.crossing_candidates, work.results[Result.CROSSINGS]
     crossings.zero_()
     retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
     inputs = [work.step, candidates.pairs, candidates.counts, crossings]
@@ -58,7 +58,7 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
         work.launch_over(count_grazing, counted(queues[:2]), [work.step, *queues[:2], work.record])
     _decide(work, overflow)
     if can_search:
-        wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
+        wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)
 
 
 def _search(work, overflow):

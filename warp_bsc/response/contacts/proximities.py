@@ -5,15 +5,16 @@ import warp as wp
 
 from ...detection.launch import retry_until_fits
 from ...kernels.closest import weights_across
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..schedule import SolveStatus, has_overflowed, is_projecting
+from ..schedule import Result, SolveStatus, is_projecting
 from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
 from . import constraints
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
-from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
+from .rules import ContactClass, are_occluded, are_on_body, crossed_at_start, owner_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -78,11 +79,11 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
-    if not is_movable(motion, corners) or not is_projecting(status, world):
+    if owner_of(motion, corners) != ContactClass.OURS or not is_projecting(status, world):
         return
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
-    if status.results.crossings[0] > 0:
+    if status.results[Result.CROSSINGS] > 0:
         if crossed_at_start(step, kind, candidates.pairs[i]):
             return
     elif nearest and _is_behind(corners, kind, normal, distance, nearest):

@@ -41,19 +41,6 @@ def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
-def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether the response can move one of two elements; of two bodies, only if it keeps them apart."""
-    for j in range(4):
-        if motion.inverse_mass[corners[j]] > 0.0:
-            return True
-    if not are_on_body(motion, corners):
-        return False
-    if wp.min(corners[0], corners[3]) < motion.bodies.particle_count:  # a particle that is held
-        return True
-    return motion.bodies.responds == 1 and bodies_meet(motion, corners)
-
-
-@wp.func
 def collides(bodies: Bodies, shape: int, other: int) -> bool:
     """Returns whether two shapes are to collide: by their flags, their groups, and the pairs that are filtered out.
 
@@ -70,18 +57,6 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
     key = wp.int64(wp.min(shape, other)) * shapes + wp.int64(wp.max(shape, other))
     place = wp.lower_bound(bodies.filtered, key)
     return place == bodies.filtered.shape[0] or bodies.filtered[place] != key
-
-
-@wp.func
-def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether two elements of shapes are of two that are to collide, one on a body that can be moved."""
-    particles = motion.bodies.particle_count
-    if wp.min(corners[0], corners[3]) < particles or not are_on_body(motion, corners):
-        return False
-    if body_of(motion, corners[0]) == body_of(motion, corners[3]):
-        return False
-    shapes = motion.bodies.shape
-    return collides(motion.bodies, shapes[corners[0] - particles], shapes[corners[3] - particles])
 
 
 @wp.func
@@ -126,12 +101,24 @@ def crossed_at_start(step: Step, kind: int, pair: wp.vec2i) -> bool:
 
 @wp.func
 def owner_of(motion: Motion, corners: wp.vec4i) -> int:
-    """Returns the ContactClass of a contact as far as it follows from its vertices: OURS, OF_BODIES or NONE."""
-    if is_movable(motion, corners):
+    """Returns the ContactClass of two elements as far as it follows from their vertices: OURS, OF_BODIES or NONE.
+
+    Those of two bodies, or of a body and a static shape, are of bodies unless the response keeps these apart.
+    """
+    for j in range(4):
+        if motion.inverse_mass[corners[j]] > 0.0:
+            return ContactClass.OURS
+    if not are_on_body(motion, corners):
+        return ContactClass.NONE
+    a = corners[0] - motion.bodies.particle_count
+    b = corners[3] - motion.bodies.particle_count
+    if wp.min(a, b) < 0:  # a particle that is held
         return ContactClass.OURS
-    if bodies_meet(motion, corners):
-        return ContactClass.OF_BODIES
-    return ContactClass.NONE
+    if body_of(motion, corners[0]) == body_of(motion, corners[3]):
+        return ContactClass.NONE
+    if not collides(motion.bodies, motion.bodies.shape[a], motion.bodies.shape[b]):
+        return ContactClass.NONE
+    return wp.where(motion.bodies.responds == 1, int(ContactClass.OURS), int(ContactClass.OF_BODIES))
 
 
 @wp.func

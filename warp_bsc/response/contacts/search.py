@@ -17,7 +17,7 @@ from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
-from ..schedule import SolveStatus, count_contact
+from ..schedule import Detection, SolveStatus, count_contact
 from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
@@ -55,9 +55,9 @@ def _resolve(
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
-        wp.atomic_add(arguments.status.detection.excluded, 0, 1)
+        wp.atomic_add(arguments.status.detection, int(Detection.EXCLUDED), 1)
     if found == ContactClass.OF_BODIES:
-        wp.atomic_add(arguments.status.detection.of_bodies, 0, 1)
+        wp.atomic_add(arguments.status.detection, int(Detection.OF_BODIES), 1)
         mark_changed(arguments.step.vertices, corners)
     if found != ContactClass.OURS:
         return

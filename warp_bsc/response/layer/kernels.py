@@ -6,12 +6,12 @@ from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
 from ...kernels.closest import closest_weights
 from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ..contacts.closest import closest_vector
 from ..contacts.constraints import contact_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
-from ..schedule import has_overflowed
 from ..state.fixed_sum import add_to_sum, from_units, sum_of, to_units, with_delta
 from ..state.motion import StateArrays
 from ..state.planes import MovingPlanes, signed_distance

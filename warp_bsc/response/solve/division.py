@@ -12,7 +12,7 @@ from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.queue import PairQueue, queues_of, vertices_of
-from ..schedule import SolveStatus, divides_all_proximities, divides_proximities, is_freezing
+from ..schedule import Loop, Result, SolveStatus, divides_all_proximities, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.structs import (
@@ -29,6 +29,7 @@ from ..state.structs import (
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
+from ..tuning import SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -92,7 +93,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, first_contact.share_before(first_contact.contact_time(packed)))
+        share = wp.min(share, SHARE_OF_PATH * first_contact.contact_time(packed))
     if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
@@ -121,7 +122,7 @@ def cut_bodies(step: Step, status: SolveStatus, dt: wp.float64):
         return
     if share == FREEZES:
         _freeze_body(step, body)
-        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     start = bodies.start[body]
     end = pose_between(bodies, body, start, moved.pose[body], wp.float64(share) / TIME_UNITS)
@@ -238,7 +239,7 @@ def truncate_vertices(
     vertices.changed[vertex] = 1
     if not cuts:
         _freeze_vertex(step, vertex)
-        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = motion.x0[vertex]
     end = vertices.x1[vertex]
@@ -280,7 +281,7 @@ def record_body_truncations(step: Step, vertex_face: PairQueue, edge_edge: PairQ
 def freeze_undetected(step: Step, particles: int, bodies: int, status: SolveStatus):
     """Freezes all particles and bodies if the last detection was incomplete; thread i has one of each."""
     i = wp.tid()
-    undetected = status.results.undetected[0] == 1
+    undetected = status.results[Result.UNDETECTED] == 1
     if i < particles and undetected and step.motion.inverse_mass[i] > 0.0:
         _freeze_vertex(step, i)
     if i < bodies:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..contacts.constraints import gap, min_distance_of, moves_body
-from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
+from ..schedule import Loop, SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import PROJECTED, ContactKind, Pace, Step
@@ -31,12 +31,12 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
     corners = constraints.vertices[i]
     world = motion.world[corners[0]]
     resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
-    if resting_edges and is_dividing(status, world, status.loop.iteration[0]):
+    if resting_edges and is_dividing(status, world, status.loop[Loop.ITERATION]):
         kept = min_distance_of(step, i)
         start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
         if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
             return
-    past = status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
+    past = status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
     normal = constraints.normal[i]
@@ -106,7 +106,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    sweeps.repeat(work, lambda: _activate(work, tolerance), project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -116,7 +116,7 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    sweeps.sweep(work, 1, lambda: _activate(work, 1.0), project_positions, _update)
+    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
 def _activate(work, tolerance):

@@ -5,18 +5,15 @@ momentum, because a contact changes its two sides oppositely and equally. Moment
 et al. 2015) carries it through a stack in few sweeps.
 """
 
-from collections.abc import Callable
-
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot
 from ..contacts.constraints import gap, moves_body
-from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, SolveStatus, start_sweeps
+from ..schedule import MAX_SWEEPS, Loop, SolveStatus
 from ..state.fixed_sum import add_to_sum
 from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
-from ..state.workspace import Workspace
 from ..tuning import CREEP, RELAXATION, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
@@ -154,7 +151,7 @@ def max_sweeps(step: Step, status: SolveStatus, i: int, slow: int) -> int:
 @wp.func
 def momentum_of(step: Step, status: SolveStatus, i: int, slow: int) -> wp.float64:
     """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
-    sweep = status.loop.sweep[0]
+    sweep = status.loop[Loop.SWEEP]
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
     if last != sweep - 1 or sweep == max_sweeps(step, status, i, slow) - 1:
@@ -207,10 +204,10 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
     The ``last`` sweep over an active set empties it.
     """
     if vertex == 0:
-        sweep = status.loop.sweep[0] + 1
+        sweep = status.loop[Loop.SWEEP] + 1
         count = int(step.constraints.active_count[0])
-        status.loop.sweep[0] = sweep
-        status.loop.more_sweeps[0] = wp.where(count > 0 and sweep < MAX_SWEEPS, 1, 0)
+        status.loop[Loop.SWEEP] = sweep
+        status.loop[Loop.MORE_SWEEPS] = wp.where(count > 0 and sweep < MAX_SWEEPS, 1, 0)
         if is_recording(record):
             end_sweep(record, count)
         if last:
@@ -219,22 +216,3 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
     if active and last:
         step.vertices.active[vertex] = 0
     return active
-
-
-def sweep(work: Workspace, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
-    """Sweeps a number of times over one active set, which ``activate`` fills.
-
-    The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
-    """
-    work.reserve_entries(number)
-    activate()
-    for i in range(number):
-        work.launch_over_active_set(project, work.status, work.record)
-        update(work, i == number - 1)
-
-
-def repeat(work: Workspace, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
-    """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
-    work.launch(start_sweeps, 1, [work.status])
-    batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
-    wp.capture_while(work.status.loop.more_sweeps, sweep, work=work, **batch)

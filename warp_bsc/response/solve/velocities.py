@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..schedule import SolveStatus
+from ..schedule import Loop, SolveStatus
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
@@ -46,7 +46,7 @@ def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp
     constraints = step.constraints
     if i >= constraints.count[0]:
         return
-    if status.loop.sweep[0] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
+    if status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == ZERO:
@@ -106,7 +106,7 @@ def project(work: Workspace, dt: float) -> None:
     work.launch_over_bodies(move_to_end)
     work.launch_over_constraints(initialize_velocity_multipliers, dt)
     _update(work, last=True)
-    sweeps.repeat(work, lambda: _activate(work, dt), project_velocities, _update)
+    work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 

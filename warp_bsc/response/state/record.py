@@ -4,7 +4,7 @@ from typing import Literal
 
 import warp as wp
 
-from ..schedule import SolveStatus, views_of
+from ..schedule import Loop, SolveStatus, views_of
 from .structs import Constraints, Step, add_zeros
 
 wp.set_module_options({"enable_backward": False})
@@ -145,7 +145,7 @@ class StepRecorder:
 def record_offsets(step: Step, status: SolveStatus, record: StepRecord, after: int):
     """Records the offsets of an iteration, or those after the last; iterations that freeze share one offset."""
     last = status.max_iterations + status.max_truncations + 1
-    iteration = status.loop.iteration[0]
+    iteration = status.loop[Loop.ITERATION]
     if after == 1 or iteration <= last:
         i = wp.min(iteration, last) + after
         record.sweep_offsets[i] = record.counts.sweeps[0]

@@ -1,6 +1,6 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -8,7 +8,16 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import MAX_ITERATIONS, SolveStatus, allocate_status, clear_status
+from ..schedule import (
+    MAX_ITERATIONS,
+    SWEEPS_PER_BATCH,
+    Loop,
+    SolveStatus,
+    allocate_status,
+    clear_status,
+    elements_of,
+    start_sweeps,
+)
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
@@ -47,7 +56,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         return
     for axis in range(3):
         if motion.x0[i][axis] != vertices.x1[i][axis]:  # moved between steps
-            status.loop.recount[0] = 1
+            status.loop[Loop.RECOUNT] = 1
     vertices.x1[i] = motion.x1[i]
     vertices.velocity[i] = motion.velocity[i]
     for axis in range(3):
@@ -67,6 +76,8 @@ class Workspace:
     Attributes:
         step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
+        loop: Views of single elements of ``status.loop``, by :class:`.schedule.Loop`, for conditions on the device.
+        results: The same of ``status.results``, by :class:`.schedule.Result`.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
@@ -112,6 +123,7 @@ class Workspace:
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status = allocate_status(self.worlds, device, **limits)
+        self.loop, self.results = elements_of(self.status.loop), elements_of(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
@@ -249,5 +261,21 @@ class Workspace:
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the vertices of shapes, if bodies can be moved."""
         if self.body_count:
-            count = self.mesh.vertex_count - self.particle_count
-            self.launch(kernel, count, [self.step, *inputs])
+            self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
+
+    def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
+
+        The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
+        """
+        self.reserve_entries(number)
+        activate()
+        for i in range(number):
+            self.launch_over_active_set(project, self.status, self.record)
+            update(self, i == number - 1)
+
+    def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
+        self.launch(start_sweeps, 1, [self.status])
+        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+        wp.capture_while(self.loop[Loop.MORE_SWEEPS], self.sweep, **batch)

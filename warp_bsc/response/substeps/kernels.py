@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, approach_of
-from ..schedule import SolveStatus
+from ..schedule import Loop, Result, SolveStatus
 from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Motion, Step, can_move
@@ -37,8 +37,8 @@ def keep_detection(step: Step, status: SolveStatus, detected: wp.array[int], is_
     is_fast[world] = status.is_fast[world]
     if world == 0:
         detected[0] = step.constraints.count[0]
-        detected[1] = status.results.first_hits[0]
-        status.loop.recount[0] = 0  # the start remains where crossings are counted
+        detected[1] = status.results[Result.FIRST_HITS]
+        status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
 
 
 @wp.kernel
@@ -50,7 +50,7 @@ def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: S
     """
     world = wp.tid()
     status.is_fast[world] = wp.max(status.is_fast[world], is_fast[world])
-    status.results.first_hits[0] = detected[1]
+    status.results[Result.FIRST_HITS] = detected[1]
 
 
 @wp.kernel
@@ -95,7 +95,7 @@ def start_substep(
     substep, vertices = step.motion, step.vertices
     if i == 0:
         step.constraints.count[0] = detected[0]
-        status.loop.iteration[0] = 0
+        status.loop[Loop.ITERATION] = 0
     if i < planes.start.shape[0]:
         path = planes.end[i] - planes.start[i]
         substep_planes.start[i] = planes.start[i] + wp.float64(before) * path
@@ -136,8 +136,8 @@ def reset_constraints(step: Step, status: SolveStatus, detected: wp.array[int]):
     """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
     i = wp.tid()
     if i == 0:
-        status.loop.iteration[0] = 1
-        status.loop.active[0] = 0  # positions and velocities are swept without regard to a detection
+        status.loop[Loop.ITERATION] = 1
+        status.loop[Loop.ACTIVE] = 0  # positions and velocities are swept without regard to a detection
     constraints = step.constraints
     if i >= constraints.count[0]:
         return

@@ -27,6 +27,7 @@ from newton.solvers import SolverBase
 
 from ..._private_names.of_newton import attributes_of, body_q_prev, may_allocate
 from ..contacts.detect import detect_penetrations
+from ..schedule import Loop
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.motion import ModelMotion, arrays_of
@@ -155,7 +156,7 @@ class Substeps:
                 )
             self._resolve_and_choose(dt)
         else:
-            work.launch(kernels.use_substeps, 1, [work.status.loop.unfinished, self._choices[0]], [self.substeps])
+            work.launch(kernels.use_substeps, 1, [work.loop[Loop.UNFINISHED], self._choices[0]], [self.substeps])
         step = _Step(state, control, contacts, dt, self._arrays_of_solver())
         if in_graph and self._may_allocate:
             self._take_substeps(step)
@@ -166,7 +167,7 @@ class Substeps:
     def _resolve_and_choose(self, dt):
         """Resolves the motion, chooses the substeps of each world, and if there are any, detects its contacts again."""
         work = self._work
-        wp.copy(self._unfinished, work.status.loop.unfinished)
+        wp.copy(self._unfinished, work.loop[Loop.UNFINISHED])
         self.substeps.zero_()
         resolve_contacts(work, dt)
         wp.capture_if(self._unfinished, self._choose)
