@@ -5,11 +5,14 @@ None of this is certified: culling accepts any direction, and coordinates are ro
 
 import warp as wp
 
-from .polynomials import VERTEX_FACE, Motion
+from .pipeline.pairs import firsts_of
+from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
 _FLAT = wp.constant(wp.float64(1.0e-24))
+_PARALLEL = wp.constant(wp.float64(1.0e-12))
+"""Squared sine up to which edges, or two sides of a face, count as parallel."""
 
 
 @wp.func
@@ -109,3 +112,60 @@ def contact_at(motion: Motion, time: wp.float64):
     if motion.kind == VERTEX_FACE:
         coordinates = wp.vec3d(_ONE - closest[0] - closest[1], closest[0], closest[1])
     return coordinates, wp.normalize(normal)
+
+
+@wp.func
+def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
+    """Returns the weights of four points in the vector between contact points, by kind and coordinates of a contact."""
+    if kind == EDGE_EDGE:
+        return wp.vec4d(_ONE - c[0], c[0], c[1] - _ONE, -c[1])
+    if kind == VERTEX_EDGE:
+        return wp.vec4d(_ONE, c[0] - _ONE, -c[0], _ZERO)
+    if kind == VERTEX_VERTEX:
+        return wp.vec4d(_ONE, -_ONE, _ZERO, _ZERO)
+    return wp.vec4d(_ONE, -c[0], -c[1], -c[2])
+
+
+@wp.func
+def closest_weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
+    """Returns the weights of four points in the vector between the closest points of two elements."""
+    if kind == EDGE_EDGE:
+        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.vec4d(_ONE - at[0], at[0], at[1] - _ONE, -at[1])
+    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.vec4d(_ONE, at[0] + at[1] - _ONE, -at[0], -at[1])
+
+
+@wp.func
+def weights_across(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Returns where the line across two elements meets them.
+
+    Returns:
+        The weights of the four points in the vector between the two points, the unit vector across both elements, from
+        the second to the first, and the distance along it, which is 0 unless both points are within the elements: only
+        then are they their closest points.
+    """
+    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
+    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
+    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
+    n = wp.cross(u, v)
+    nn = wp.length_sq(n)
+    s = wp.dot(wp.cross(w, v), n)
+    r = wp.dot(wp.cross(u, w), n)
+    weights = wp.vec4d()
+    if nn <= _PARALLEL * wp.length_sq(u) * wp.length_sq(v) or not (s > _ZERO and s < nn):
+        return weights, n, _ZERO
+    height = wp.dot(w, n)
+    s /= nn
+    r /= nn
+    if kind == EDGE_EDGE:
+        height = -height
+        r = -r
+        weights = wp.vec4d(_ONE - s, s, r - _ONE, -r)
+    else:
+        weights = wp.vec4d(_ONE, s + r - _ONE, -s, -r)
+    size = wp.sqrt(nn)
+    n *= wp.sign(height) / size
+    if r > _ZERO and weights[firsts_of(kind)] < _ZERO:
+        return weights, n, wp.abs(height) / size
+    return weights, n, _ZERO

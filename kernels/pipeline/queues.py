@@ -118,3 +118,12 @@ def append(pair: wp.vec2i, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64]
 def is_filled(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int) -> bool:
     """Returns whether entry i of a queue has been written."""
     return i < queue.shape[0] and wp.int64(i) < counts[count]
+
+
+@wp.func
+def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
+    """Returns whether one of the queues of a detection was too small for it."""
+    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
+        if counts[i] > capacities[i]:
+            return True
+    return False

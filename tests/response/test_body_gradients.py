@@ -225,13 +225,13 @@ def test_an_incomplete_record_gives_nan(device):
     with wp.Tape():
         scene.solver.step(*scene.states, None, None, DT)
     work = scene.solver._work
-    recorded = RecordedStep(scene.solver._motion, work.resolution, scene.solver._recorder, DT)
+    recorded = RecordedStep(work, DT)
     arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
     for complete in (1, 0):
         for array in scene.arrays.values():
             array.grad.fill_(1.0)
-        recorded.complete.fill_(complete)
-        StepAdjoint(recorded, work).backward(*(array.grad for array in arrays))
+        recorded.counts.complete.fill_(complete)
+        StepAdjoint(recorded).backward(*(array.grad for array in arrays))
         for name, array in scene.arrays.items():
             assert np.isfinite(array.grad.numpy()).all() == (complete == 1), name
 

@@ -13,7 +13,7 @@ from newton_scenes import SOLVERS, STIFF, Changed, Rollout, add_patch, add_plate
 import warp_bsc as bsc
 from warp_bsc.response.contacts.dividing_planes import add_plane
 from warp_bsc.response.solve.sides import position_on_sides
-from warp_bsc.response.state.structs import DIVIDED, DividingPlanes, allocate_dividing_planes
+from warp_bsc.response.state.structs import DIVIDED, NO_NODE, DividingPlanes, allocate
 
 
 def staged(model, iterations, inner="vbd"):
@@ -192,7 +192,9 @@ def divide(planes, x0, x1, device):
     inputs = [wp.array(normals, dtype=wp.vec3d, device=device)]
     inputs += [wp.array(values, dtype=wp.float64, device=device) for values in (offsets, margins)]
     end, cut = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=bool, device=device)
-    outputs = [allocate_dividing_planes(1, len(planes), device), end, cut]
+    lists = allocate(DividingPlanes, len(planes), device, count=1, next=4 * len(planes), first=1, kept=1, half=0)
+    lists.first.fill_(int(NO_NODE))
+    outputs = [lists, end, cut]
     wp.launch(_divide, 1, inputs=[*inputs, wp.vec3(*x0), wp.vec3(*x1)], outputs=outputs, device=device)
     return end.numpy()[0], bool(cut.numpy()[0])
 

@@ -10,6 +10,8 @@ from sheets import crumpled
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.response.schedule import Result
+from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
 from warp_bsc.response.step import inspect
 
@@ -85,16 +87,18 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     for tiny in (False, True):
         solver = stage(model, monkeypatch, tiny=tiny, max_iterations=0)  # so that first contacts are found at once
         work, motion = solver._work, solver._motion
-        motion.set_start(model.particle_q, None)
-        motion.set_end(wp.array(end, dtype=wp.vec3, device=device), model.particle_qd, None, DT)
-        results = inspect(work, motion).status.results
+        arrays = arrays_of(model)
+        motion.set_start(arrays)
+        arrays.particle_q = wp.array(end, dtype=wp.vec3, device=device)
+        motion.set_end(arrays, DT)
+        inspect(work)
         keys = work.vertices.first_contact.numpy()
         times = np.where(keys == int(NEVER), np.inf, (keys >> 32) / 2.0**30)
         numbers = [
-            int(getattr(results, name).numpy()[0])
+            int(work.results[Result[name.upper()]].numpy()[0])
             for name in ("remaining", "first_hits", "excluded", "undetected", "certified")
         ]
-        found.append((times, numbers, work._dividing_planes.count.numpy()[0], work.vertices.changed.numpy()))
+        found.append((times, numbers, work.dividing.count.numpy()[0], work.vertices.changed.numpy()))
     queued, queueless = found
     assert queued[1] == queueless[1] and queued[1][0] > 100
     assert queued[2] == queueless[2] > 0

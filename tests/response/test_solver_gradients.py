@@ -320,12 +320,12 @@ def test_an_incomplete_record_gives_nan(device):
     scene.backward()
     solver = scene.solver
     work = solver._work
-    recorded = RecordedStep(solver._motion, work.resolution, solver._recorder, DT)
+    recorded = RecordedStep(work, DT)
     arrays = [wp.zeros(scene.model.particle_count, dtype=wp.vec3, device=device) for _ in range(3)]
-    StepAdjoint(recorded, work).backward(*arrays)
+    StepAdjoint(recorded).backward(*arrays)
     assert all(np.isfinite(array.numpy()).all() for array in arrays)
-    recorded.complete.zero_()
+    recorded.counts.complete.zero_()
     for name in ("constraint", "multiplier", "previous_multiplier", "momentum"):  # nothing may be read out of bounds
-        setattr(recorded.record, name, getattr(recorded.record, name)[:1])
-    StepAdjoint(recorded, work).backward(*arrays)
+        setattr(recorded.restored.record, name, getattr(recorded.restored.record, name)[:1])
+    StepAdjoint(recorded).backward(*arrays)
     assert all(np.isnan(array.numpy()).all() for array in arrays)

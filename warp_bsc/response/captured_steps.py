@@ -59,17 +59,17 @@ class CapturedSteps:
         for x in state:
             check_instance(x, "state", (newton.State, wp.array), "a list of states and arrays")
         self._lock = Occupied("CapturedSteps")
-        self._steps, self._solver, self._device = steps, solver, solver.model.device
+        self._steps, self._device = steps, solver.model.device
         self._report = solver.report if isinstance(solver, CollisionStage) else None
         layer = solver.solver if isinstance(solver, CollisionStage) else solver
         self._layer = layer if isinstance(layer, ContactLayer) else None
-        self._state = list(state)
+        restored = [] if self._report is None and self._layer is None else list(state)
         if self._report is not None:
-            self._state.append(self._report.total_values)
+            restored.append(self._report.total_values)
         if self._layer is not None:
-            self._state.append(self._layer.skipped)
-        self._saved: list[Any] = [  # each of the type of its state
-            wp.clone(x) if isinstance(x, wp.array) else solver.model.state() for x in self._state
+            restored.append(self._layer.skipped)
+        self._saved: list[tuple[Any, Any]] = [  # each state with a copy of its type
+            (x, wp.clone(x) if isinstance(x, wp.array) else solver.model.state()) for x in restored
         ]
         self._graph = None
         self.retaken = 0
@@ -94,16 +94,13 @@ class CapturedSteps:
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
-        if self._report is None and self._layer is None:
-            wp.capture_launch(self._graph)
-            return True
-        for saved, x in zip(self._saved, self._state, strict=True):
+        for x, saved in self._saved:
             saved.assign(x)
         lost = self._count_lost()
         wp.capture_launch(self._graph)
         if self._count_lost() == lost:
             return True
-        for saved, x in zip(self._saved, self._state, strict=True):
+        for x, saved in self._saved:
             x.assign(saved)
         self.retaken += 1
         return False

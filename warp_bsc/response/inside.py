@@ -11,7 +11,7 @@ from newton import BodyFlags, ParticleFlags
 from ..detection.body_parts import connect_cells
 from ..detection.containment import ContainmentFinder
 from ..detection.mesh import CollisionMesh
-from .state.mesh import ModelMesh, sides_of
+from .state.mesh import ModelMesh, elements_of, outer_sides
 
 _ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in :func:`.state.planes.signed_distance`
 
@@ -66,7 +66,7 @@ class InsideFinder:
 
     def __init__(self, mesh: ModelMesh):
         """Takes the mesh of a model; the first search finds its solids."""
-        self._mesh = mesh
+        self._mesh, self._world = mesh, mesh.device_world.numpy()
 
     def find(self, x: np.ndarray | wp.array, planes: np.ndarray | wp.array) -> Inside:
         """Returns which particles are inside solids. Synchronizes with the device of the arrays.
@@ -126,21 +126,13 @@ class InsideFinder:
         return np.concatenate(rows)
 
     @functools.cached_property
-    def _world(self) -> np.ndarray:
-        """World of each vertex, shape [vertex_count]."""
-        return self._mesh.device_world.numpy()
-
-    @functools.cached_property
     def _solids(self) -> _Solids:
         mesh, count, world = self._mesh, self._mesh.model.particle_count, self._world
-        tetrahedra = mesh.model.tet_indices
-        tetrahedra = np.zeros((0, 4), dtype=np.int32) if tetrahedra is None else tetrahedra.numpy().reshape(-1, 4)
+        tetrahedra = elements_of(mesh.model.tet_indices, 4)
         first = connect_cells(tetrahedra, count)
         soft_body_of = np.full(count, -1)
         soft_body_of[tetrahedra] = first[tetrahedra]
-        sides = sides_of(tetrahedra)
-        _, places, numbers = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
-        soft_faces = sides[places[numbers == 1]]  # an inner side belongs to two tetrahedra
+        soft_faces = outer_sides(tetrahedra, np.empty((0, 3), dtype=np.int32))
         soft_bodies, of_soft_face = np.unique(soft_body_of[soft_faces[:, 0]], return_inverse=True)
         shape_faces = mesh.faces[mesh.faces[:, 0] >= count]
         corners = shape_faces[:, 0]

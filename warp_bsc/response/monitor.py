@@ -6,10 +6,10 @@ from newton.solvers import SolverBase
 
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
-from .integration.wrapped_solver import StateArrays
 from .options import checked_min_distance, checked_radii, default_separation, friction_of
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
+from .state.motion import ModelMotion, arrays_of
 from .step import inspect
 from .write_back import finish_inspection
 
@@ -53,21 +53,23 @@ class CollisionMonitor(CollisionStage):
         keeps_distances = min_distance > 0.0 or bool(radii.any())
         mesh = ModelMesh(self.model, strands=keeps_distances)
         if keeps_distances:
-            mesh.keep_distances(min_distance, radii, reach=0.0)
+            mesh.distances = mesh.min_distances(min_distance, radii, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
-        self._allocate(mesh, friction, separation=default_separation(mesh), restitution=nothing, responds=False)
+        motion = ModelMotion(mesh, friction)
+        self._allocate(motion, default_separation(mesh), nothing, responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
-        end = StateArrays.of(state_out)
+        end = arrays_of(state_out)
         run_on_host(lambda: self._inspect(end, dt), self.mesh.device)
 
     @one_at_a_time
     def _inspect(self, end, dt):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._timed():
-            self._set_end(end, dt)
-            resolution = inspect(self._work, self._motion)
-            inputs, outputs = [resolution.vertices.outcome, self.model.particle_count], [resolution.status]
-            self._launch(finish_inspection, self.mesh.vertex_count, inputs, outputs)
-            self._count_step(resolution)
+            self._motion.set_end(end, dt)
+            work = self._work
+            inspect(work)
+            inputs = [work.vertices.outcome, self.model.particle_count]
+            work.launch(finish_inspection, self.mesh.vertex_count, inputs, [work.status])
+            self._count_step()

@@ -33,18 +33,8 @@ Bodies = Literal["pushed", "separated", "left"]
 class StageOptions:
     """The arguments of :class:`.solver_ccd.SolverCCD`, checked, with defaults that follow from the model.
 
-    Attributes:
-        separation: Distance that contacts are moved apart [m], None for the default of the mesh.
-        friction: Coefficients of particles, shape [1] or [particle_count].
-        reads_friction: Whether each step reads the coefficients again.
-        restitution: Share of the approaching velocity that comes back, shape [1].
-        substeps: Substeps of a step that collides, "auto" or None.
-        bodies: What becomes of dynamic bodies.
-        min_distance: Distance that pairs keep [m].
-        radii: Radius of each particle [m], shape [particle_count].
-        contact_layer: Whether to put in a contact layer if the model requires gradients.
-        lift_speed_limit: Whether to lift the speed limit of VBD's self-contact.
-        max_iterations: Iterations of detect and project.
+    Coefficients are arrays; ``reads_friction`` says whether each step reads those of friction again. The default of
+    ``separation`` follows from the mesh, and is None here. ``radii`` has the radius of each particle [m].
     """
 
     separation: float | None
@@ -193,10 +183,4 @@ def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | N
     for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
         if not values[shape] >= 0.0:
             raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
-    return Friction(
-        of_particles,
-        of_shapes,
-        particle_count=model.particle_count,
-        vertex_shapes=mesh.device_shape_vertices.shape,
-        plane_shapes=mesh.device_planes.shape,
-    )
+    return Friction(mesh, of_particles, of_shapes)

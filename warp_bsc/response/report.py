@@ -8,8 +8,7 @@ import warp as wp
 
 from ..detection.intersections import find_intersections
 from .inside import Inside, InsideFinder
-from .schedule import views_of
-from .state.motion import ModelMotion
+from .schedule import Result, views_of
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
 
@@ -90,9 +89,9 @@ class SolverReport:
         speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
     """
 
-    def __init__(self, motion: ModelMotion, work: Workspace, *, responds: bool = True):
+    def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
-        self._motion, self._work, self._responds = motion, work, responds
+        self._motion, self._work, self._responds = work.motion, work, responds
         self.speed_limit_lifted = False
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
@@ -110,12 +109,12 @@ class SolverReport:
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.
         """
-        return bool(_read(self._work.status.results.certified))
+        return bool(_read(self._work.results[Result.CERTIFIED]))
 
     @property
     def hits(self) -> int:
         """Contacts of the motion that the inner solver predicted in the last step, without those excluded."""
-        return _read(self._work.status.results.first_hits)
+        return _read(self._work.results[Result.FIRST_HITS])
 
     @property
     def remaining(self) -> int:
@@ -123,7 +122,7 @@ class SolverReport:
 
         With a response, they could not be resolved, because kinematic vertices leave no space.
         """
-        return _read(self._work.status.results.remaining)
+        return _read(self._work.results[Result.REMAINING])
 
     @property
     def excluded(self) -> int:
@@ -131,7 +130,7 @@ class SolverReport:
 
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
-        return _read(self._work.status.results.excluded)
+        return _read(self._work.results[Result.EXCLUDED])
 
     @property
     def body_contacts(self) -> int:
@@ -141,7 +140,7 @@ class SolverReport:
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
         the response moves no bodies, and counts nothing that it keeps apart (``bodies="separated"``).
         """
-        return _read(self._work.status.results.body_contacts)
+        return _read(self._work.results[Result.BODY_CONTACTS])
 
     @property
     def crossings(self) -> int:
@@ -150,7 +149,7 @@ class SolverReport:
         Only pairs that floating point certifies to cross count; :attr:`intersections` lists all of them. In a CUDA
         graph the number is a lower bound if there are more candidates than its queues hold.
         """
-        return _read(self._work.status.results.crossings)
+        return _read(self._work.results[Result.CROSSINGS])
 
     @property
     def not_finite(self) -> int:
@@ -158,7 +157,7 @@ class SolverReport:
 
         They stood where they were at the start. Without a response they are left as the inner solver made them.
         """
-        return _read(self._work.status.results.not_finite)
+        return _read(self._work.results[Result.NOT_FINITE])
 
     @property
     def uncertified_vertices(self) -> np.ndarray:
@@ -206,12 +205,12 @@ class SolverReport:
         This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
         :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
         """
-        return bool(_read(self._work.status.results.undetected))
+        return bool(_read(self._work.results[Result.UNDETECTED]))
 
     @property
     def iterations(self) -> int:
         """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
-        return _read(self._work.status.results.iterations)
+        return _read(self._work.results[Result.ITERATIONS])
 
     @property
     def truncated(self) -> int:

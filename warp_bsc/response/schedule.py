@@ -1,6 +1,6 @@
 """When a world projects, divides, truncates and freezes: all limits, the predicates on them, and the solve status.
 
-What a world does after the ``n``-th detection of a step, counted from 0, which ``loop.iteration`` is during detection.
+What a world does after the ``n``-th detection of a step, counted from 0, which ``Loop.ITERATION`` is during detection.
 The first detection tells slow worlds from fast ones::
 
                      slow contacts only              a fast, pushing or body contact
@@ -27,9 +27,12 @@ plane there. They are counted, but not resolved, and a step with them may be cer
 bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`.
 """
 
+from enum import IntEnum
+
 import warp as wp
 
-from .state.structs import Constraints
+from ..kernels.pipeline.queues import has_overflowed
+from .state.structs import Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,55 +57,52 @@ _WIDEST = wp.constant(wp.float64(5.0))
 """Largest factor on the separation."""
 
 
-@wp.struct
-class LoopControl:
-    """What the conditions of the loop over iterations read; each field is an array of one element."""
+class Loop(IntEnum):
+    """What the conditions of the loop over iterations read: elements of :attr:`SolveStatus.loop`."""
 
-    active: wp.array[int]  # 1 while another iteration is needed
-    unfinished: wp.array[int]  # 1 if the first detection leaves something to do
-    iteration: wp.array[int]  # detections so far, less one; from max_iterations on, all worlds divide
-    projecting: wp.array[int]  # 1 if the last detection added constraints
-    newly_frozen: wp.array[int]  # vertices and bodies that this iteration froze
-    recount: wp.array[int]  # 1 if crossings may have changed since they were counted
-    more_sweeps: wp.array[int]  # 1 while another batch of sweeps is needed
-    sweep: wp.array[int]  # sweeps so far
-
-
-@wp.struct
-class DetectionCounts:
-    """Counters of the detection in progress; each field is an array of one element."""
-
-    hits: wp.array[int]  # contacts
-    excluded: wp.array[int]  # contacts of elements that crossed or touched at the start
-    of_bodies: wp.array[int]  # contacts between bodies, which are left to the inner solver
-    too_near: wp.array[int]  # 1 if a pair ends nearer than its separation, but not in contact
+    RECOUNT = 0  # 1 if crossings may have changed since they were counted
+    ACTIVE = 1  # 1 while another iteration is needed
+    UNFINISHED = 2  # 1 if the first detection leaves something to do
+    ITERATION = 3  # detections so far, less one; from max_iterations on, all worlds divide
+    PROJECTING = 4  # 1 if the last detection added constraints
+    NEWLY_FROZEN = 5  # vertices and bodies that this iteration froze
+    MORE_SWEEPS = 6  # 1 while another batch of sweeps is needed
+    SWEEP = 7  # sweeps so far
 
 
-@wp.struct
-class StepResults:
-    """Results of a step; each field is an array of one element."""
+class Detection(IntEnum):
+    """Counters of the detection in progress: elements of :attr:`SolveStatus.detection`."""
 
-    certified: wp.array[int]  # 1 if the last detection was complete and found no contact
-    undetected: wp.array[int]  # 1 if the last detection was incomplete
-    counted: wp.array[int]  # 1 once all contacts of the predicted motion are counted
-    first_hits: wp.array[int]  # contacts of the predicted motion
-    remaining: wp.array[int]  # contacts that the last detection found
-    excluded: wp.array[int]  # contacts that the last detection found and excluded
-    body_contacts: wp.array[int]  # contacts between bodies that the last detection found
-    crossings: wp.array[int]  # edges that cross faces at the start
-    iterations: wp.array[int]  # of detect and project or divide
-    truncated: wp.array[int]  # 1 if a path was cut
-    frozen: wp.array[int]  # 1 if a vertex or a body was frozen
-    not_finite: wp.array[int]  # particles whose predicted position or velocity was not finite
+    HITS = 0  # contacts
+    EXCLUDED = 1  # contacts of elements that crossed or touched at the start
+    OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
+    TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
+
+
+class Result(IntEnum):
+    """Results of a step: elements of :attr:`SolveStatus.results`."""
+
+    CERTIFIED = 0  # 1 if the last detection was complete and found no contact
+    UNDETECTED = 1  # 1 if the last detection was incomplete
+    COUNTED = 2  # 1 once all contacts of the predicted motion are counted
+    FIRST_HITS = 3  # contacts of the predicted motion
+    REMAINING = 4  # contacts that the last detection found
+    EXCLUDED = 5  # contacts that the last detection found and excluded
+    BODY_CONTACTS = 6  # contacts between bodies that the last detection found
+    ITERATIONS = 7  # of detect and project or divide
+    TRUNCATED = 8  # 1 if a path was cut
+    FROZEN = 9  # 1 if a vertex or a body was frozen
+    NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
+    CROSSINGS = 11  # edges that cross faces at the start
 
 
 @wp.struct
 class SolveStatus:
     """How far a step is, and its limits."""
 
-    loop: LoopControl
-    detection: DetectionCounts
-    results: StepResults
+    loop: wp.array[int]  # elements of Loop
+    detection: wp.array[int]  # of Detection
+    results: wp.array[int]  # of Result
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
     max_iterations: int
@@ -112,29 +112,27 @@ class SolveStatus:
     slow_velocity_sweeps: int
 
 
+def elements_of(values: wp.array) -> list[wp.array]:
+    """Returns views of the single elements of an array, which conditions on the device and the host can read."""
+    return [values[i : i + 1] for i in range(len(values))]
+
+
 def views_of(struct_type: type, values: wp.array):
     """Returns a struct whose fields, in their order, are views of one element each of an array."""
     struct = struct_type()
-    for i, name in enumerate(struct_type.vars):
-        setattr(struct, name, values[i : i + 1])
+    for name, element in zip(struct_type.vars, elements_of(values), strict=True):
+        setattr(struct, name, element)
     return struct
 
 
-def allocate_status(
-    worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool
-) -> tuple[SolveStatus, list[wp.array]]:
-    """Returns a cleared status, and the arrays that its parts are views of.
+def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
+    """Returns a cleared status.
 
-    Args:
-        worlds: Number of worlds.
-        device: The device.
-        max_iterations: Iterations of detect and project.
-        recorded: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided.
+    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
     """
-    status, values = SolveStatus(), []
-    for name, struct_type in (("loop", LoopControl), ("detection", DetectionCounts), ("results", StepResults)):
-        values.append(wp.zeros(len(struct_type.vars), dtype=int, device=device))
-        setattr(status, name, views_of(struct_type, values[-1]))
+    status = SolveStatus()
+    for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
+        setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
     for name in ("contact_iteration", "is_fast"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
@@ -142,37 +140,25 @@ def allocate_status(
     status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
     status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
     status.slow_velocity_sweeps = int(MAX_SWEEPS) if recorded else SLOW_VELOCITY_SWEEPS
-    return status, values
+    return status
 
 
 @wp.func
-def _clear_detection(detection: DetectionCounts):
-    detection.hits[0] = 0
-    detection.excluded[0] = 0
-    detection.of_bodies[0] = 0
-    detection.too_near[0] = 0
+def _clear_detection(status: SolveStatus):
+    for i in range(status.detection.shape[0]):
+        status.detection[i] = 0
 
 
 @wp.func
 def clear_status(status: SolveStatus):
-    """Clears everything for a step, except for the crossings, which are those of the last step until recounted."""
-    status.loop.active[0] = 0
-    status.loop.unfinished[0] = 0
-    status.loop.iteration[0] = 0
-    status.loop.projecting[0] = 0
-    status.loop.newly_frozen[0] = 0
-    _clear_detection(status.detection)
-    status.results.certified[0] = 0
-    status.results.undetected[0] = 0
-    status.results.counted[0] = 0
-    status.results.first_hits[0] = 0
-    status.results.remaining[0] = 0
-    status.results.excluded[0] = 0
-    status.results.body_contacts[0] = 0
-    status.results.iterations[0] = 0
-    status.results.truncated[0] = 0
-    status.results.frozen[0] = 0
-    status.results.not_finite[0] = 0
+    """Clears everything for a step, except for the crossings, of the last step until recounted, and RECOUNT."""
+    _clear_detection(status)
+    for i in range(status.loop.shape[0]):
+        if i != Loop.RECOUNT:
+            status.loop[i] = 0
+    for j in range(status.results.shape[0]):
+        if j != Result.CROSSINGS:
+            status.results[j] = 0
 
 
 @wp.func
@@ -186,7 +172,7 @@ def is_dividing(status: SolveStatus, world: int, iteration: int) -> bool:
 @wp.func
 def divides_all_proximities(status: SolveStatus) -> bool:
     """Returns whether all proximities are divided in this iteration, also where that stops what moves together."""
-    return status.loop.iteration[0] - 1 == status.max_slow_iterations
+    return status.loop[Loop.ITERATION] - 1 == status.max_slow_iterations
 
 
 @wp.func
@@ -195,7 +181,7 @@ def divides_proximities(status: SolveStatus, world: int) -> bool:
 
     Those at rest are divided after the last projection, and all of them in the next iteration, if contacts are left.
     """
-    last = status.loop.iteration[0] - 1
+    last = status.loop[Loop.ITERATION] - 1
     if status.contact_iteration[world] != last or status.is_fast[world] == 1:
         return False
     return last == status.max_slow_iterations - 1 or divides_all_proximities(status)
@@ -204,14 +190,14 @@ def divides_proximities(status: SolveStatus, world: int) -> bool:
 @wp.func
 def is_projecting(status: SolveStatus, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
-    iteration = status.loop.iteration[0]
+    iteration = status.loop[Loop.ITERATION]
     return status.contact_iteration[world] == iteration - 1 and not is_dividing(status, world, iteration - 1)
 
 
 @wp.func
 def is_freezing(status: SolveStatus) -> bool:
     """Returns whether this iteration freezes what still collides."""
-    return status.loop.iteration[0] > status.max_iterations + status.max_truncations
+    return status.loop[Loop.ITERATION] > status.max_iterations + status.max_truncations
 
 
 @wp.func
@@ -220,40 +206,25 @@ def is_reversible(status: SolveStatus, is_slow: bool) -> bool:
 
     Constraints of fast elements only push after the first iteration, which leaves space where contacts come back.
     """
-    return status.loop.iteration[0] == 1 or is_slow
+    return status.loop[Loop.ITERATION] == 1 or is_slow
 
 
 @wp.func
 def widened(separation: wp.float64, status: SolveStatus) -> wp.float64:
     """Returns the separation of constraints that are added in this iteration [m]."""
-    return separation * wp.min(wp.pow(_WIDENING, wp.float64(status.loop.iteration[0])), _WIDEST)
+    return separation * wp.min(wp.pow(_WIDENING, wp.float64(status.loop[Loop.ITERATION])), _WIDEST)
 
 
 @wp.func
 def count_contact(status: SolveStatus, world: int):
     """Counts a contact that a detection found."""
-    wp.atomic_add(status.detection.hits, 0, 1)
-    status.contact_iteration[world] = status.loop.iteration[0]
-
-
-@wp.func
-def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
-    """Returns whether a queue of the detector was too small for a detection."""
-    for i in range(1, counts.shape[0]):  # the first counts positions that are not finite
-        if counts[i] > capacities[i]:
-            return True
-    return False
+    wp.atomic_add(status.detection, int(Detection.HITS), 1)
+    status.contact_iteration[world] = status.loop[Loop.ITERATION]
 
 
 @wp.kernel
 def decide(
-    # in
-    constraints: Constraints,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    can_search: bool,
-    # in and out
-    status: SolveStatus,
+    step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus
 ):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
 
@@ -264,35 +235,35 @@ def decide(
     detection = status.detection
     results = status.results
     overflowed = has_overflowed(counts, capacities)
-    if can_search and overflowed and results.undetected[0] == 0:
-        results.undetected[0] = 1
-        _clear_detection(detection)
-        loop.iteration[0] = wp.max(loop.iteration[0], status.max_iterations)
+    if can_search and overflowed and results[Result.UNDETECTED] == 0:
+        results[Result.UNDETECTED] = 1
+        _clear_detection(status)
+        loop[Loop.ITERATION] = wp.max(loop[Loop.ITERATION], status.max_iterations)
         return
     overflowed = overflowed and not can_search
-    hits = detection.hits[0]
-    finished = hits == 0 and detection.too_near[0] == 0
-    stuck = is_freezing(status) and loop.newly_frozen[0] == 0
-    results.remaining[0] = hits
-    results.excluded[0] = detection.excluded[0]
-    results.body_contacts[0] = detection.of_bodies[0]
-    _clear_detection(detection)
-    loop.newly_frozen[0] = 0
-    if results.counted[0] == 0:
-        results.first_hits[0] = results.first_hits[0] + hits
-        results.counted[0] = 1
-    results.certified[0] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
-    results.undetected[0] = wp.where(overflowed, 1, 0)
-    loop.active[0] = wp.where(finished or overflowed or stuck, 0, 1)
-    loop.iteration[0] = loop.iteration[0] + loop.active[0]
-    results.iterations[0] = results.iterations[0] + loop.active[0]
-    loop.unfinished[0] = wp.where(loop.active[0] == 1 or overflowed or constraints.count[0] > 0, 1, 0)
+    hits = detection[Detection.HITS]
+    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0
+    stuck = is_freezing(status) and loop[Loop.NEWLY_FROZEN] == 0
+    results[Result.REMAINING] = hits
+    results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
+    results[Result.BODY_CONTACTS] = detection[Detection.OF_BODIES]
+    _clear_detection(status)
+    loop[Loop.NEWLY_FROZEN] = 0
+    if results[Result.COUNTED] == 0:
+        results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
+        results[Result.COUNTED] = 1
+    results[Result.CERTIFIED] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
+    results[Result.UNDETECTED] = wp.where(overflowed, 1, 0)
+    loop[Loop.ACTIVE] = wp.where(finished or overflowed or stuck, 0, 1)
+    loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]
+    results[Result.ITERATIONS] = results[Result.ITERATIONS] + loop[Loop.ACTIVE]
+    loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
 
 
 @wp.kernel
 def start_sweeps(status: SolveStatus):
     """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
     loop = status.loop
-    loop.sweep[0] = 0
-    loop.more_sweeps[0] = wp.where(loop.active[0] == 0 or loop.projecting[0] == 1, 1, 0)
-    loop.projecting[0] = 0
+    loop[Loop.SWEEP] = 0
+    loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)
+    loop[Loop.PROJECTING] = 0

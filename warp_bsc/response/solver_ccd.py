@@ -1,9 +1,9 @@
 """The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
 
 import contextlib
+import functools
 from typing import Literal
 
-import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
@@ -13,18 +13,18 @@ from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, w
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
-from .integration.wrapped_solver import StateArrays
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
+from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
 from .substeps.substeps import Substeps
 from .tuning import SUBSTEPS
-from .write_back import count_record, write_back, write_back_bodies
+from .write_back import count_record, write_back
 
 
 class SolverCCD(CollisionStage):
@@ -169,20 +169,14 @@ class SolverCCD(CollisionStage):
         mesh = ModelMesh(self.model, strands=options.keeps_distances)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
         if options.keeps_distances:
-            mesh.keep_distances(options.min_distance, options.radii, reach=self.separation)
+            mesh.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         if self.substeps is not None and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
-        moves_bodies = options.moves_bodies(mesh, inner)
-        self._allocate(
-            mesh,
-            friction_of(mesh, self.friction),
-            separation=self.separation,
-            restitution=self.restitution,
-            moves_bodies=moves_bodies,
-            responds_to_bodies=options.bodies == "separated",
-            max_iterations=self.max_iterations,
-        )
+        moves, separates = options.moves_bodies(mesh, inner), options.bodies == "separated"
+        coefficients = friction_of(mesh, self.friction)
+        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
+        self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
         if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
             self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)
@@ -193,43 +187,10 @@ class SolverCCD(CollisionStage):
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._in_substeps = None
         if self.substeps is not None:
-            self._inner_contacts = InnerContacts(mesh, moves_bodies=moves_bodies)
+            self._inner_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            arguments = self._step_inner, solver, mesh, self._motion, self._work, choices
-            self._in_substeps = Substeps(*arguments, moves_bodies=moves_bodies)
+            self._in_substeps = Substeps(self._step_inner, solver, self._work, choices)
             self.report.last_substeps = self._in_substeps.substeps
-
-    def step(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        **options,
-    ) -> None:
-        """Steps the inner solver, and changes positions and velocities of particles and bodies whose motion collides.
-
-        Args:
-            state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same, except on a tape.
-            control: As for the inner solver.
-            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
-                see :mod:`.substeps.inner_contacts`.
-            dt: Length of the step [s], more than 0.
-            options: As for the inner solver.
-
-        Raises:
-            TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
-                ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
-                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
-                ``SolverXPBD``.
-            RuntimeError: If a tape records gradients in a CUDA graph, and it recorded no step outside one before, or if
-                another thread is using this stage.
-        """
-        super().step(state_in, state_out, control, contacts, dt, **options)
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -258,83 +219,67 @@ class SolverCCD(CollisionStage):
             self.solver.step(*arguments, **options)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
-        device, end = self.mesh.device, StateArrays.of(state_out)
+        device, end = self.mesh.device, arrays_of(state_out)
         if self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
         if self._in_substeps is not None:
-            run_on_host(lambda: self._resolve_in_substeps(state_out, control, passed, dt), device)
+            solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
+            run_on_host(lambda: self._resolve(end, dt, solve), device)
         elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
-            self._record(StateArrays.of(state_in), end, dt, tape)
+            self._record(arrays_of(state_in), end, dt, tape)
         else:
-            run_on_host(lambda: self._resolve(end, dt), device)
+            run_on_host(lambda: self._resolve(end, dt, functools.partial(resolve, self._work, dt)), device)
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
-        device, model, motion = self.mesh.device, self.model, self._motion
+        device, model, friction = self.mesh.device, self.model, self._motion.friction
         arrays = [start.particle_q, end.particle_q, end.particle_qd]
         if model.body_count:
             arrays += [start.body_q, end.body_q, end.body_qd]
-        read = [motion.friction.of_particles, motion.friction.of_shapes, self.restitution, model.particle_inv_mass]
+        read = [friction.of_particles, friction.of_shapes, self.restitution, model.particle_inv_mass]
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None
 
         def forward():
             nonlocal recorded
-            resolution, recorded = self._resolve(end, dt, self._recorder), None
-            if device.is_capturing or self._has_changed(resolution.vertices):
-                recorded = RecordedStep(motion, resolution, self._recorder, dt)
-                self._launch(
-                    count_record, 1, [self._recorder.record.counts, recorded.complete], [self.report.device_totals]
-                )
+            self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder))
+            recorded = None
+            if device.is_capturing or self._has_changed():
+                recorded = RecordedStep(self._work, dt)
+                self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
             with self._lock:
                 if recorded is not None:
-                    StepAdjoint(recorded, self._work).backward(*(array.grad for array in arrays))
+                    StepAdjoint(recorded).backward(*(array.grad for array in arrays))
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
-    def _has_changed(self, vertices):
+    def _has_changed(self):
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
-        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._moves_bodies else [vertices.outcome]
+        vertices = self._work.vertices
+        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._motion.moves_bodies else [vertices.outcome]
         return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
-    def _resolve(self, end, dt, recorder=None):
-        """Resolves the motion from the start of the step to its end, and changes the end."""
+    def _resolve(self, end, dt, solve):
+        """Solves the motion from the start of the step to its end, as it was predicted, and changes the end."""
         with self._timed():
-            self._read_end(end, dt)
-            resolution = resolve(self._work, self._motion, dt, recorder)
-            self._write_end(resolution, end)
-        return resolution
+            if self._reads_friction:
+                self._motion.friction.read()
+            self._motion.set_end(end, dt)
+            solve()
+            self._write_end(end)
 
-    @one_at_a_time
-    def _resolve_in_substeps(self, state, control, contacts, dt):
-        """Resolves the motion from the start of the step to a state, in substeps if it collides, and changes it."""
-        with self._timed():
-            self._read_end(StateArrays.of(state), dt)
-            assert self._in_substeps is not None
-            resolution = self._in_substeps.resolve(state, control, contacts, dt)
-            self._write_end(resolution, StateArrays.of(state))
-
-    def _read_end(self, end, dt):
-        """Reads the predicted motion."""
-        if self._reads_friction:
-            self._motion.friction.read()
-        self._set_end(end, dt)
-
-    def _write_end(self, resolution, end):
-        """Writes a resolved motion to the arrays of a state, and counts the step."""
-        vertices = resolution.vertices
-        inputs = [vertices.outcome, vertices.x1, vertices.velocity]
-        outputs = [end.particle_q, end.particle_qd, resolution.status]
-        self._launch(write_back, self.mesh.vertex_count, inputs, outputs)
-        if self._moves_bodies:
-            outputs = [end.body_q, end.body_qd, body_q_prev(self.solver), resolution.status]
-            self._launch(write_back_bodies, self.model.body_count, [vertices.bodies], outputs)
-        self._count_step(resolution)
+    def _write_end(self, end):
+        """Writes the resolved motion to the arrays of a state, and counts the step."""
+        size = max(self.mesh.vertex_count, self.model.body_count)
+        poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
+        outputs = [end, poses, self._work.status]
+        self._work.launch(write_back, size, [self._work.vertices], outputs)
+        self._count_step()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

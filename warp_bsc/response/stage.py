@@ -11,59 +11,39 @@ from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
-from .schedule import MAX_ITERATIONS
-from .state.friction import Friction
+from .schedule import MAX_ITERATIONS, Loop
 from .state.mesh import ModelMesh
-from .state.motion import ModelMotion
-from .state.workspace import Resolution, Workspace
+from .state.motion import ModelMotion, arrays_of
+from .state.workspace import Workspace
 from .step import prepare
 from .write_back import count_step
 
 
 class CollisionStage(CouplingHooks):
-    """A stage behind another solver, which :class:`.solver_ccd.SolverCCD` and :class:`.monitor.CollisionMonitor` are.
-
-    Attributes:
-        solver: The inner solver.
-        mesh: The triangles that collide.
-        report: What the stage found and did.
-    """
-
-    report: SolverReport
+    """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
     mesh: ModelMesh
+    report: SolverReport
 
     def _allocate(
         self,
-        mesh: ModelMesh,
-        friction: Friction,
-        *,
+        motion: ModelMotion,
         separation: float,
         restitution: wp.array,
-        moves_bodies: bool = False,
-        responds_to_bodies: bool = False,
+        *,
         max_iterations: int = MAX_ITERATIONS,
         responds: bool = True,
     ):
-        """Allocates the motion and the workspace of steps, and makes the report."""
-        self.mesh, model = mesh, self.model
-        self._moves_bodies = moves_bodies
-        self._motion = ModelMotion(mesh, friction, moves_bodies=moves_bodies, responds_to_bodies=responds_to_bodies)
-        self._work = Workspace(
-            mesh,
-            separation=separation,
-            restitution=restitution,
-            differentiable=model.requires_grad,
-            moves_bodies=moves_bodies,
-            max_iterations=max_iterations,
-        )
-        self._motion.set_start(model.particle_q, model.body_q)
-        self._motion.set_end(model.particle_q, model.particle_qd, model.body_q, 1.0, model.body_qd)
-        prepare(self._work, self._motion)
+        """Allocates the workspace of steps, and makes the report."""
+        self.mesh, self._motion, model = motion.mesh, motion, self.model
+        self._work = Workspace(motion, separation=separation, restitution=restitution, max_iterations=max_iterations)
+        motion.set_start(arrays_of(model))
+        motion.set_end(arrays_of(model), 1.0)
+        prepare(self._work)
         self._recount_crossings()
         if not model.requires_grad:
-            self._motion.remember(self._work.vertices.x1)
-        self.report = SolverReport(self._motion, self._work, responds=responds)
+            motion.remember(self._work.vertices.x1)
+        self.report = SolverReport(self._work, responds=responds)
 
     @one_at_a_time
     def step(
@@ -77,24 +57,33 @@ class CollisionStage(CouplingHooks):
     ) -> None:
         """Steps the inner solver, and detects the collisions of its motion.
 
+        :class:`.solver_ccd.SolverCCD` then changes positions and velocities of the particles and bodies that collide.
+        What is said of tapes and substeps holds for it alone.
+
         Args:
             state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same.
+            state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver.
+            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
+                see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
             options: As for the inner solver.
 
         Raises:
             TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0.
-            RuntimeError: If another thread is using this stage.
+            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
+                ``state_out`` is ``state_in``.
+            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
+                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
+                ``SolverXPBD``.
+            RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
+                recorded no step outside one before.
         """
         checked_number(dt, "dt", 0.0, above=True)
         with paused_tape() as tape:
             self._check_tape(tape, state_in, state_out)
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
-            self._motion.set_start(start.particle_q, start.body_q)  # now: some solvers overwrite it
+            self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
             passed = self._begin_step(state_in, contacts)
         self._step_inner(state_in, state_out, control, passed, dt, **options)
         with paused_tape() as tape:
@@ -117,18 +106,13 @@ class CollisionStage(CouplingHooks):
         """Detects the collisions of the step after the inner solver, which was passed contacts of the program."""
         raise NotImplementedError
 
-    def _set_end(self, end, dt):
-        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
-
-    def _launch(self, kernel, size, inputs, outputs):
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.mesh.device)
-
-    def _count_step(self, resolution: Resolution):
-        self._launch(count_step, 1, [resolution.status, self.report.last_substeps], [self.report.device_totals])
+    def _count_step(self):
+        work, report = self._work, self.report
+        work.launch(count_step, 1, [work.status, report.last_substeps], [report.device_totals])
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
-        self._work.status.loop.recount.fill_(1)
+        self._work.loop[Loop.RECOUNT].fill_(1)
 
     @contextlib.contextmanager
     def _timed(self):

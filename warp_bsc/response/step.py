@@ -12,32 +12,31 @@ minimum distances, a contact is a pair that comes nearer than it may.
 import warp as wp
 
 from .contacts import detect, proximities
+from .schedule import Loop
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
-from .state.motion import ModelMotion
 from .state.record import StepRecorder
-from .state.workspace import Resolution, Workspace
+from .state.workspace import Workspace
 
 
-def resolve(work: Workspace, motion: ModelMotion, dt: float, recorder: StepRecorder | None = None) -> Resolution:
-    """Returns the motion without its contacts, except for those that cannot be resolved.
+def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) -> None:
+    """Makes the predicted motion free of its contacts, except for those that cannot be resolved.
 
     Args:
-        work: The buffers, which the next step overwrites.
-        motion: The predicted motion; it is only read.
+        work: The motion, which is only read, and buffers, which hold the result until the next step.
         dt: Length of the step [s].
         recorder: Records the step for its adjoint; None to record nothing.
 
     Raises:
         RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
     """
-    find_contacts(work, motion, recorder)
-    return resolve_contacts(work, dt)
+    find_contacts(work, recorder)
+    resolve_contacts(work, dt)
 
 
-def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
-    """Detects the contacts of a motion, as the first half of :func:`resolve`, with the same arguments and errors."""
-    begin(work, motion, recorder)
+def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None:
+    """Detects the contacts of the motion, as the first half of :func:`resolve`, with the same arguments and errors."""
+    begin(work, recorder)
     if work.max_penetrations:
         work.reserve(work.max_contacts)
         detect.detect_penetrations(work, ahead=True)
@@ -47,15 +46,14 @@ def find_contacts(work: Workspace, motion: ModelMotion, recorder: StepRecorder |
     work.record_offsets(after=1)
 
 
-def resolve_contacts(work: Workspace, dt: float) -> Resolution:
+def resolve_contacts(work: Workspace, dt: float) -> None:
     """Resolves the contacts that :func:`find_contacts` found, as the second half of :func:`resolve`."""
-    wp.capture_if(work.status.loop.unfinished, _resolve_contacts, work=work, dt=dt)
-    return work.resolution
+    wp.capture_if(work.loop[Loop.UNFINISHED], _resolve_contacts, work=work, dt=dt)
 
 
 def _resolve_contacts(work, dt):
     add_proximities(work)
-    wp.capture_while(work.status.loop.active, _iterate, work=work, dt=dt)
+    wp.capture_while(work.loop[Loop.ACTIVE], _iterate, work=work, dt=dt)
     work.record_offsets(after=1)
     wp.capture_if(work.constraints.count, velocities.project, work=work, dt=dt)
     division.freeze_if_undetected(work)
@@ -71,31 +69,25 @@ def _iterate(work, dt):
 
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
-    wp.capture_if(work.status.loop.active, proximities.add_proximities, work=work)
+    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
 
 
-def prepare(work: Workspace, motion: ModelMotion) -> None:
-    """Resolves a motion to allocate buffers, which a CUDA graph cannot; clears the status."""
-    resolve(work, motion, 1.0)
-    for values in work.status_values:
+def prepare(work: Workspace) -> None:
+    """Resolves the motion to allocate buffers, which a CUDA graph cannot; clears the status."""
+    resolve(work, 1.0)
+    for values in (work.status.loop, work.status.detection, work.status.results):
         values.zero_()
     work.vertices.outcome.zero_()
 
 
-def inspect(work: Workspace, motion: ModelMotion) -> Resolution:
-    """Returns the motion as it is, with a status that says whether it has contacts; ``remaining`` counts them.
-
-    Args:
-        work: The buffers, which the next step overwrites.
-        motion: The predicted motion; it is only read.
-    """
-    begin(work, motion)
+def inspect(work: Workspace) -> None:
+    """Detects the contacts of the motion, and leaves it as it is; ``remaining`` of the status counts them."""
+    begin(work)
     detect.detect(work)
-    return work.resolution
 
 
-def begin(work: Workspace, motion: ModelMotion, recorder: StepRecorder | None = None) -> None:
+def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:
     """Initializes vertices and bodies by their prediction, and counts what crosses at the start, which is excluded."""
-    work.begin(motion, recorder)
+    work.begin(recorder)
     work.launch_over_bodies(begin_bodies)
     detect.detect_crossings(work)

@@ -10,12 +10,12 @@ are integers.
 
 import warp as wp
 
-from ..schedule import SWEEPS_PER_BATCH, LoopControl, views_of
-from ..state.record import OFFSETS, PER_ENTRY, PER_TRUNCATION, RecordCounts, check_complete
-from ..state.structs import SUMS, Constraints, MovedBodies, allocate
+from ..schedule import SWEEPS_PER_BATCH
+from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
+from ..state.structs import SUMS, Constraints, add_zeros, allocate
 from ..state.workspace import Workspace
 from . import kernels, restore
-from .arrays import attach_gradients, copied, launch_adjoint
+from .arrays import copied, filled, launch_adjoint, with_gradients
 from .restore import Move, Projection, RestoredStep
 
 _UNUSED_OF_CONSTRAINTS = {"count", "min_distance", "last_sweep", "active_set", "active_count"}
@@ -29,113 +29,84 @@ class RecordedStep:
     """A copy of a step for its adjoint: its record and results, as far as they fit in the buffers of a CUDA graph.
 
     Attributes:
-        dt: Length of the step [s].
+        restored: The step at its end, :class:`.adjoint.restore.RestoredStep` without a cursor.
         mesh: The mesh, :class:`.state.mesh.ModelMesh`.
         friction: The coefficients of its vertices and planes, :class:`.state.friction.Friction`.
         moves_bodies: Whether the response can move bodies.
-        motion: The motion that the inner solver predicted, :class:`.state.structs.Motion`.
-        planes: The planes, :class:`.state.planes.MovingPlanes`.
-        vertices: The vertices at the end, :class:`.state.structs.Vertices`.
-        constraints: The constraints at the end, :class:`.state.structs.Constraints`.
-        undetected: Array of one int, 1 if the last detection was incomplete.
-        iteration: Array of one int, the last iteration.
-        record: What each sweep and truncation changed, :class:`.state.record.StepRecord`.
-        complete: Array of one int, 1 if nothing is missing.
+        counts: Sizes of the record, and whether it is complete, :class:`.state.record.RecordCounts`.
     """
 
-    def __init__(self, motion, resolution, recorder, dt: float):
-        """Copies a step.
-
-        Args:
-            motion: The :class:`.state.motion.ModelMotion` that was resolved.
-            resolution: The :class:`.state.workspace.Resolution`.
-            recorder: The :class:`.state.record.StepRecorder` that recorded it.
-            dt: Length of the step [s].
-        """
-        self.dt, self.mesh, self.friction, self.moves_bodies = dt, motion.mesh, motion.friction, motion.moves_bodies
-        constraints, record, device = resolution.constraints, recorder.record, recorder.counts.device
-        if device.is_capturing:
-            count, sweeps = len(constraints.vertices), len(record.sweep_ends)
-            entries, truncations = len(record.constraint), len(record.vertex)
-        else:
-            counts = constraints.count, record.counts.sweeps, record.counts.entries, record.counts.truncations
-            count, sweeps, entries, truncations = (int(array.numpy()[0]) for array in counts)
-        self.undetected = wp.clone(resolution.status.results.undetected)
-        self.iteration = wp.clone(resolution.status.loop.iteration)
-        self.planes = copied(motion.planes, ("start", "end", "friction"))
-        self.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
+    def __init__(self, work: Workspace, dt: float):
+        """Copies the step that was recorded in a workspace, of length ``dt`` [s]."""
+        motion, constraints, record = work.motion, work.constraints, work.record
+        self.mesh, self.friction, self.moves_bodies = motion.mesh, motion.friction, motion.moves_bodies
+        self.restored = restored = RestoredStep()
+        restored.status, restored.dt, restored.step = copied(work.status, ["loop", "results"]), dt, work.step
+        restored.planes = copied(motion.planes, ("start", "end", "friction"))
+        step = restored.step
+        step.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
-        self.vertices = copied(resolution.vertices, names)
+        step.vertices = copied(work.vertices, names)
         if motion.keeps_poses:
             names = _MOTION_OF_BODIES if motion.moves_bodies else ("start", "end")
-            self.motion.bodies = copied(motion.vertices.bodies, names)
+            step.motion.bodies = copied(motion.vertices.bodies, names)
         if motion.moves_bodies:
             names = "pose", "velocity", "delta_x", "delta_v", "outcome"
-            self.vertices.bodies = copied(resolution.vertices.bodies, names)
-        lengths = dict.fromkeys(Constraints.vars.keys() - _UNUSED_OF_CONSTRAINTS, count)
-        self.constraints = copied(constraints, {**lengths, "count": 1})
-        lengths = {"sweep_ends": sweeps, **dict.fromkeys(OFFSETS)}
-        lengths |= {**dict.fromkeys(PER_ENTRY, entries), **dict.fromkeys(PER_TRUNCATION, truncations)}
-        self.record = copied(record, lengths)
-        self.record.counts = views_of(RecordCounts, wp.clone(recorder.counts))
-        self.complete = wp.empty(1, dtype=int, device=device)
-        wp.launch(check_complete, 1, [self.constraints, self.record], [self.complete], device=device)
+            step.vertices.bodies = copied(work.vertices.bodies, names)
+        names = Constraints.vars.keys() - _UNUSED_OF_CONSTRAINTS
+        lengths = dict.fromkeys(names, filled(constraints.vertices, constraints.count))
+        step.constraints = copied(constraints, {**lengths, "count": 1})
+        lengths = dict.fromkeys(OFFSETS) | {"sweep_ends": filled(record.sweep_ends, record.counts.sweeps)}
+        for kind, names in GROWING.items():
+            lengths |= dict.fromkeys(names, filled(getattr(record, names[0]), getattr(record.counts, kind)))
+        restored.record = copied(record, lengths)
+        self.counts = restored.record.counts = copied(record.counts, list(RecordCounts.vars))
+        work.launch(check_complete, 1, [step.constraints, restored.record])
 
 
 class StepAdjoint:
     """Goes back through a recorded step, and carries gradients along."""
 
-    def __init__(self, recorded: RecordedStep, work: Workspace):
-        """Copies what going back changes.
-
-        Args:
-            recorded: The step.
-            work: The workspace in which it was resolved.
-        """
-        self._recorded, self._work, self._mesh = recorded, work, recorded.mesh
-        model, device = recorded.mesh.model, recorded.mesh.device
-        vertices, bodies = len(recorded.motion.x0), model.body_count if recorded.moves_bodies else 0
+    def __init__(self, recorded: RecordedStep):
+        """Copies what going back through a step changes."""
+        self._recorded, self._mesh, given = recorded, recorded.mesh, recorded.restored.step
+        model, device = self._mesh.model, self._mesh.device
+        vertices, bodies = len(given.motion.x0), model.body_count if recorded.moves_bodies else 0
         self._moves_bodies, self._bodies, self._vertices_and_bodies = recorded.moves_bodies, bodies, vertices + bodies
         self._shape_vertices = len(self._mesh.shape_vertices.body) if recorded.moves_bodies else 0
-        self._constraints, self._truncations = len(recorded.constraints.vertices), len(recorded.record.vertex)
+        self._constraints, self._truncations = len(given.constraints.vertices), len(recorded.restored.record.vertex)
         self._gradients = gradients = allocate(restore.Gradients, vertices, device)
         gradients.bodies = of_bodies = allocate(restore.BodyGradients, bodies, device)
-        self._step = step = RestoredStep()
-        planes, motion = copied(recorded.planes, ()), copied(recorded.motion, ())
-        self._of_planes = attach_gradients(planes, ("start", "end", "friction"))
-        self._of_motion = attach_gradients(motion, ("x0", "x1", "velocity", "inverse_mass", "friction"))
+        self._restored = restored = copied(recorded.restored)
+        restored.cursor = allocate(restore.Cursor, 1, device)
+        restored.status = copied(restored.status, ["loop"])
+        restored.planes, self._of_planes = with_gradients(restored.planes, ("start", "end", "friction"))
+        self._step = step = restored.step
+        names = "x0", "x1", "velocity", "inverse_mass", "friction"
+        step.motion, self._of_motion = with_gradients(given.motion, names)
         if model.body_count:
-            predicted = copied(motion.bodies, ())
             names = _MOTION_OF_BODIES if recorded.moves_bodies else ("start", "end")
-            self._of_motion.bodies = attach_gradients(predicted, names)
-            motion.bodies = predicted
-        moved = copied(recorded.vertices, ("x1", "velocity", "particle_delta_x", "particle_delta_v"))
-        moved.active = wp.zeros(vertices, dtype=int, device=device)
-        attach_gradients(moved, x1=gradients.more_x1, velocity=gradients.more_velocity)
+            step.motion.bodies, self._of_motion.bodies = with_gradients(given.motion.bodies, names)
+        moved = copied(given.vertices, ("x1", "velocity", "particle_delta_x", "particle_delta_v"))
+        add_zeros(moved, ["active"], vertices, device)
+        step.vertices, _ = with_gradients(moved, x1=gradients.more_x1, velocity=gradients.more_velocity)
         if recorded.moves_bodies:
-            moved_bodies = copied(moved.bodies, ("pose", "velocity", "delta_x", "delta_v"))
-            for name in ("active", "centre", "inverse_inertia"):
-                dtype = MovedBodies.vars[name].type.dtype
-                setattr(moved_bodies, name, wp.zeros(bodies, dtype=dtype, device=device))
-            given = {"pose": of_bodies.pose, "velocity": of_bodies.velocity}
-            self._of_moved_bodies = attach_gradients(moved_bodies, ("centre", "inverse_inertia"), **given)
-            moved.bodies = moved_bodies
-        constraints = copied(recorded.constraints, _MULTIPLIERS)
+            names = "centre", "inverse_inertia"
+            moved = copied(given.vertices.bodies, ("pose", "velocity", "delta_x", "delta_v"))
+            add_zeros(moved, ("active", *names), bodies, device)
+            of_moved = {"pose": of_bodies.pose, "velocity": of_bodies.velocity}
+            step.vertices.bodies, self._of_moved_bodies = with_gradients(moved, names, **of_moved)
         names = "weights", "normal", "separation", "friction", "approach", *_MULTIPLIERS
-        self._of_constraints = attach_gradients(constraints, names)
+        constraints = copied(given.constraints, _MULTIPLIERS)
+        step.constraints, self._of_constraints = with_gradients(constraints, names)
         self._sums = wp.zeros(bodies, dtype=wp.spatial_vectord, device=device)
         self._sums.grad = of_bodies.shift
-        self._times = wp.zeros(self._truncations, dtype=wp.float64, device=device)
-        self._times.grad = wp.zeros_like(self._times)
-        self._paths = allocate(restore.Paths, self._truncations, device)
-        self._of_paths = attach_gradients(self._paths, restore.Paths.vars)
-        status = copied(work.status, ())
-        status.loop = allocate(LoopControl, 1, device)
-        step.motion, step.planes, step.vertices, step.constraints = motion, planes, moved, constraints
-        step.status, step.record, step.cursor = status, recorded.record, allocate(restore.Cursor, 1, device)
-        step.restitution, step.separation, step.dt = work.restitution, work.separation, recorded.dt
+        self._times = wp.zeros(self._truncations, dtype=wp.float64, device=device, requires_grad=True)
+        paths = allocate(restore.Paths, self._truncations, device)
+        self._paths, self._of_paths = with_gradients(paths, restore.Paths.vars)
+        moved = step.vertices
         sums, of_changes = (moved.particle_delta_x, moved.bodies.delta_x), (gradients.x1, of_bodies.shift)
-        self._positions = self._projection(motion.x1, "position_multiplier", sums, of_changes)
+        self._positions = self._projection(step.motion.x1, "position_multiplier", sums, of_changes)
         sums = moved.particle_delta_v, moved.bodies.delta_v
         of_changes = gradients.velocity_change, of_bodies.velocity_change
         self._velocities = self._projection(moved.x1, "velocity_multiplier", sums, of_changes)
@@ -151,8 +122,7 @@ class StepAdjoint:
         gradients = dict(zip(names, (*of_multipliers, *of_changes), strict=True))
         for name, gradient in gradients.items():
             setattr(swept, name, wp.zeros_like(gradient))
-        attach_gradients(swept, **gradients)
-        return swept
+        return with_gradients(swept, **gradients)[0]
 
     def backward(self, *of_state: wp.array | None) -> None:
         """Turns gradients with respect to the results of the step into those with respect to its inputs, in place.
@@ -163,27 +133,28 @@ class StepAdjoint:
             of_state: The arrays of :class:`.adjoint.restore.StateGradients`, in its order; those of bodies may be
                 omitted if the model has none.
         """
-        recorded, step, gradients, of_motion = self._recorded, self._step, self._gradients, self._of_motion
-        motion, cursor, both = step.motion, step.cursor, self._vertices_and_bodies
+        recorded, restored, gradients, of_motion = self._recorded, self._restored, self._gradients, self._of_motion
+        step, cursor, both = self._step, restored.cursor, self._vertices_and_bodies
+        motion = step.motion
         of_states, of_model = restore.StateGradients(), restore.ModelGradients()
         for name, array in zip(restore.StateGradients.vars, of_state, strict=False):
             setattr(of_states, name, array)
         for name in restore.ModelGradients.vars:
-            array = self._work.restitution if name == "restitution" else getattr(self._mesh.model, name)
+            array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
-        wp.copy(step.status.loop.iteration, recorded.iteration)
-        self._launch(restore.begin_gradients, both, motion, recorded.undetected, of_states, gradients, of_motion)
-        self._launch(restore.restore_velocities, both, step, gradients)  # as they were before the turn
+        wp.copy(restored.status.loop, recorded.restored.status.loop)
+        self._launch(restore.begin_gradients, both, restored, of_states, gradients, of_motion)
+        self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)
-        self._set_centres(step.vertices.bodies.pose)
+        self._launch(kernels.set_centres, self._bodies, motion, step.vertices.bodies.pose, step.vertices.bodies)
         self._through_turn()
         wp.capture_while(cursor.more_sweeps, self._batch, through=self._through_velocity_sweep)
         self._through_initialization()
         self._through_centres(step.vertices.bodies.pose)
-        self._set_centres(motion.bodies.end)
+        self._launch(kernels.set_centres, self._bodies, motion, motion.bodies.end, step.vertices.bodies)
         wp.capture_while(cursor.more_iterations, self._through_iteration)
-        self._through_placement(kernels.place_vertices)
-        inputs = [motion, gradients, recorded.complete, of_motion, of_states, of_model]
+        self._through_vertices_of_bodies(kernels.place_vertices, "x1")
+        inputs = [restored, gradients, of_motion, of_states, of_model]
         self._launch(restore.finish_gradients, len(motion.x0), *inputs)
         if self._mesh.model.body_count:
             self._through_motion_of_bodies()
@@ -192,26 +163,26 @@ class StepAdjoint:
 
     def _through_motion_of_bodies(self):
         """Turns gradients with respect to vertices of shapes and planes into those with respect to poses of bodies."""
-        motion, mesh = self._step.motion, self._mesh
-        self._through_centres(motion.bodies.end)
-        self._through_projection()
+        step, mesh = self._step, self._mesh
+        self._through_centres(step.motion.bodies.end)
+        self._through_poses()
         shapes, planes = mesh.device_shape_vertices, mesh.device_planes
-        inputs = [motion, shapes.body, shapes.position, mesh.model.particle_count, self._recorded.dt]
+        inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, self._restored.dt]
         self._launch_adjoint(kernels.place_shape_vertices, len(shapes.body), inputs)
-        inputs = [motion, planes.point, planes.normal, planes.body, self._step.planes]
+        inputs = [step.motion, planes.point, planes.normal, planes.body, self._restored.planes]
         self._launch_adjoint(kernels.place_planes, len(planes.body), inputs)
 
     def _through_turn(self):
         """Goes back through the turn that restores angular momentum."""
-        motion, vertices, constraints = self._step.motion, self._step.vertices, self._step.constraints
-        both, gradients, shape = self._vertices_and_bodies, self._gradients, (self._work.worlds, int(SUMS))
-        totals = wp.zeros(shape, dtype=wp.float64, device=self._mesh.device, requires_grad=True)
-        self._launch(kernels.add_torques, self._constraints, motion, vertices, constraints, totals)
-        self._launch(kernels.add_moments, both, motion, vertices, totals)
+        both, gradients, worlds = self._vertices_and_bodies, self._gradients, len(self._restored.status.is_fast)
+        totals = wp.zeros((worlds, int(SUMS)), dtype=wp.float64, device=self._mesh.device, requires_grad=True)
+        inputs = [self._step, totals]
+        self._launch(kernels.add_torques, self._constraints, *inputs)
+        self._launch(kernels.add_moments, both, *inputs)
         of_outputs = [gradients.velocity, gradients.bodies.velocity]
-        self._launch_adjoint(kernels.turn_velocities, both, [motion, vertices, totals], of_outputs)
-        self._launch_adjoint(kernels.add_moments, both, [motion, vertices, totals])
-        self._launch_adjoint(kernels.add_torques, self._constraints, [motion, vertices, constraints, totals])
+        self._launch_adjoint(kernels.turn_velocities, both, inputs, of_outputs)
+        self._launch_adjoint(kernels.add_moments, both, inputs)
+        self._launch_adjoint(kernels.add_torques, self._constraints, inputs)
 
     def _batch(self, through):
         for _ in range(SWEEPS_PER_BATCH):
@@ -219,69 +190,65 @@ class StepAdjoint:
 
     def _through_velocity_sweep(self):
         """Goes back through a sweep on velocities."""
-        vertices, gradients = self._step.vertices, self._gradients
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._velocities)
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._velocities)
         self._restore_velocities()
         self._through_change(self._velocities)
-        self._collect(gradients.velocity, gradients.more_velocity)
-        inputs = [self._step.motion, vertices]
-        self._launch_adjoint(kernels.vertex_velocities, self._shape_vertices, inputs, [gradients.on_bodies])
+        self._through_vertices_of_bodies(kernels.vertex_velocities, "velocity")
 
     def _through_initialization(self):
         """Goes back through the initial velocity multipliers."""
         self._restore_velocities()
-        inputs = [self._step, self._velocities]
-        self._launch_adjoint(kernels.initialize_multipliers, self._constraints, inputs)
+        self._launch_adjoint(kernels.initialize_multipliers, self._constraints, [self._restored, self._velocities])
         self._of_constraints.previous_multiplier.zero_()
 
     def _through_iteration(self):
         """Goes back through an iteration: truncation, sweeps, and the constraints that its detection added."""
         self._restore_positions()
-        self._through_placement(kernels.place_vertices)
+        self._through_vertices_of_bodies(kernels.place_vertices, "x1")
         self._through_truncation()
         self._move_cursor(Move.SWEEPS)
         if self._moves_bodies:
-            wp.capture_if(self._step.cursor.more_sweeps, self._through_projection)
-        wp.capture_while(self._step.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
+            wp.capture_if(self._restored.cursor.more_sweeps, self._through_poses)
+        wp.capture_while(self._restored.cursor.more_sweeps, self._batch, through=self._through_position_sweep)
         self._move_cursor(Move.DETECTION)
-        inputs = [self._step, self._recorded.constraints]
+        inputs = [self._restored, self._recorded.restored.step.constraints]
         self._launch_adjoint(kernels.make_constraints, self._constraints, inputs)
 
     def _through_position_sweep(self):
         """Goes back through a sweep on positions."""
-        self._launch(restore.restore_multipliers, self._constraints, self._step, self._positions)
+        self._launch(restore.restore_multipliers, self._constraints, self._restored, self._positions)
         self._restore_positions()
         self._place()
         self._through_change(self._positions)
-        self._through_placement(kernels.project_vertices, self._sums)
+        self._through_vertices_of_bodies(kernels.project_vertices, "x1", self._sums)
 
     def _through_change(self, swept):
         """Goes back through what a sweep changes."""
-        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._step, swept])
+        self._launch_adjoint(kernels.change_multipliers, self._constraints, [self._restored, swept])
         self._step.vertices.active.zero_()
         if self._moves_bodies:
             self._step.vertices.bodies.active.zero_()
 
     def _through_truncation(self):
         """Goes back through the truncation of paths."""
-        step, times, count = self._step, self._times, self._truncations
-        self._launch(restore.restore_paths, count, step, self._gradients, self._of_paths)
+        restored, times, count = self._restored, self._times, self._truncations
+        self._launch(restore.restore_paths, count, restored, self._gradients, self._of_paths)
         self._place()
-        self._launch(kernels.find_truncation_times, count, step, times)
-        self._launch_adjoint(kernels.truncate_paths, count, [step, times, self._paths])
-        self._launch_adjoint(kernels.find_truncation_times, count, [step, times])
+        self._launch(kernels.find_truncation_times, count, restored, times)
+        self._launch_adjoint(kernels.truncate_paths, count, [restored, times, self._paths])
+        self._launch_adjoint(kernels.find_truncation_times, count, [restored, times])
 
-    def _through_placement(self, kernel, *inputs):
-        """Turns gradients with respect to positions of vertices into those of poses, or of what constraints did."""
-        self._collect(self._gradients.x1, self._gradients.more_x1)
-        inputs = [self._step.motion, self._step.vertices, *inputs]
-        self._launch_adjoint(kernel, self._shape_vertices, inputs, [self._gradients.on_bodies])
+    def _through_vertices_of_bodies(self, kernel, name, *inputs):
+        """Turns gradients with respect to positions or velocities of vertices into those with respect to bodies."""
+        gradients = self._gradients
+        collected = [self._step.motion, gradients, getattr(gradients, name), getattr(gradients, f"more_{name}")]
+        self._launch(restore.collect_gradients_on_bodies, self._shape_vertices, *collected)
+        self._launch_adjoint(kernel, self._shape_vertices, [self._step, *inputs], [gradients.on_bodies])
 
-    def _through_projection(self):
+    def _through_poses(self):
         """Turns gradients with respect to poses into those with respect to what constraints did to them."""
         of_poses = self._gradients.bodies.pose
-        inputs = [self._step.motion, self._step.vertices, self._sums]
-        self._launch_adjoint(kernels.project_poses, self._bodies, inputs, [of_poses])
+        self._launch_adjoint(kernels.project_poses, self._bodies, [self._step, self._sums], [of_poses])
         of_poses.zero_()
 
     def _through_centres(self, poses):
@@ -292,29 +259,19 @@ class StepAdjoint:
             self._of_moved_bodies.centre.zero_()
             self._of_moved_bodies.inverse_inertia.zero_()
 
-    def _set_centres(self, poses):
-        """Makes given poses those where impulses act."""
-        self._launch(kernels.set_centres, self._bodies, self._step.motion, poses, self._step.vertices.bodies)
-
     def _move_cursor(self, move):
-        self._launch(restore.move_cursor, 1, self._step, int(move), self._recorded.complete)
+        self._launch(restore.move_cursor, 1, self._restored, int(move))
 
     def _restore_positions(self):
-        self._launch(restore.restore_positions, self._vertices_and_bodies, self._step, self._gradients, self._sums)
+        self._launch(restore.restore_positions, self._vertices_and_bodies, self._restored, self._gradients, self._sums)
 
     def _restore_velocities(self):
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._step, self._gradients)
-        self._launch(kernels.vertex_velocities, self._shape_vertices, motion, vertices, vertices.velocity)
+        self._launch(restore.restore_velocities, self._vertices_and_bodies, self._restored, self._gradients)
+        self._launch(kernels.vertex_velocities, self._shape_vertices, self._step, self._step.vertices.velocity)
 
     def _place(self):
         """Moves vertices of bodies to where their poses say."""
-        motion, vertices = self._step.motion, self._step.vertices
-        self._launch(kernels.place_vertices, self._shape_vertices, motion, vertices, vertices.x1)
-
-    def _collect(self, of_vertices, more):
-        inputs = [self._step.motion, self._gradients, of_vertices, more]
-        self._launch(restore.collect_gradients_on_bodies, self._shape_vertices, *inputs)
+        self._launch(kernels.place_vertices, self._shape_vertices, self._step, self._step.vertices.x1)
 
     def _launch(self, kernel, dim, *arguments):
         wp.launch(kernel, dim, inputs=arguments, device=self._mesh.device)

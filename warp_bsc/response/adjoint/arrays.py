@@ -2,10 +2,15 @@
 
 import warp as wp
 
-from ..._private_names.of_warp import empty_struct, struct_fields, struct_type
+from ..._private_names.of_warp import empty_struct, struct_type
 
 
-def copied(struct, lengths):
+def filled(array: wp.array, counts: wp.array, place: int = 0) -> int:
+    """Returns how many elements of an array one of ``counts`` says are in use; in a CUDA graph, all of them."""
+    return len(array) if array.device.is_capturing else min(len(array), int(counts.numpy()[place]))
+
+
+def copied(struct, lengths=()):
     """Returns a struct with copies of some arrays, and all other fields those of ``struct``.
 
     Args:
@@ -13,8 +18,7 @@ def copied(struct, lengths):
         lengths: Names of the arrays to copy; a dictionary says how many elements, None for all.
     """
     into = struct_type(struct)()
-    for name in struct_fields(struct_type(struct)):
-        setattr(into, name, getattr(struct, name))
+    into.assign(struct)
     for name, length in lengths.items() if isinstance(lengths, dict) else dict.fromkeys(lengths).items():
         array = getattr(struct, name)
         if length == 0:  # Warp makes no empty slices
@@ -24,18 +28,18 @@ def copied(struct, lengths):
     return into
 
 
-def attach_gradients(struct, names=(), **gradients):
-    """Replaces arrays of a struct by aliases with gradients, zeros for ``names``; returns a struct of the gradients."""
-    into = struct_type(struct)()
+def with_gradients(struct, names=(), **gradients):
+    """Returns a struct with aliases of some arrays that have gradients, zeros for ``names``, and their gradients."""
+    into, of_struct = copied(struct), struct_type(struct)()
     for name in (*names, *gradients):
         array = getattr(struct, name)
         gradient = gradients[name] if name in gradients else wp.zeros_like(array, requires_grad=False)
-        setattr(into, name, gradient)
+        setattr(of_struct, name, gradient)
         if len(array):
             alias = array[:]
             alias.grad, alias.retain_grad = gradient, True  # which a store would clear
-            setattr(struct, name, alias)
-    return into
+            setattr(into, name, alias)
+    return into, of_struct
 
 
 def launch_adjoint(kernel, dim, inputs, of_outputs, device):

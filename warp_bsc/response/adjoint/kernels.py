@@ -5,19 +5,18 @@ For launches over vertices and bodies see :mod:`.adjoint.restore`.
 
 import warp as wp
 
+from ...kernels.closest import contact_weights, weights_across
 from ..contacts.collect import level, offset_from
 from ..contacts.constraints import (
     approach_of,
     contact_friction,
-    contact_weights,
     feasible,
     has_pushed,
     kind_of_pair,
     sagitta,
 )
-from ..contacts.first_contact import share_before, truncated_path
+from ..contacts.first_contact import truncated_path
 from ..contacts.impacts import impact_of
-from ..contacts.proximities import weights_across
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
     Moments,
@@ -39,102 +38,100 @@ from ..solve.sweeps import (
 )
 from ..state.motion import moves_with_body, predicted_velocity
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transformed_plane
-from ..state.poses import centre_of, inverse_inertia_at, pose_between, turned_pose, velocity_between, velocity_on_body
+from ..state.poses import centre_of, in_world, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Vertices
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
-from ..tuning import MAX_SAGITTA
+from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
+from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
+from ..tuning import SHARE_OF_PATH
 from .restore import Paths, Projection, RestoredStep, entry_of, is_movable
 
 
 @wp.func
-def _add_change(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, change: wp.vec3d, swept: Projection
-):
+def _add_change(step: Step, i: int, change: wp.vec3d, swept: Projection):
     """Adds what the change of a multiplier does to its vertices and bodies.
 
     :func:`.solve.sweeps.add_delta` and :func:`.solve.bodies.add_body_delta` do it in integers.
     """
     for j in range(4):
-        vertex = constraints.vertices[i][j]
-        share = constraints.weights[i][j] * wp.float64(motion.inverse_mass[vertex])
+        vertex = step.constraints.vertices[i][j]
+        share = step.constraints.weights[i][j] * wp.float64(step.motion.inverse_mass[vertex])
         wp.atomic_add(swept.vertex_change, vertex, to_single(share * change))
-    if motion.bodies.of_vertex:
+    if step.motion.bodies.of_vertex:
         for side in range(2):
-            body, shift, turn = body_change(motion, vertices, constraints, i, side, change, swept.x)
+            body, shift, turn = body_change(step, i, side, change, swept.x)
             if body >= 0:
                 added = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
                 wp.atomic_add(swept.body_change, body, added)
 
 
 @wp.kernel
-def change_multipliers(step: RestoredStep, swept: Projection):
+def change_multipliers(restored: RestoredStep, swept: Projection):
     """Computes what a sweep changes.
 
     See :func:`.solve.positions.project_positions` and :func:`.solve.velocities.project_velocities`.
     """
-    motion, vertices, constraints = step.motion, step.vertices, step.constraints
-    entry = entry_of(step.record, step.cursor.current_sweep[0], wp.tid())
+    step, record = restored.step, restored.record
+    entry = entry_of(record, restored.cursor.current_sweep[0], wp.tid())
     if entry < 0:
         return
-    i = step.record.constraint[entry]
+    i = record.constraint[entry]
     old = swept.multiplier[i]
     multiplier = old
     if swept.of_velocities:
-        multiplier = velocity_multiplier_after(motion, vertices, constraints, i, step.restitution)
+        multiplier = velocity_multiplier_after(step, i)
     else:
-        pushes_only = not is_reversible(step.status, constraints.pace[i] != Pace.FAST)
-        multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
-    previous = constraints.previous_multiplier[i]
-    change = with_momentum(multiplier, previous, step.record.momentum[entry]) - old
+        pushes_only = not is_reversible(restored.status, step.constraints.pace[i] != Pace.FAST)
+        multiplier = position_multiplier_after(step, i, pushes_only)
+    previous = step.constraints.previous_multiplier[i]
+    change = with_momentum(multiplier, previous, record.momentum[entry]) - old
     swept.multiplier_change[i] = change
     swept.previous_change[i] = multiplier - previous
-    _add_change(motion, vertices, constraints, i, change, swept)
+    _add_change(step, i, change, swept)
 
 
 @wp.kernel
-def initialize_multipliers(step: RestoredStep, swept: Projection):
+def initialize_multipliers(restored: RestoredStep, swept: Projection):
     """Computes initial velocity multipliers, see :func:`.solve.velocities.initialize_velocity_multipliers`."""
     i = wp.tid()
-    constraints = step.constraints
-    if i < constraints.count[0] and has_pushed(constraints, i):
-        first = initial_velocity_multiplier(constraints, i, step.dt)
+    step = restored.step
+    if i < step.constraints.count[0] and has_pushed(step, i):
+        first = initial_velocity_multiplier(step, i, restored.dt)
         swept.multiplier_change[i] = first
         swept.previous_change[i] = first
-        _add_change(step.motion, step.vertices, constraints, i, first, swept)
+        _add_change(step, i, first, swept)
 
 
 @wp.kernel
-def add_torques(motion: Motion, vertices: Vertices, constraints: Constraints, totals: wp.array2d[wp.float64]):
+def add_torques(step: Step, totals: wp.array2d[wp.float64]):
     """Adds the torques of contacts to the totals of their worlds, see :func:`.solve.angular_momentum.sum_torques`."""
     i = wp.tid()
-    if i >= constraints.count[0] or not acts(constraints, i):
+    if i >= step.constraints.count[0] or not acts(step, i):
         return
-    world = motion.world[constraints.vertices[i][0]]
-    if is_held(motion, vertices, constraints, i):
+    world = step.motion.world[step.constraints.vertices[i][0]]
+    if is_held(step, i):
         totals[world, HELD] = ONE
     else:
-        torque = torque_of(motion, vertices, constraints, i)
+        torque = torque_of(step, i)
         for axis in range(3):
             wp.atomic_add(totals, world, axis, torque[axis])
 
 
 @wp.kernel
-def add_moments(motion: Motion, vertices: Vertices, totals: wp.array2d[wp.float64]):
+def add_moments(step: Step, totals: wp.array2d[wp.float64]):
     """Adds the moments of vertices and bodies, and the torques of bodies, to the totals of their worlds.
 
     See :func:`.solve.angular_momentum.sum_moments` and :func:`.solve.angular_momentum.sum_body_moments`.
     """
     vertex = wp.tid()
-    body = vertex - motion.x0.shape[0]
+    body = vertex - step.motion.x0.shape[0]
     if body < 0:
-        if turns(motion, vertices, vertex):
-            added = moments(motion, vertices, vertex)
+        if turns(step, vertex):
+            added = moments(step, vertex)
             for i in range(MOMENTS):
-                wp.atomic_add(totals, motion.world[vertex], MASS + i, added[i])
-    elif body_turns(motion, vertices, body):
-        world = wp.max(motion.bodies.world[body], 0)
-        torque, of_body = body_moments(motion, vertices, body)
+                wp.atomic_add(totals, step.motion.world[vertex], MASS + i, added[i])
+    elif body_turns(step, body):
+        world = wp.max(step.motion.bodies.world[body], 0)
+        torque, of_body = body_moments(step, body)
         for axis in range(3):
             wp.atomic_add(totals, world, axis, torque[axis])
         for i in range(MOMENTS):
@@ -153,43 +150,40 @@ def _torque_and_moments(totals: wp.array2d[wp.float64], world: int):
 
 @wp.kernel
 def turn_velocities(
-    motion: Motion,
-    vertices: Vertices,
-    totals: wp.array2d[wp.float64],
-    changes: wp.array[wp.vec3],
-    body_changes: wp.array[wp.spatial_vector],
+    step: Step, totals: wp.array2d[wp.float64], changes: wp.array[wp.vec3], body_changes: wp.array[wp.spatial_vector]
 ):
     """Computes how the turn of each world changes the velocities of its vertices and bodies.
 
     See :func:`.solve.angular_momentum.turn_vertices` and :func:`.solve.angular_momentum.turn_bodies`.
     """
     vertex = wp.tid()
-    body = vertex - motion.x0.shape[0]
+    body = vertex - step.motion.x0.shape[0]
     if body < 0:
-        world = motion.world[vertex]
-        if turns(motion, vertices, vertex) and totals[world, HELD] == ZERO:
+        world = step.motion.world[vertex]
+        if turns(step, vertex) and totals[world, HELD] == ZERO:
             torque, total = _torque_and_moments(totals, world)
-            of_vertex, _turn = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
+            of_vertex, _turn = change_by_turn(torque, total, to_double(step.vertices.x1[vertex]))
             changes[vertex] = to_single(of_vertex)
     else:
-        own = wp.max(motion.bodies.world[body], 0)
-        if body_turns(motion, vertices, body) and totals[own, HELD] == ZERO:
+        own = wp.max(step.motion.bodies.world[body], 0)
+        if body_turns(step, body) and totals[own, HELD] == ZERO:
             own_torque, own_total = _torque_and_moments(totals, own)
-            of_body, turn = change_by_turn(own_torque, own_total, vertices.bodies.centre[body])
+            of_body, turn = change_by_turn(own_torque, own_total, step.vertices.bodies.centre[body])
             body_changes[body] = wp.spatial_vector(to_single(of_body), to_single(turn))
 
 
 @wp.kernel
-def make_constraints(step: RestoredStep, found: Constraints):
+def make_constraints(restored: RestoredStep, found: Constraints):
     """Computes the constraints that a detection ``found``, from contacts and proximities; the cursor is ahead of it.
 
     See :func:`.contacts.collect.collect_contacts` and :func:`.contacts.proximities.collect_proximities`.
     """
-    motion, vertices, constraints, iteration = step.motion, step.vertices, step.constraints, step.cursor.iteration[0]
+    step, record, iteration = restored.step, restored.record, restored.cursor.iteration[0]
+    motion, constraints = step.motion, step.constraints
     i = wp.tid()
     if iteration >= 0:
-        i += step.record.constraint_offsets[iteration]
-    if i >= step.record.constraint_offsets[iteration + 1]:
+        i += record.constraint_offsets[iteration]
+    if i >= record.constraint_offsets[iteration + 1]:
         return
     corners = found.vertices[i]
     kind = found.kind[i]
@@ -198,10 +192,10 @@ def make_constraints(step: RestoredStep, found: Constraints):
     separation = found.separation[i]
     friction = float(0.0)
     if kind == ContactKind.PLANE:
-        plane = step.planes.end[found.plane[i]]
+        plane = restored.planes.end[found.plane[i]]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        separation = offset_from(motion, step.planes, found.plane[i], corners[0], step.status, step.separation)
-        friction = contact_friction(motion.friction[corners[0]], step.planes.friction[found.plane[i]])
+        separation = offset_from(step, restored.planes, found.plane[i], corners[0], restored.status)
+        friction = contact_friction(motion.friction[corners[0]], restored.planes.friction[found.plane[i]])
     else:
         friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     if kind < ContactKind.PLANE:
@@ -209,120 +203,121 @@ def make_constraints(step: RestoredStep, found: Constraints):
         if kind == ContactKind.EDGE_EDGE:
             coordinates = wp.vec3d(weight[1], -weight[3], ZERO)
         within_tolerance = found.within_tolerance[i]
-        impact = impact_of(motion, vertices, corners, kind, within_tolerance, found.toi[i], coordinates, normal)
+        impact = impact_of(step, corners, kind, within_tolerance, found.toi[i], coordinates, normal)
         weight = contact_weights(kind_of_pair(kind), impact.coordinates)
         normal = impact.normal
-        separation = widened(step.separation, step.status)
+        separation = widened(step.separation, restored.status)
         if found.pace[i] == Pace.SLOW:
             before = wp.dot(normal, relative(weight, corners, motion.x0))
-            separation = feasible(motion, corners, separation, before, step.separation)
-        separation += sagitta(motion, vertices, corners, MAX_SAGITTA * step.separation)
+            separation = feasible(step, corners, separation, before)
+        separation += sagitta(step, corners)
     elif kind > ContactKind.PLANE:
-        across, direction, distance = weights_across(motion, corners, kind_of_pair(kind))
+        a, b, c, d = corners_of(motion.x0, corners)
+        across, direction, distance = weights_across(kind_of_pair(kind), a, b, c, d)
         weight = across
         normal = direction
-        separation = feasible(motion, corners, step.separation, distance, step.separation)
+        separation = feasible(step, corners, step.separation, distance)
     constraints.weights[i] = weight
     constraints.normal[i] = normal
     constraints.separation[i] = separation
     constraints.friction[i] = friction
-    constraints.approach[i] = approach_of(motion, vertices, corners, weight, normal, separation)
+    constraints.approach[i] = approach_of(step, corners, weight, normal, separation)
 
 
 @wp.kernel
-def find_truncation_times(step: RestoredStep, times: wp.array[wp.float64]):
+def find_truncation_times(restored: RestoredStep, times: wp.array[wp.float64]):
     """Computes the times of the contacts that an iteration truncated paths before."""
-    motion, record = step.motion, step.record
-    entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
+    step, planes, record = restored.step, restored.planes, restored.record
+    entry = truncation_at(record, restored.cursor.iteration[0], wp.tid())
     if entry < 0 or record.kind[entry] == NO_CONTACT:
         return
     corners = record.contact[entry]
     if record.kind[entry] == ContactKind.PLANE:
         vertex = corners[0]
         plane = corners[1]
-        before, _error = signed_distance(step.planes.start[plane], motion.x0[vertex])
-        after, _error_after = signed_distance(step.planes.end[plane], step.vertices.x1[vertex])
-        lowest = level(motion, step.planes, plane, vertex)
+        before, _error = signed_distance(planes.start[plane], step.motion.x0[vertex])
+        after, _error_after = signed_distance(planes.end[plane], step.vertices.x1[vertex])
+        lowest = level(step.motion, planes, plane, vertex)
         times[entry] = time_of_entry(before - lowest, after - lowest)
     else:
         kind, within_tolerance, toi = record.kind[entry], record.within_tolerance[entry], record.toi[entry]
         coordinates, normal = record.coordinates[entry], record.normal[entry]
-        impact = impact_of(motion, step.vertices, corners, kind, within_tolerance, toi, coordinates, normal)
+        impact = impact_of(step, corners, kind, within_tolerance, toi, coordinates, normal)
         times[entry] = impact.toi
 
 
 @wp.kernel
-def truncate_paths(step: RestoredStep, times: wp.array[wp.float64], paths: Paths):
+def truncate_paths(restored: RestoredStep, times: wp.array[wp.float64], paths: Paths):
     """Computes the ends and velocities of truncated paths of vertices and bodies.
 
     See :func:`.solve.division.truncate_vertices` and :func:`.solve.division.cut_bodies`. Frozen paths have time 0.
     """
-    motion, record = step.motion, step.record
-    entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
+    motion, vertices, record = restored.step.motion, restored.step.vertices, restored.record
+    entry = truncation_at(record, restored.cursor.iteration[0], wp.tid())
     if entry < 0:
         return
     vertex = record.vertex[entry]
     body = record.body[entry]
     if vertex >= 0:
         x0 = to_double(motion.x0[vertex])
-        path = truncated_path(x0, to_double(step.vertices.x1[vertex]), times[entry])
+        path = truncated_path(x0, to_double(vertices.x1[vertex]), times[entry])
         paths.end[entry] = to_single(x0 + path)
-        paths.velocity[entry] = to_single(path / step.dt)
+        paths.velocity[entry] = to_single(path / restored.dt)
     elif body >= 0:
         start = motion.bodies.start[body]
         if record.kind[entry] == NO_CONTACT:
             paths.pose[entry] = start
             paths.twist[entry] = wp.spatial_vector()
         else:
-            share = share_before(times[entry])
-            end = pose_between(motion.bodies, body, start, step.vertices.bodies.pose[body], share)
+            share = SHARE_OF_PATH * times[entry]
+            end = pose_between(motion.bodies, body, start, vertices.bodies.pose[body], share)
             paths.pose[entry] = end
-            paths.twist[entry] = velocity_between(motion.bodies, body, start, end, step.dt)
+            paths.twist[entry] = velocity_between(motion.bodies, body, start, end, restored.dt)
 
 
 @wp.func
-def _pose_by(motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], body: int) -> wp.transform:
+def _pose_by(step: Step, sums: wp.array[wp.spatial_vectord], body: int) -> wp.transform:
     """Returns the pose of a body by what constraints did to it; without any it keeps every bit."""
     change = sums[body]
+    motion = step.motion
     pose = motion.bodies.end[body]
-    if is_movable(motion, body) and vertices.bodies.outcome[body] != 0:
+    if is_movable(motion, body) and step.vertices.bodies.outcome[body] != 0:
         pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
     return pose
 
 
 @wp.kernel
-def project_poses(
-    motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], poses: wp.array[wp.transform]
-):
+def project_poses(step: Step, sums: wp.array[wp.spatial_vectord], poses: wp.array[wp.transform]):
     """Computes the poses of bodies by what constraints did to them, see :func:`.solve.bodies.move_bodies`."""
     body = wp.tid()
-    poses[body] = _pose_by(motion, vertices, sums, body)
+    poses[body] = _pose_by(step, sums, body)
 
 
 @wp.kernel
-def project_vertices(
-    motion: Motion, vertices: Vertices, sums: wp.array[wp.spatial_vectord], positions: wp.array[wp.vec3]
-):
+def project_vertices(step: Step, sums: wp.array[wp.spatial_vectord], positions: wp.array[wp.vec3]):
     """Computes the positions of vertices in these poses, see :func:`.solve.bodies.place_vertices`."""
+    motion = step.motion
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     if body >= 0 and is_movable(motion, body):
-        pose = _pose_by(motion, vertices, sums, body)
+        pose = _pose_by(step, sums, body)
         positions[vertex] = wp.transform_point(pose, motion.bodies.position[wp.tid()])
 
 
 @wp.kernel
-def place_vertices(motion: Motion, vertices: Vertices, positions: wp.array[wp.vec3]):
+def place_vertices(step: Step, positions: wp.array[wp.vec3]):
     """Computes the positions of vertices from poses, see :func:`.solve.bodies.place_vertices`."""
+    motion = step.motion
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     if body >= 0 and is_movable(motion, body):
-        positions[vertex] = wp.transform_point(vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
+        positions[vertex] = wp.transform_point(step.vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
 
 
 @wp.kernel
-def vertex_velocities(motion: Motion, vertices: Vertices, velocities: wp.array[wp.vec3]):
+def vertex_velocities(step: Step, velocities: wp.array[wp.vec3]):
     """Computes the velocities of vertices, see :func:`.solve.bodies.set_vertex_velocities`."""
+    motion, vertices = step.motion, step.vertices
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     if body >= 0 and is_movable(motion, body):
@@ -336,7 +331,7 @@ def set_centres(motion: Motion, poses: wp.array[wp.transform], moved: MovedBodie
     body = wp.tid()
     if is_movable(motion, body):
         moved.centre[body] = centre_of(motion.bodies, body, poses[body])
-        moved.inverse_inertia[body] = inverse_inertia_at(motion.bodies, body, poses[body])
+        moved.inverse_inertia[body] = in_world(motion.bodies.inverse_inertia[body], poses[body])
 
 
 @wp.kernel

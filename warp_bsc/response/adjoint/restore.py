@@ -7,7 +7,7 @@ import enum
 
 import warp as wp
 
-from ..schedule import SolveStatus
+from ..schedule import Loop, Result, SolveStatus
 from ..solve.bodies import change_body_velocity, move_body
 from ..solve.positions import move_vertex
 from ..solve.sweeps import add_delta, count_active
@@ -15,7 +15,7 @@ from ..solve.velocities import change_velocity
 from ..state.fixed_sum import sums_of
 from ..state.planes import MovingPlanes
 from ..state.record import StepRecord, truncation_at
-from ..state.structs import Constraints, Motion, Vertices
+from ..state.structs import Motion, Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,15 +36,11 @@ class Cursor:
 class RestoredStep:
     """A recorded step, restored as it was at the cursor."""
 
-    motion: Motion
+    step: Step
     planes: MovingPlanes
-    vertices: Vertices
-    constraints: Constraints
     status: SolveStatus
     record: StepRecord
     cursor: Cursor
-    restitution: wp.array[float]
-    separation: wp.float64  # smallest separation of constraints [m]
     dt: wp.float64  # length of the step [s]
 
 
@@ -98,10 +94,7 @@ class Gradients:
 
 @wp.struct
 class StateGradients:
-    """Gradients with respect to the states of a step: first its results, then what the inner solver predicted.
-
-    Those of the start are added to.
-    """
+    """Gradients with respect to results of a step, then to what was predicted; those of the start are added to."""
 
     start_q: wp.array[wp.vec3]
     particle_q: wp.array[wp.vec3]
@@ -149,19 +142,14 @@ def is_movable(motion: Motion, body: int) -> bool:
 
 
 @wp.kernel
-def begin_gradients(
-    motion: Motion, undetected: wp.array[int], of_state: StateGradients, gradients: Gradients, of_motion: Motion
-):
-    """Initializes gradients by those of the results; where an undetected step froze everything, only those of starts.
-
-    Threads are over vertices and bodies.
-    """
-    vertex = wp.tid()
+def begin_gradients(restored: RestoredStep, of_state: StateGradients, gradients: Gradients, of_motion: Motion):
+    """Initializes gradients by those of results; where an undetected step froze everything, only those of starts."""
+    motion, undetected, vertex = restored.step.motion, restored.status.results[Result.UNDETECTED] == 1, wp.tid()
     body = vertex - motion.x0.shape[0]
     if body >= 0:
         pose = of_state.body_q[body]
         twist = of_state.body_qd[body]
-        if undetected[0] == 1 and is_movable(motion, body):
+        if undetected and is_movable(motion, body):
             of_motion.bodies.start[body] = pose
             pose = wp.transform(wp.vec3(), wp.quat())
             twist = wp.spatial_vector()
@@ -174,7 +162,7 @@ def begin_gradients(
         x1 = of_state.particle_q[vertex]
         velocity = of_state.particle_qd[vertex]
     of_motion.x0[vertex] = wp.vec3()
-    if undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
+    if undetected and motion.inverse_mass[vertex] > 0.0:
         of_motion.x0[vertex] = x1
         x1 = wp.vec3()
         velocity = wp.vec3()
@@ -183,22 +171,21 @@ def begin_gradients(
 
 
 @wp.kernel
-def move_cursor(step: RestoredStep, move: int, complete: wp.array[int]):
+def move_cursor(restored: RestoredStep, move: int):
     """Moves the cursor, and sets the iteration of the status to the one that computed what is there.
 
-    There is nothing to go back through in a record that is not ``complete``.
+    There is nothing to go back through in a record that is not complete.
     """
-    record = step.record
-    cursor = step.cursor
+    record, cursor, status = restored.record, restored.cursor, restored.status
     iteration = cursor.iteration[0]
     first = cursor.first_sweep[0]
     last = cursor.next_sweep[0]
-    if complete[0] == 0:
+    if record.counts.complete[0] == 0:
         first = 0
         last = -1
     elif move == Move.END:
-        iteration = wp.min(step.status.loop.iteration[0], step.status.max_iterations + step.status.max_truncations + 1)
-        step.status.loop.iteration[0] = iteration
+        iteration = wp.min(status.loop[Loop.ITERATION], status.max_iterations + status.max_truncations + 1)
+        status.loop[Loop.ITERATION] = iteration
         cursor.more_iterations[0] = 1
         first = record.sweep_offsets[iteration + 1]
         last = record.counts.sweeps[0] - 1
@@ -207,7 +194,7 @@ def move_cursor(step: RestoredStep, move: int, complete: wp.array[int]):
         last = record.sweep_offsets[iteration + 1] - 1
     else:
         iteration -= 1
-        step.status.loop.iteration[0] = wp.max(iteration, 0)
+        status.loop[Loop.ITERATION] = wp.max(iteration, 0)
         cursor.more_iterations[0] = wp.where(iteration >= 0, 1, 0)
     cursor.iteration[0] = iteration
     cursor.first_sweep[0] = first
@@ -227,67 +214,65 @@ def _step_back(cursor: Cursor):
 
 
 @wp.kernel
-def restore_multipliers(step: RestoredStep, swept: Projection):
+def restore_multipliers(restored: RestoredStep, swept: Projection):
     """Restores multipliers as they were before a sweep, and the sums of what they changed."""
-    record, constraints, sweep = step.record, step.constraints, step.cursor.next_sweep[0]
+    step, record, sweep = restored.step, restored.record, restored.cursor.next_sweep[0]
     entry = entry_of(record, sweep, wp.tid())
-    if sweep < step.cursor.first_sweep[0] or entry < 0:
+    if sweep < restored.cursor.first_sweep[0] or entry < 0:
         return
     i = record.constraint[entry]
     old = record.multiplier[entry]
-    change = old - swept.multiplier[i]
-    add_delta(step.motion, step.vertices, constraints, i, change, swept.x, swept.sums, swept.body_sums)
+    add_delta(step, i, old - swept.multiplier[i], swept.x, swept.sums, swept.body_sums)
     swept.multiplier[i] = old
-    constraints.previous_multiplier[i] = record.previous_multiplier[entry]
-    count_active(step.motion, step.vertices, constraints, i)
+    step.constraints.previous_multiplier[i] = record.previous_multiplier[entry]
+    count_active(step, i)
 
 
 @wp.kernel
-def restore_positions(step: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
-    """Restores positions and poses as they were before a sweep, and adds up the gradients of positions.
-
-    Threads are over vertices and bodies. Writes the sums of the changes of poses to ``sums``.
-    """
+def restore_positions(restored: RestoredStep, gradients: Gradients, sums: wp.array[wp.spatial_vectord]):
+    """Restores positions, poses and ``sums`` of their changes before a sweep, and adds up gradients of positions."""
     vertex = wp.tid()
+    step = restored.step
     body = vertex - step.motion.x0.shape[0]
     if body >= 0:
-        move_body(step.motion, step.vertices, body)
+        move_body(step, body)
         shift, turn = sums_of(step.vertices.bodies.delta_x, body)
         sums[body] = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
         return
     if vertex == 0:
-        _step_back(step.cursor)
+        _step_back(restored.cursor)
     gradients.x1[vertex] = gradients.x1[vertex] + gradients.more_x1[vertex]
     gradients.more_x1[vertex] = wp.vec3()
     if step.vertices.active[vertex] != 0:
-        move_vertex(step.motion, step.vertices, vertex)
+        move_vertex(step, vertex)
 
 
 @wp.kernel
-def restore_velocities(step: RestoredStep, gradients: Gradients):
+def restore_velocities(restored: RestoredStep, gradients: Gradients):
     """Restores velocities as they were before a sweep, and adds up their gradients, over vertices and bodies."""
     vertex = wp.tid()
+    step = restored.step
     body = vertex - step.motion.x0.shape[0]
     if body >= 0:
         change = wp.spatial_vectord()
-        if change_body_velocity(step.motion, step.vertices, body):
+        if change_body_velocity(step, body):
             for i in range(6):
                 change[i] = wp.float64(gradients.bodies.velocity[body][i])
         gradients.bodies.velocity_change[body] = change
         return
     if vertex == 0:
-        _step_back(step.cursor)
+        _step_back(restored.cursor)
     gradients.velocity[vertex] = gradients.velocity[vertex] + gradients.more_velocity[vertex]
     gradients.more_velocity[vertex] = wp.vec3()
-    is_free = change_velocity(step.motion, step.vertices, vertex)
+    is_free = change_velocity(step, vertex)
     gradients.velocity_change[vertex] = wp.where(is_free, gradients.velocity[vertex], wp.vec3())
 
 
 @wp.kernel
-def restore_paths(step: RestoredStep, gradients: Gradients, of_paths: Paths):
+def restore_paths(restored: RestoredStep, gradients: Gradients, of_paths: Paths):
     """Restores paths before truncation; the gradients of their vertices and bodies move to ``of_paths``."""
-    record = step.record
-    entry = truncation_at(record, step.cursor.iteration[0], wp.tid())
+    step, record = restored.step, restored.record
+    entry = truncation_at(record, restored.cursor.iteration[0], wp.tid())
     if entry < 0:
         return
     vertex = record.vertex[entry]
@@ -321,27 +306,16 @@ def collect_gradients_on_bodies(
     gradients.on_bodies[vertex] = collected
 
 
-@wp.func
-def _missing(complete: wp.array[int]) -> float:
-    """Returns what is added to all gradients: NaN if the record of the step is incomplete, else 0."""
-    return wp.where(complete[0] == 0, wp.nan, float(0.0))
-
-
 @wp.kernel
 def finish_gradients(
-    motion: Motion,
-    gradients: Gradients,
-    complete: wp.array[int],
-    of_motion: Motion,
-    of_state: StateGradients,
-    of_model: ModelGradients,
+    restored: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of the inputs of the step; NaN if its record is incomplete.
 
     Those of vertices of shapes remain gradients with respect to what was predicted of them.
     """
     particle = wp.tid()
-    missing = _missing(complete)
+    missing = wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
@@ -352,7 +326,7 @@ def finish_gradients(
         of_motion.velocity[particle] = velocity
         return
     masses = of_model.particle_inv_mass
-    if masses and motion.inverse_mass[particle] > 0.0:
+    if masses and restored.step.motion.inverse_mass[particle] > 0.0:
         masses[particle] = masses[particle] + of_motion.inverse_mass[particle] + missing
     of_state.particle_q[particle] = x1 + wp.vec3(missing)
     of_state.particle_qd[particle] = velocity + wp.vec3(missing)
@@ -361,19 +335,14 @@ def finish_gradients(
 
 @wp.kernel
 def finish_body_gradients(
-    motion: Motion,
-    gradients: Gradients,
-    complete: wp.array[int],
-    of_motion: Motion,
-    of_state: StateGradients,
-    of_model: ModelGradients,
+    restored: RestoredStep, gradients: Gradients, of_motion: Motion, of_state: StateGradients, of_model: ModelGradients
 ):
     """Writes the gradients of poses, velocities and masses of bodies; NaN if the record of the step is incomplete.
 
     Where the response moves no bodies, only those of poses change.
     """
-    body = wp.tid()
-    missing = _missing(complete)
+    motion, body = restored.step.motion, wp.tid()
+    missing = wp.where(restored.record.counts.complete[0] == 0, wp.nan, float(0.0))
     start = of_state.start_body_q[body] + of_motion.bodies.start[body]
     end = of_motion.bodies.end[body]
     if motion.bodies.of_vertex:

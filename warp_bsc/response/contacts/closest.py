@@ -2,20 +2,10 @@
 
 import warp as wp
 
-from ...kernels.closest import closest_coordinates
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.closest import closest_weights
+from ...kernels.polynomials import EDGE_EDGE
 from ..state.structs import Motion
-from ..state.vectors import ONE, ZERO, corners_of, relative
-
-
-@wp.func
-def closest_weights(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between the closest points of two elements."""
-    if kind == EDGE_EDGE:
-        at = closest_coordinates(EDGE_EDGE, b - a, d - c, c - a)
-        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1])
-    at = closest_coordinates(VERTEX_FACE, c - b, d - b, a - b)
-    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1])
+from ..state.vectors import ZERO, corners_of, relative
 
 
 @wp.func

@@ -3,43 +3,22 @@
 import warp as wp
 
 from ...detection.settings import Count
-from ...kernels.pipeline.queues import is_filled
+from ...kernels.closest import contact_weights
+from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import SolveStatus, count_contact, has_overflowed, is_dividing, widened
+from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, is_dividing, widened
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
-from ..state.structs import Connectivity, Constraints, ContactKind, DividingPlanes, Motion, Pace, Vertices
+from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
-from ..tuning import MAX_SAGITTA, PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
-from .constraints import (
-    TOUCH,
-    Constraint,
-    add_constraint,
-    contact_friction,
-    contact_weights,
-    distances_at_start,
-    feasible,
-    is_pushing,
-    kind_of_contact,
-    pace_of,
-    sagitta,
-)
+from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
+from . import constraints, rules
+from .constraints import TOUCH
 from .dividing_planes import add_dividing_plane, add_plane
 from .first_contact import update_first_contact
 from .queue import PairQueue, has_pair, vertices_of
-from .rules import (
-    ContactClass,
-    are_occluded,
-    are_on_body,
-    classify_contact,
-    collides,
-    crosses_face,
-    inverse_mass_of,
-    is_movable,
-    is_on_body,
-    owner_of,
-)
+from .rules import ContactClass
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,29 +28,29 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 
 @wp.kernel(enable_backward=False)
-def count_crossings(
-    motion: Motion, mesh: Connectivity, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]
-):
+def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
+    mesh = step.mesh
     if not is_filled(i, pairs, counts, _QUEUED):
         return
     edge = pairs[i][0]
     face = pairs[i][1]
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    if is_movable(motion, corners) or motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if crosses_face(motion, mesh, edge, face):
+    movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
+    if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+        if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
 
 
 @wp.func
 def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     """Returns whether a plane stops a vertex: not one of its own body, or of a shape that it does not collide with."""
-    if not is_on_body(motion, vertex):
+    body = body_of(motion, vertex)
+    if body < 0:
         return True
-    body = motion.bodies.of_vertex[vertex]
     shape = motion.bodies.shape[vertex - motion.bodies.particle_count]
-    return body != planes.body[i] and collides(motion.bodies, shape, planes.shape[i])
+    return body != planes.body[i] and rules.collides(motion.bodies, shape, planes.shape[i])
 
 
 @wp.func
@@ -82,7 +61,7 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
     predicted to end in it: a body goes no deeper.
     """
     lowest = ZERO
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         before, _error = signed_distance(planes.start[i], motion.x0[vertex])
         lowest = wp.min(before, ZERO)
         if motion.bodies.responds == 0:
@@ -92,14 +71,12 @@ def level(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float
 
 
 @wp.func
-def offset_from(
-    motion: Motion, planes: MovingPlanes, i: int, vertex: int, status: SolveStatus, separation: wp.float64
-) -> wp.float64:
+def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: SolveStatus) -> wp.float64:
     """Returns the offset at which constraints keep a vertex that a plane stops, without a minimum distance [m]."""
-    distance = level(motion, planes, i, vertex)
+    distance = level(step.motion, planes, i, vertex)
     if distance == ZERO:
-        before, _error = signed_distance(planes.start[i], motion.x0[vertex])
-        distance = feasible(motion, wp.vec4i(vertex), widened(separation, status), before, separation)
+        before, _error = signed_distance(planes.start[i], step.motion.x0[vertex])
+        distance = constraints.feasible(step, wp.vec4i(vertex), widened(step.separation, status), before)
     return planes.end[i][3] + distance
 
 
@@ -109,7 +86,7 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
 
     Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
     """
-    if is_on_body(motion, vertex):
+    if body_of(motion, vertex) >= 0:
         return level(motion, planes, i, vertex), ZERO
     if not motion.distances.radius:
         return ZERO, ZERO
@@ -119,26 +96,16 @@ def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: 
 
 
 @wp.kernel
-def collect_penetrations(
-    # in
-    motion: Motion,
-    planes: MovingPlanes,
-    separation: wp.float64,
-    ahead: bool,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing: DividingPlanes, status: SolveStatus):
     """Adds constraints for vertices that may have entered solids; after the last projection, dividing planes too.
 
     Vertices that were inside at the start are excluded, like pairs of elements that crossed. Ahead of the first
     detection, contacts are counted as those of the predicted motion only.
     """
     vertex = wp.tid()
+    motion, vertices, separation = step.motion, step.vertices, step.separation
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0:
+    if rules.inverse_mass_of(motion, vertex) == 0.0:
         return
     for i in range(planes.end.shape[0]):
         if planes.world[i] >= 0 and planes.world[i] != world:
@@ -159,19 +126,19 @@ def collect_penetrations(
         after -= kept
         if before < -error_before:
             if not ahead:
-                wp.atomic_add(status.detection.excluded, 0, 1)
+                wp.atomic_add(status.detection, int(Detection.EXCLUDED), 1)
             continue
         if ahead:
-            wp.atomic_add(status.results.first_hits, 0, wp.where(near, 0, 1))
+            wp.atomic_add(status.results, int(Result.FIRST_HITS), wp.where(near, 0, 1))
         else:
             count_contact(status, world)
             vertices.changed[vertex] = 1
-            if status.loop.iteration[0] == 0 and is_on_body(motion, vertex):
+            if status.loop[Loop.ITERATION] == 0 and body_of(motion, vertex) >= 0:
                 status.is_fast[world] = 1  # as between elements, see _collect_contact
         plane = planes.end[i]
-        added = Constraint()
+        added = constraints.Constraint()
         added.normal = wp.vec3d(plane[0], plane[1], plane[2])
-        if is_dividing(status, world, status.loop.iteration[0]):
+        if is_dividing(status, world, status.loop[Loop.ITERATION]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
             if not dividing.first:
                 continue
@@ -183,17 +150,17 @@ def collect_penetrations(
             add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, added.normal, offset, margin, ZERO)
             added.multiplier = TOUCH * added.normal
         else:
-            status.loop.projecting[0] = 1
+            status.loop[Loop.PROJECTING] = 1
         added.vertices = wp.vec4i(vertex)
         added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
         added.min_distance = wp.max(kept, ZERO)
-        added.separation = offset_from(motion, planes, i, vertex, status, separation) + added.min_distance
-        added.friction = contact_friction(motion.friction[vertex], planes.friction[i])
+        added.separation = offset_from(step, planes, i, vertex, status) + added.min_distance
+        added.friction = constraints.contact_friction(motion.friction[vertex], planes.friction[i])
         added.kind = ContactKind.PLANE
         added.plane = i
         added.within_tolerance = True
         added.pace = Pace.SLOW
-        add_constraint(motion, vertices, added, constraints)
+        constraints.add_constraint(step, added)
 
 
 @wp.func
@@ -204,58 +171,49 @@ def mark_changed(vertices: Vertices, corners: wp.vec4i):
 
 
 @wp.func
-def _collect_contact(
-    motion: Motion,
-    mesh: Connectivity,
-    contacts: PairQueue,
-    i: int,
-    separation: wp.float64,
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not has_pair(contacts, i):
         return
+    motion, vertices = step.motion, step.vertices
     near = int(contacts.status[i]) == FREE  # within reach of its minimum distance, but not a contact
     if near and not motion.distances.radius:
         return
     kind = contacts.kind
     toi = contacts.toi[i]
     corners = vertices_of(contacts, i)
-    owner = owner_of(motion, corners)
+    owner = rules.owner_of(motion, corners)
     if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
         return
-    added = Constraint()
+    added = constraints.Constraint()
     bound = toi
     if motion.distances.radius:
-        start, kept = distances_at_start(motion, corners, kind)
+        start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
         bound = start
-    may_cross = status.results.crossings[0] > 0
-    found = classify_contact(motion, mesh, kind, contacts.pairs[i], corners, owner, bound, may_cross)
+    may_cross = status.results[Result.CROSSINGS] > 0
+    found = rules.classify_contact(step, kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.CROSSED:
-        wp.atomic_add(status.detection.excluded, 0, wp.where(near, 0, 1))
+        wp.atomic_add(status.detection, int(Detection.EXCLUDED), wp.where(near, 0, 1))
     if found == ContactClass.OF_BODIES:
-        wp.atomic_add(status.detection.of_bodies, 0, 1)
+        wp.atomic_add(status.detection, int(Detection.OF_BODIES), 1)
         mark_changed(vertices, corners)
     if found != ContactClass.OURS:
         return
     world = motion.world[corners[0]]
-    iteration = status.loop.iteration[0]
+    iteration = status.loop[Loop.ITERATION]
     added.vertices = corners
-    added.pace = pace_of(motion, corners, kind)
+    added.pace = constraints.pace_of(motion, corners, kind)
     added.weights = contact_weights(kind, contacts.coordinates[i])
     added.normal = contacts.normal[i]
-    added.kind = kind_of_contact(kind)
+    added.kind = constraints.kind_of_contact(kind)
     if not near:
         count_contact(status, world)
         mark_changed(vertices, corners)
         if iteration == 0:
             # dividing planes do not move: they would stop a body that takes along what it pushes
-            moves = added.pace == Pace.FAST or are_on_body(motion, corners)
-            if moves or is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
+            moves = added.pace == Pace.FAST or rules.are_on_body(motion, corners)
+            if moves or constraints.is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
                 status.is_fast[world] = 1
     if is_dividing(status, world, iteration):
         if near:
@@ -264,46 +222,42 @@ def _collect_contact(
             update_first_contact(vertices, corners[j], toi, added.kind, i)
         if not dividing.first:
             return
-        add_dividing_plane(motion, vertices, corners, kind, separation, added.min_distance, dividing, True, True)
+        add_dividing_plane(step, corners, kind, added.min_distance, dividing, True, True)
         added.multiplier = TOUCH * added.normal
     else:
         if not near:
-            status.loop.projecting[0] = 1
+            status.loop[Loop.PROJECTING] = 1
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
-            if are_occluded(motion, mesh, contacts.pairs[i], corners, added.normal, time):
+            if rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time):
                 return  # the next detection finds it, if it is still there
-    target = widened(separation, status)
+    target = widened(step.separation, status)
     if added.pace == Pace.SLOW:
         before = wp.dot(added.normal, relative(added.weights, corners, motion.x0)) - added.min_distance
-        target = feasible(motion, corners, target, before, separation)
-    target += sagitta(motion, vertices, corners, MAX_SAGITTA * separation)
+        target = constraints.feasible(step, corners, target, before)
+    target += constraints.sagitta(step, corners)
     target += added.min_distance
     if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
-        status.detection.too_near[0] = 1
-        status.loop.projecting[0] = 1
+        status.detection[Detection.TOO_NEAR] = 1
+        status.loop[Loop.PROJECTING] = 1
         status.contact_iteration[world] = iteration
     added.separation = target
-    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
     added.within_tolerance = contacts.within_tolerance[i]
     added.toi = toi
-    add_constraint(motion, vertices, added, constraints)
+    constraints.add_constraint(step, added)
 
 
 @wp.kernel
 def collect_contacts(
     # in
-    motion: Motion,
-    mesh: Connectivity,
     first: PairQueue,
     second: PairQueue,
-    separation: wp.float64,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     can_search: bool,
     # in and out
-    vertices: Vertices,
-    constraints: Constraints,
+    step: Step,
     dividing: DividingPlanes,
     status: SolveStatus,
 ):
@@ -315,14 +269,14 @@ def collect_contacts(
     i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(motion, mesh, first, i, separation, vertices, constraints, dividing, status)
-    _collect_contact(motion, mesh, second, i, separation, vertices, constraints, dividing, status)
+    _collect_contact(step, first, i, dividing, status)
+    _collect_contact(step, second, i, dividing, status)
 
 
 @wp.kernel
-def drop_if_full(constraints: Constraints, record: StepRecord, needed: int):
+def drop_if_full(step: Step, record: StepRecord, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
-    if constraints.count[0] > constraints.vertices.shape[0] - needed:
-        constraints.count[0] = 0
+    if step.constraints.count[0] > step.constraints.vertices.shape[0] - needed:
+        step.constraints.count[0] = 0
         if is_recording(record):
             record.counts.dropped[0] = 1

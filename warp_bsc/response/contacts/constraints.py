@@ -4,11 +4,11 @@ import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.poses import turn_between
-from ..state.structs import Constraints, ContactKind, Motion, Pace, Vertices
+from ..state.structs import ContactKind, Motion, Pace, Step, body_of, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
-from ..tuning import RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
+from ..tuning import MAX_SAGITTA, RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
 from .rules import are_on_body, inverse_mass_of
 
 TOUCH = wp.constant(wp.float64(1e-100))
@@ -50,18 +50,6 @@ def kind_of_pair(kind: int) -> int:
 
 
 @wp.func
-def contact_weights(kind: int, c: wp.vec3d) -> wp.vec4d:
-    """Returns the weights of four vertices in the vector between contact points, by kind and coordinates of a pair."""
-    if kind == EDGE_EDGE:
-        return wp.vec4d(ONE - c[0], c[0], c[1] - ONE, -c[1])
-    if kind == VERTEX_EDGE:
-        return wp.vec4d(ONE, c[0] - ONE, -c[0], ZERO)
-    if kind == VERTEX_VERTEX:
-        return wp.vec4d(ONE, -ONE, ZERO, ZERO)
-    return wp.vec4d(ONE, -c[0], -c[1], -c[2])
-
-
-@wp.func
 def longest_path(motion: Motion, corners: wp.vec4i) -> wp.float64:
     """Returns the length of the longest predicted path of four vertices [m]."""
     path = ZERO
@@ -96,10 +84,10 @@ def distances_at_start(motion: Motion, corners: wp.vec4i, kind: int):
 
 
 @wp.func
-def min_distance_of(constraints: Constraints, i: int) -> wp.float64:
+def min_distance_of(step: Step, i: int) -> wp.float64:
     """Returns the part of the separation of a constraint that its pair must keep [m]; 0 without minimum distances."""
-    if constraints.min_distance:
-        return constraints.min_distance[i]
+    if step.constraints.min_distance:
+        return step.constraints.min_distance[i]
     return ZERO
 
 
@@ -134,24 +122,22 @@ def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
-def feasible(
-    motion: Motion, corners: wp.vec4i, target: wp.float64, start: wp.float64, separation: wp.float64
-) -> wp.float64:
+def feasible(step: Step, corners: wp.vec4i, target: wp.float64, start: wp.float64) -> wp.float64:
     """Returns the separation of slow elements [m]: hardly more than at the start, as standing still should nearly do.
 
     Fast elements get ``target``, which is the most; ``start`` is the distance at the start. Both, like the result, are
     without minimum distances.
     """
-    path = longest_path(motion, corners)
+    path = longest_path(step.motion, corners)
     before = start
-    least = SMALL_DISTANCE * separation
-    if _may_rest(motion, corners):
+    least = SMALL_DISTANCE * step.separation
+    if _may_rest(step.motion, corners):
         before = wp.min(start, REST * path)
-        x = to_double(motion.x1[corners[0]])
+        x = to_double(step.motion.x1[corners[0]])
         rounding = ROUNDING * wp.max(wp.abs(x[0]), wp.max(wp.abs(x[1]), wp.abs(x[2])))
         least = wp.min(least, wp.max(REST * path, rounding))
     recovered = wp.max(before + RECOVERY * path, least)
-    return wp.min(target, wp.max(start, wp.min(separation, recovered)))
+    return wp.min(target, wp.max(start, wp.min(step.separation, recovered)))
 
 
 @wp.func
@@ -164,27 +150,29 @@ def contact_friction(a: float, b: float) -> float:
 
 
 @wp.func
-def gap(vertices: Vertices, constraints: Constraints, i: int) -> wp.float64:
+def gap(step: Step, i: int) -> wp.float64:
     """Returns the distance of contact points at the end of the step less the separation [m]; negative if violated."""
-    end = relative(constraints.weights[i], constraints.vertices[i], vertices.x1)
+    constraints = step.constraints
+    end = relative(constraints.weights[i], constraints.vertices[i], step.vertices.x1)
     return wp.dot(constraints.normal[i], end) - constraints.separation[i]
 
 
 @wp.func
 def approach_of(
-    motion: Motion, vertices: Vertices, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, separation: wp.float64
+    step: Step, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, separation: wp.float64
 ) -> wp.float64:
     """Returns the approach of contact points over the step as a share of their violation, in [0, 1]."""
-    end = wp.dot(normal, relative(weights, corners, vertices.x1))
-    start = wp.dot(normal, relative(weights, corners, motion.x0))
+    end = wp.dot(normal, relative(weights, corners, step.vertices.x1))
+    start = wp.dot(normal, relative(weights, corners, step.motion.x0))
     if end < separation:
         return wp.clamp((start - end) / (separation - end), ZERO, ONE)
     return ONE
 
 
 @wp.func
-def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constraints: Constraints):
+def add_constraint(step: Step, added: Constraint):
     """Adds a constraint if it fits; counts it in any case."""
+    constraints = step.constraints
     i = take_slot_int(constraints.count)
     if i < constraints.vertices.shape[0]:
         constraints.vertices[i] = added.vertices
@@ -196,9 +184,7 @@ def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constr
         constraints.plane[i] = added.plane
         constraints.within_tolerance[i] = added.within_tolerance
         constraints.toi[i] = added.toi
-        constraints.approach[i] = approach_of(
-            motion, vertices, added.vertices, added.weights, added.normal, added.separation
-        )
+        constraints.approach[i] = approach_of(step, added.vertices, added.weights, added.normal, added.separation)
         constraints.pace[i] = added.pace
         constraints.position_multiplier[i] = added.multiplier
         constraints.velocity_multiplier[i] = wp.vec3d()
@@ -209,30 +195,30 @@ def add_constraint(motion: Motion, vertices: Vertices, added: Constraint, constr
 
 
 @wp.func
-def moves_body(motion: Motion, constraints: Constraints, i: int) -> bool:
+def moves_body(step: Step, i: int) -> bool:
     """Returns whether a constraint moves a body."""
-    return are_on_body(motion, constraints.vertices[i])
+    return are_on_body(step.motion, step.constraints.vertices[i])
 
 
 @wp.func
-def has_pushed(constraints: Constraints, i: int) -> bool:
+def has_pushed(step: Step, i: int) -> bool:
     """Returns whether a constraint pushed its vertices apart, or is of a contact that was divided, see TOUCH."""
-    return wp.dot(constraints.position_multiplier[i], constraints.normal[i]) > ZERO
+    return wp.dot(step.constraints.position_multiplier[i], step.constraints.normal[i]) > ZERO
 
 
 @wp.func
-def sagitta(motion: Motion, vertices: Vertices, corners: wp.vec4i, most: wp.float64) -> wp.float64:
-    """Returns how far the arcs of vertices on turning bodies are from their chords at most [m], up to ``most``.
+def sagitta(step: Step, corners: wp.vec4i) -> wp.float64:
+    """Returns how far the arcs of vertices on turning bodies are from their chords [m], up to ``MAX_SAGITTA``.
 
     The centre of mass moves straight, so that an arm r that turns by an angle a is off by r (1 - cos(a / 2)).
     """
     off = ZERO
-    if motion.bodies.of_vertex:
-        for j in range(4):
-            body = motion.bodies.of_vertex[corners[j]]
-            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                turn = turn_between(motion.bodies.start[body], motion.bodies.end[body])
-                half = wp.sin(wp.float64(0.25) * wp.length(turn))
-                arm = to_double(motion.x1[corners[j]]) - vertices.bodies.centre[body]
-                off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
-    return wp.min(off, most)
+    bodies = step.motion.bodies
+    for j in range(4):
+        body = body_of(step.motion, corners[j])
+        if can_move(step.motion, body):
+            turn = turn_between(bodies.start[body], bodies.end[body])
+            half = wp.sin(wp.float64(0.25) * wp.length(turn))
+            arm = to_double(step.motion.x1[corners[j]]) - step.vertices.bodies.centre[body]
+            off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
+    return wp.min(off, MAX_SAGITTA * step.separation)

@@ -5,7 +5,7 @@ import warp as wp
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ...detection.settings import Count
-from ..schedule import decide
+from ..schedule import Loop, Result, decide
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
 from .impacts import count_grazing
@@ -15,21 +15,21 @@ from .search import find_contacts_without_queues
 
 def detect_crossings(work: Workspace) -> None:
     """Counts the edges that cross faces at the start of the step, if they may have changed since the last."""
-    wp.capture_if(work.status.loop.recount, _count_crossings, work=work)
+    wp.capture_if(work.loop[Loop.RECOUNT], _count_crossings, work=work)
 
 
 def _count_crossings(work):
-    motion, candidates, crossings = work.motion.vertices, work.crossing_candidates, work.status.results.crossings
+    candidates, crossings = work.crossing_candidates, work.results[Result.CROSSINGS]
     crossings.zero_()
-    retry_until_fits(lambda: candidates.find(motion.x0), candidates, work.device)
-    inputs = [motion, work.connectivity, candidates.pairs, candidates.counts, crossings]
+    retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
+    inputs = [work.step, candidates.pairs, candidates.counts, crossings]
     work.launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
 
 
 def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
     """Adds constraints for vertices that enter solids of planes; ``ahead`` of the first detection also those near."""
-    inputs = [work.motion.vertices, work.motion.planes, work.separation, ahead]
-    work.launch(collect_penetrations, work.vertices_at_planes, inputs, _outputs(work))
+    inputs = [work.step, work.motion.planes, ahead, work.dividing, work.status]
+    work.launch(collect_penetrations, work.vertices_at_planes, inputs)
 
 
 def detect(work: Workspace, *, only_changed: bool = False) -> None:
@@ -37,45 +37,39 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
 
     With ``only_changed``, only vertices that changed since the last detection are looked at.
     """
-    detector, motion, vertices = work.detector, work.motion.vertices, work.vertices
+    detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else None
-    retry_until_fits(
-        lambda: detector.find_contacts(motion.x0, vertices.x1, refit=only_changed, changed=changed),
-        detector,
-        work.device,
-    )
+
+    def find():
+        detector.find_contacts(work.step.motion.x0, vertices.x1, refit=only_changed, changed=changed)
+
+    retry_until_fits(find, detector, work.device)
     work.reserve(work.max_contacts)
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
-        work.launch(drop_if_full, 1, [work.constraints, work.record, work.max_contacts])
-    queues, mesh = queues_of(detector), work.connectivity
+        work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
+    queues = queues_of(detector)
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
-        inputs = [motion, mesh, *pair, work.separation, *overflow, *_outputs(work)]
+        inputs = [*pair, *overflow, work.step, work.dividing, work.status]
         work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
-        work.launch_over(count_grazing, counted(queues[:2]), [motion, vertices, mesh, *queues[:2], work.record])
+        work.launch_over(count_grazing, counted(queues[:2]), [work.step, *queues[:2], work.record])
     _decide(work, overflow)
     if can_search:
-        wp.capture_if(work.status.results.undetected, _search, work=work, overflow=overflow)
+        wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)
 
 
 def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
-    broad_phase, motion = work.detector.broad_phase, work.motion.vertices
-    broad_phase.fit(motion.x0, work.vertices.x1)
-    arrays = {"mesh": work.connectivity, "motion": motion, "vertices": work.vertices}
-    arrays |= {"dividing": work.dividing, "status": work.status}
-    find_contacts_without_queues(broad_phase, work.separation, **arrays)
+    broad_phase = work.detector.broad_phase
+    broad_phase.fit(work.step.motion.x0, work.vertices.x1)
+    find_contacts_without_queues(broad_phase, work.step, work.dividing, work.status)
     _decide(work, overflow)
 
 
 def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
-    work.launch(decide, 1, [work.constraints, *overflow], [work.status])
-
-
-def _outputs(work):
-    return [work.vertices, work.constraints, work.dividing, work.status]
+    work.launch(decide, 1, [work.step, *overflow], [work.status])

@@ -4,7 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.pairs import firsts_of
 from ...kernels.pipeline.queues import take_slot_int
-from ..state.structs import DividingPlanes, Motion, Vertices
+from ..state.structs import DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, relative, to_double
 from ..tuning import CLOSE_MARGIN, MARGIN, SLACK, SMALL_DISTANCE
 from .closest import closest_direction, closest_vector
@@ -81,14 +81,7 @@ class _Side:
 
 @wp.func
 def _side(
-    motion: Motion,
-    vertices: Vertices,
-    corners: wp.vec4i,
-    begin: int,
-    end: int,
-    origin: wp.vec3d,
-    normal: wp.vec3d,
-    half: wp.float64,
+    step: Step, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d, normal: wp.vec3d, half: wp.float64
 ) -> _Side:
     """Returns how far the vertices from ``begin`` to ``end`` reach against a normal.
 
@@ -102,14 +95,14 @@ def _side(
     side.fixed = FAR
     for j in range(begin, end):
         vertex = corners[j]
-        start = to_double(motion.x0[vertex])
-        path = to_double(vertices.x1[vertex]) - start
+        start = to_double(step.motion.x0[vertex])
+        path = to_double(step.vertices.x1[vertex]) - start
         x0 = wp.dot(normal, start - origin) - half
         x1 = x0 + wp.dot(normal, path)
         side.start = wp.min(side.start, x0)
         side.reach = wp.min(side.reach, HALF * (x0 + x1 - wp.length(path)))
         side.end = wp.min(side.end, x1)
-        inverse_mass = wp.float64(inverse_mass_of(motion, vertex))
+        inverse_mass = wp.float64(inverse_mass_of(step.motion, vertex))
         side.inverse_mass += inverse_mass
         if inverse_mass == ZERO:
             side.fixed = wp.min(side.fixed, x1)
@@ -118,11 +111,9 @@ def _side(
 
 @wp.func
 def add_dividing_plane(
-    motion: Motion,
-    vertices: Vertices,
+    step: Step,
     corners: wp.vec4i,
     kind: int,
-    separation: wp.float64,
     min_distance: wp.float64,
     planes: DividingPlanes,
     is_contact: bool,
@@ -132,28 +123,19 @@ def add_dividing_plane(
 
     The plane lies where both would meet at the end by their masses, but between them at the start, and not within a
     vertex that cannot be moved. Elements that touch at the start have none, nor do those without a contact that planes
-    cannot bring together.
-
-    Args:
-        motion: The motion.
-        vertices: The vertices as they were moved so far.
-        corners: The vertices of both elements.
-        kind: The kind of pair.
-        separation: Distance that projection moves contacts apart [m].
-        min_distance: Distance that the elements must keep [m]: half of it is on either side.
-        planes: The planes, which the new one is added to.
-        is_contact: Whether the elements are in contact.
-        may_stop: Whether elements get a plane that stops them although their closest points do not meet.
+    cannot bring together. Of the distance that the elements must keep, ``min_distance`` [m], half is on either side.
+    With ``may_stop``, elements get a plane that stops them although their closest points do not meet.
 
     Returns:
         Whether the elements meet at the end, or nearly, without planes.
     """
+    motion = step.motion
     normal = closest_direction(motion, corners, kind)
     origin = to_double(motion.x0[corners[3]])
     split = firsts_of(kind)
     half = HALF * min_distance
-    above = _side(motion, vertices, corners, 0, split, origin, normal, half)
-    below = _side(motion, vertices, corners, split, 4, origin, -normal, half)
+    above = _side(step, corners, 0, split, origin, normal, half)
+    below = _side(step, corners, split, 4, origin, -normal, half)
     distance = above.start + below.start
     if not is_contact and (distance <= ZERO or above.reach + below.reach > ZERO):
         return False
@@ -165,7 +147,7 @@ def add_dividing_plane(
             if movable[j] >= 0:
                 _add_node(planes, movable[j], INCOMPLETE)
         return False
-    margin = wp.where(distance < SMALL_DISTANCE * separation, CLOSE_MARGIN, MARGIN) * distance
+    margin = wp.where(distance < SMALL_DISTANCE * step.separation, CLOSE_MARGIN, MARGIN) * distance
     least = margin + SLACK * distance
     share = above.inverse_mass / (above.inverse_mass + below.inverse_mass)
     offset = above.end + share * (-below.end - above.end)
@@ -174,7 +156,7 @@ def add_dividing_plane(
     offset = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
     if not may_stop and (above.end < offset or -below.end > offset):
         weights, _between = closest_vector(motion, corners, kind)
-        if wp.dot(normal, relative(weights, corners, vertices.x1)) >= half + half + margin:
+        if wp.dot(normal, relative(weights, corners, step.vertices.x1)) >= half + half + margin:
             return False
     add_plane(planes, movable, split, normal, wp.dot(normal, origin) + offset, margin, half)
     return above.end + below.end < margin

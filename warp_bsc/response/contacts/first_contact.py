@@ -49,12 +49,6 @@ def update_first_contact(vertices: Vertices, vertex: int, time: wp.float64, kind
 
 
 @wp.func
-def share_before(time: wp.float64) -> wp.float64:
-    """Returns the share of a path that is left before its first contact, at ``time`` in [0, 1]."""
-    return SHARE_OF_PATH * time
-
-
-@wp.func
 def truncated_path(x0: wp.vec3d, x1: wp.vec3d, time: wp.float64) -> wp.vec3d:
     """Returns the path of a vertex truncated before its first contact, at ``time`` in [0, 1] [m]."""
-    return share_before(time) * (x1 - x0)
+    return SHARE_OF_PATH * time * (x1 - x0)

@@ -4,65 +4,19 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
-from ...kernels.pipeline.pairs import firsts_of
+from ...kernels.closest import weights_across
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..schedule import SolveStatus, has_overflowed, is_projecting
-from ..state.structs import Connectivity, Constraints, ContactKind, Motion, Pace, Vertices
-from ..state.vectors import ONE, ZERO, corners_of
+from ..schedule import Result, SolveStatus, is_projecting
+from ..state.structs import ContactKind, Pace, Step
+from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
-from .constraints import (
-    Constraint,
-    add_constraint,
-    contact_friction,
-    distances_at_start,
-    feasible,
-    longest_path,
-    pace_of,
-)
+from . import constraints
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
-from .rules import are_occluded, are_on_body, crossed_at_start, is_movable
+from .rules import ContactClass, are_occluded, are_on_body, crossed_at_start, owner_of
 
 wp.set_module_options({"enable_backward": False})
-
-_PARALLEL = wp.constant(wp.float64(1.0e-12))
-"""Squared sine up to which edges, or two sides of a face, count as parallel."""
-
-
-@wp.func
-def weights_across(motion: Motion, corners: wp.vec4i, kind: int):
-    """Returns where the line across both elements at the start meets them.
-
-    Returns:
-        The weights of the four vertices in the vector between the two points, the unit vector across both elements,
-        from the second to the first, and the distance along it [m], which is 0 unless both points are within the
-        elements: only then are they their closest points.
-    """
-    a, b, c, d = corners_of(motion.x0, corners)
-    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
-    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
-    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
-    n = wp.cross(u, v)
-    nn = wp.length_sq(n)
-    s = wp.dot(wp.cross(w, v), n)
-    r = wp.dot(wp.cross(u, w), n)
-    weights = wp.vec4d()
-    if nn <= _PARALLEL * wp.length_sq(u) * wp.length_sq(v) or not (s > ZERO and s < nn):
-        return weights, n, ZERO
-    height = wp.dot(w, n)
-    s /= nn
-    r /= nn
-    if kind == EDGE_EDGE:
-        height = -height
-        r = -r
-        weights = wp.vec4d(ONE - s, s, r - ONE, -r)
-    else:
-        weights = wp.vec4d(ONE, s + r - ONE, -s, -r)
-    size = wp.sqrt(nn)
-    n *= wp.sign(height) / size
-    if r > ZERO and weights[firsts_of(kind)] < ZERO:
-        return weights, n, wp.abs(height) / size
-    return weights, n, ZERO
 
 
 @wp.func
@@ -76,7 +30,7 @@ def _direction(u: wp.vec3d) -> int:
 
 
 @wp.kernel
-def find_nearest(motion: Motion, vertex_face: PairQueue, nearest: wp.array2d[float]):
+def find_nearest(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float]):
     """Finds how far each vertex is from the nearest face in each of six directions [m]; ``nearest`` is infinite before.
 
     Only faces count that have the closest point within them.
@@ -85,7 +39,8 @@ def find_nearest(motion: Motion, vertex_face: PairQueue, nearest: wp.array2d[flo
     if not has_pair(vertex_face, i):
         return
     corners = vertices_of(vertex_face, i)
-    _weights, normal, distance = weights_across(motion, corners, VERTEX_FACE)
+    a, b, c, d = corners_of(step.motion.x0, corners)
+    _weights, normal, distance = weights_across(VERTEX_FACE, a, b, c, d)
     if distance > ZERO:
         wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
 
@@ -105,72 +60,53 @@ def _is_behind(
 
 
 @wp.func
-def _collect_proximity(
-    motion: Motion,
-    mesh: Connectivity,
-    candidates: PairQueue,
-    nearest: wp.array2d[float],
-    i: int,
-    separation: wp.float64,
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
-):
+def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
     if not has_pair(candidates, i):
         return
+    motion, separation = step.motion, step.separation
     kind = candidates.kind
     corners = vertices_of(candidates, i)
-    weights, normal, distance = weights_across(motion, corners, kind)
+    a, b, c, d = corners_of(motion.x0, corners)
+    weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
-    added = Constraint()
+    added = constraints.Constraint()
     if motion.distances.radius:
-        _start, kept = distances_at_start(motion, corners, kind)
+        _start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
     beyond = distance - added.min_distance
-    path = longest_path(motion, corners)
+    path = constraints.longest_path(motion, corners)
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
-    if not is_movable(motion, corners) or not is_projecting(status, world):
+    if owner_of(motion, corners) != ContactClass.OURS or not is_projecting(status, world):
         return
-    if pace_of(motion, corners, kind) == Pace.FAST:
+    if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
-    if status.results.crossings[0] > 0:
-        if crossed_at_start(motion, mesh, kind, candidates.pairs[i]):
+    if status.results[Result.CROSSINGS] > 0:
+        if crossed_at_start(step, kind, candidates.pairs[i]):
             return
     elif nearest and _is_behind(corners, kind, normal, distance, nearest):
         return
-    if kind == EDGE_EDGE and are_occluded(motion, mesh, candidates.pairs[i], corners, normal, ZERO):
+    if kind == EDGE_EDGE and are_occluded(step, candidates.pairs[i], corners, normal, ZERO):
         return
     if are_on_body(motion, corners):
         status.is_fast[world] = 1  # as where bodies are in contact, see collect.collect_contacts
     added.vertices = corners
     added.weights = weights
     added.normal = normal
-    added.separation = added.min_distance + feasible(motion, corners, separation, beyond, separation)
-    added.friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    added.kind = ContactKind.VERTEX_FACE_PROXIMITY
-    if kind == EDGE_EDGE:
-        added.kind = ContactKind.EDGE_EDGE_PROXIMITY
+    added.separation = added.min_distance + constraints.feasible(step, corners, separation, beyond)
+    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    of_faces, of_edges = int(ContactKind.VERTEX_FACE_PROXIMITY), int(ContactKind.EDGE_EDGE_PROXIMITY)
+    added.kind = wp.where(kind == EDGE_EDGE, of_edges, of_faces)
     added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
-    add_constraint(motion, vertices, added, constraints)
+    constraints.add_constraint(step, added)
 
 
 @wp.kernel
 def collect_proximities(
-    # in
-    motion: Motion,
-    mesh: Connectivity,
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
-    nearest: wp.array2d[float],
-    separation: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    status: SolveStatus,
+    step: Step, vertex_face: PairQueue, edge_edge: PairQueue, nearest: wp.array2d[float], status: SolveStatus
 ):
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
@@ -181,31 +117,26 @@ def collect_proximities(
     behind them.
     """
     i = wp.tid()
-    _collect_proximity(motion, mesh, vertex_face, nearest, i, separation, vertices, constraints, status)
-    _collect_proximity(motion, mesh, edge_edge, nearest, i, separation, vertices, constraints, status)
+    _collect_proximity(step, vertex_face, nearest, i, status)
+    _collect_proximity(step, edge_edge, nearest, i, status)
 
 
 @wp.kernel
 def drop_proximities(
-    # in
-    kept: wp.array[int],
-    needed: int,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
-    # in and out
-    constraints: Constraints,
+    step: Step, kept: wp.array[int], needed: int, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]
 ):
     """Drops all proximities, those from ``kept`` on, if some are missing, or if contacts might not fit behind them.
 
     They only save iterations; but which of them fit would depend on the order of threads.
     """
-    if has_overflowed(counts, capacities) or constraints.count[0] > constraints.vertices.shape[0] - needed:
-        constraints.count[0] = kept[0]
+    count = step.constraints.count
+    if has_overflowed(counts, capacities) or count[0] > step.constraints.vertices.shape[0] - needed:
+        count[0] = kept[0]
 
 
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for proximities, in worlds that have contacts; in a CUDA graph none if not all fit."""
-    detector, motion, nearest = work.detector, work.motion.vertices, work.nearest
+    detector, nearest = work.detector, work.nearest
     retry_until_fits(detector.find_candidates, detector, work.device)
     wp.copy(work.kept, work.constraints.count)
 
@@ -213,11 +144,10 @@ def add_proximities(work: Workspace) -> None:
         queues = queues_of(detector, candidates=True)[:2]
         if nearest is not None:
             nearest.fill_(np.inf)
-            work.launch_over(find_nearest, counted(queues[:1]), [motion, queues[0], nearest])
-        inputs = [motion, work.connectivity, *queues, nearest, work.separation]
-        outputs = [work.vertices, work.constraints, work.status]
-        work.launch_over(collect_proximities, counted(queues), [*inputs, *outputs])
+            work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
+        inputs = [work.step, *queues, nearest, work.status]
+        work.launch_over(collect_proximities, counted(queues), inputs)
 
     retry_until_fits(collect, work, work.device)
-    inputs = [work.kept, work.max_contacts, detector.counters.array, detector.capacities, work.constraints]
+    inputs = [work.step, work.kept, work.max_contacts, detector.counters.array, detector.capacities]
     work.launch(drop_proximities, 1, inputs)

@@ -9,7 +9,7 @@ from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
-from ..state.structs import Bodies, Connectivity, Motion
+from ..state.structs import Bodies, Motion, Step, body_of, can_move
 from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
 
@@ -28,47 +28,16 @@ class ContactClass(IntEnum):
 @wp.func
 def inverse_mass_of(motion: Motion, vertex: int) -> float:
     """Returns the inverse mass of a vertex, or of the body that it moves with [1/kg]; 0 where nothing can move it."""
-    if motion.bodies.of_vertex:
-        body = motion.bodies.of_vertex[vertex]
-        if body >= 0:
-            return motion.bodies.inverse_mass[body]
+    body = body_of(motion, vertex)
+    if body >= 0:
+        return motion.bodies.inverse_mass[body]
     return motion.inverse_mass[vertex]
-
-
-@wp.func
-def is_on_body(motion: Motion, vertex: int) -> bool:
-    """Returns whether a vertex is of a body; False if the response moves none."""
-    if motion.bodies.of_vertex:
-        return motion.bodies.of_vertex[vertex] >= 0
-    return False
 
 
 @wp.func
 def are_on_body(motion: Motion, corners: wp.vec4i) -> bool:
     """Returns whether one of two elements is of a body that can be moved."""
-    if motion.bodies.of_vertex:
-        for side in range(2):
-            body = motion.bodies.of_vertex[corners[3 * side]]
-            if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-                return True
-    return False
-
-
-@wp.func
-def is_movable(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether the response can move one of two elements; of two bodies, only if it keeps them apart."""
-    for j in range(4):
-        if motion.inverse_mass[corners[j]] > 0.0:
-            return True
-    if not motion.bodies.of_vertex:
-        return False
-    for side in range(2):
-        body = motion.bodies.of_vertex[corners[3 * side]]
-        if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-            if corners[3 - 3 * side] < motion.bodies.particle_count:  # a particle that is held
-                return True
-            return motion.bodies.responds == 1 and bodies_meet(motion, corners)
-    return False
+    return can_move(motion, body_of(motion, corners[0])) or can_move(motion, body_of(motion, corners[3]))
 
 
 @wp.func
@@ -91,35 +60,14 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
 
 
 @wp.func
-def bodies_meet(motion: Motion, corners: wp.vec4i) -> bool:
-    """Returns whether two elements of shapes are of two that are to collide, one on a body that can be moved."""
-    if not motion.bodies.of_vertex:
-        return False
-    particles = motion.bodies.particle_count
-    if corners[0] < particles or corners[3] < particles:
-        return False
-    body = motion.bodies.of_vertex[corners[0]]
-    other = motion.bodies.of_vertex[corners[3]]
-    if body == other:
-        return False
-    movable = bool(False)
-    if body >= 0:
-        movable = motion.bodies.inverse_mass[body] > 0.0
-    if other >= 0:
-        movable = movable or motion.bodies.inverse_mass[other] > 0.0
-    return movable and collides(
-        motion.bodies, motion.bodies.shape[corners[0] - particles], motion.bodies.shape[corners[3] - particles]
-    )
-
-
-@wp.func
-def crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bool:
+def crosses_face(step: Step, edge: int, face: int) -> bool:
     """Returns whether an edge certainly crosses a face at the start."""
+    mesh = step.mesh
     for end in range(2):
         for corner in range(3):
             if mesh.edges[edge, end] == mesh.faces[face, corner]:
                 return False
-    x = motion.x0
+    x = step.motion.x0
     p = mesh.edges[edge, 0]
     q = mesh.edges[edge, 1]
     a = x[mesh.faces[face, 0]]
@@ -129,7 +77,7 @@ def crosses_face(motion: Motion, mesh: Connectivity, edge: int, face: int) -> bo
 
 
 @wp.func
-def crossed_at_start(motion: Motion, mesh: Connectivity, kind: int, pair: wp.vec2i) -> bool:
+def crossed_at_start(step: Step, kind: int, pair: wp.vec2i) -> bool:
     """Returns whether a contact belongs to elements that certainly crossed at the start of the step.
 
     A vertex that passes through a face changes which of the vertex's edges cross that face; an edge that passes through
@@ -137,60 +85,59 @@ def crossed_at_start(motion: Motion, mesh: Connectivity, kind: int, pair: wp.vec
     to a crossing if one of the vertex's edges crosses that face, and the contact of two edges if one of them crosses a
     face of the other. Crossing surfaces come apart by these contacts. Points cross nothing.
     """
+    mesh = step.mesh
     if kind == EDGE_EDGE:
         for side in range(2):
             other = pair[1 - side]
             for i in range(mesh.edge_faces.first[other], mesh.edge_faces.first[other + 1]):
-                if crosses_face(motion, mesh, pair[side], mesh.edge_faces.items[i]):
+                if crosses_face(step, pair[side], mesh.edge_faces.items[i]):
                     return True
     if kind == VERTEX_FACE:
         for i in range(mesh.vertex_edges.first[pair[0]], mesh.vertex_edges.first[pair[0] + 1]):
-            if crosses_face(motion, mesh, mesh.vertex_edges.items[i], pair[1]):
+            if crosses_face(step, mesh.vertex_edges.items[i], pair[1]):
                 return True
     return False
 
 
 @wp.func
 def owner_of(motion: Motion, corners: wp.vec4i) -> int:
-    """Returns the ContactClass of a contact as far as it follows from its vertices: OURS, OF_BODIES or NONE."""
-    if is_movable(motion, corners):
+    """Returns the ContactClass of two elements as far as it follows from their vertices: OURS, OF_BODIES or NONE.
+
+    Those of two bodies, or of a body and a static shape, are of bodies unless the response keeps these apart.
+    """
+    for j in range(4):
+        if motion.inverse_mass[corners[j]] > 0.0:
+            return ContactClass.OURS
+    if not are_on_body(motion, corners):
+        return ContactClass.NONE
+    a = corners[0] - motion.bodies.particle_count
+    b = corners[3] - motion.bodies.particle_count
+    if wp.min(a, b) < 0:  # a particle that is held
         return ContactClass.OURS
-    if bodies_meet(motion, corners):
-        return ContactClass.OF_BODIES
-    return ContactClass.NONE
+    if body_of(motion, corners[0]) == body_of(motion, corners[3]):
+        return ContactClass.NONE
+    if not collides(motion.bodies, motion.bodies.shape[a], motion.bodies.shape[b]):
+        return ContactClass.NONE
+    return wp.where(motion.bodies.responds == 1, int(ContactClass.OURS), int(ContactClass.OF_BODIES))
 
 
 @wp.func
 def classify_contact(
-    motion: Motion,
-    mesh: Connectivity,
-    kind: int,
-    pair: wp.vec2i,
-    corners: wp.vec4i,
-    owner: int,
-    bound: wp.float64,
-    may_cross: bool,
+    step: Step, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int, bound: wp.float64, may_cross: bool
 ) -> int:
-    """Returns the ContactClass of a contact.
+    """Returns the ContactClass of a contact of an owner, as of :func:`owner_of`.
 
-    Args:
-        motion: The motion.
-        mesh: Its connectivity.
-        kind: The kind of pair.
-        pair: Its elements.
-        corners: Its vertices.
-        owner: What :func:`owner_of` returns for them.
-        bound: A lower bound of the time of impact, or of the distance at the start. Above 0, the elements did not touch
-            at the start; at 0, which it also is for contacts soon after the start, an exact test decides.
-        may_cross: False if nothing that can be moved crosses at the start.
+    Above a ``bound`` of 0, which is a lower one of the time of impact, or of the distance at the start, the elements
+    did not touch at the start; at 0, which it also is for contacts soon after the start, an exact test decides. Nothing
+    that can be moved crosses at the start unless it ``may_cross``.
     """
     met = bool(False)
     if not bound > ZERO:
-        x = motion.x0
+        x = step.motion.x0
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         met = meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
     if not met and (may_cross or owner != ContactClass.OURS):
-        met = crossed_at_start(motion, mesh, kind, pair)
+        met = crossed_at_start(step, kind, pair)
     if not met:
         return owner
     return wp.where(owner == ContactClass.OURS, int(ContactClass.CROSSED), int(ContactClass.NONE))
@@ -203,9 +150,7 @@ def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def are_occluded(
-    motion: Motion, mesh: Connectivity, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64
-) -> bool:
+def are_occluded(step: Step, edges: wp.vec2i, corners: wp.vec4i, normal: wp.vec3d, time: wp.float64) -> bool:
     """Returns whether a face next to one of two edges shields it from the other along the normal, at a time in [0, 1].
 
     Only pairs with an edge of a body that can be moved are occluded. The face reaches farther along the normal than
@@ -213,6 +158,7 @@ def are_occluded(
     above. A push along this normal would hold what slides. Sheets may bend around a body by 30 degrees to either side,
     bodies do not bend.
     """
+    motion, mesh = step.motion, step.mesh
     if not are_on_body(motion, corners):
         return False
     for side in range(2):

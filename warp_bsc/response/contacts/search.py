@@ -17,8 +17,8 @@ from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
-from ..schedule import SolveStatus, count_contact
-from ..state.structs import Connectivity, ContactKind, DividingPlanes, Motion, Vertices
+from ..schedule import Detection, SolveStatus, count_contact
+from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
@@ -36,17 +36,9 @@ class _Arguments:
     """Input of a thread that finds the contacts of two faces and resolves them."""
 
     faces: FaceHierarchy
-    mesh: Connectivity
-    motion: Motion
-    vertices: Vertices
+    step: Step
     dividing: DividingPlanes
     status: SolveStatus
-    separation: wp.float64
-
-
-@wp.func
-def _next(corner: int) -> int:
-    return wp.where(corner == 2, 0, corner + 1)
 
 
 @wp.func
@@ -61,22 +53,19 @@ def _resolve(
     min_distance: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
-    motion = arguments.motion
-    found = classify_contact(motion, arguments.mesh, kind, pair, corners, owner, bound, True)
+    found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
-        wp.atomic_add(arguments.status.detection.excluded, 0, 1)
+        wp.atomic_add(arguments.status.detection, int(Detection.EXCLUDED), 1)
     if found == ContactClass.OF_BODIES:
-        wp.atomic_add(arguments.status.detection.of_bodies, 0, 1)
-        mark_changed(arguments.vertices, corners)
+        wp.atomic_add(arguments.status.detection, int(Detection.OF_BODIES), 1)
+        mark_changed(arguments.step.vertices, corners)
     if found != ContactClass.OURS:
         return
-    count_contact(arguments.status, motion.world[corners[0]])
-    separation = arguments.separation
-    vertices = arguments.vertices
-    add_dividing_plane(motion, vertices, corners, kind, separation, min_distance, arguments.dividing, True, True)
-    mark_changed(vertices, corners)
+    count_contact(arguments.status, arguments.step.motion.world[corners[0]])
+    add_dividing_plane(arguments.step, corners, kind, min_distance, arguments.dividing, True, True)
+    mark_changed(arguments.step.vertices, corners)
     for j in range(4):
-        update_first_contact(vertices, corners[j], toi, ContactKind.NONE, 0)
+        update_first_contact(arguments.step.vertices, corners[j], toi, ContactKind.NONE, 0)
 
 
 @wp.func
@@ -86,13 +75,10 @@ def _ends(x0: wp.array[wp.vec3], x1: wp.array[wp.vec3], v: wp.vec4i):
 
 
 @wp.func
-def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it comes nearer than it may."""
-    motion = arguments.motion
-    owner = owner_of(motion, corners)
-    if owner == ContactClass.NONE:
-        return
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.vertices.x1, corners)
+    motion = arguments.step.motion
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     most = distance_of_corners(kind, corners, motion.distances.radius)
     relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
@@ -105,13 +91,9 @@ def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: 
 
 
 @wp.func
-def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i):
+def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it is in contact."""
-    motion = arguments.motion
-    owner = owner_of(motion, corners)
-    if owner == ContactClass.NONE:
-        return
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.vertices.x1, corners)
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(arguments.step.motion.x0, arguments.step.vertices.x1, corners)
     relative = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
     y = coplanarity(relative)
     if certified_sign_cubic(y.k, y.bound) != 0:
@@ -145,9 +127,9 @@ def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
     other_side = (bit - 6) % 3
     corners = wp.vec4i(
         mesh.faces[place, side],
-        mesh.faces[place, _next(side)],
+        mesh.faces[place, (side + 1) % 3],
         mesh.faces[other, other_side],
-        mesh.faces[other, _next(other_side)],
+        mesh.faces[other, (other_side + 1) % 3],
     )
     return EDGE_EDGE, wp.vec2i(mesh.face_edges[place, side], mesh.face_edges[other, other_side]), corners
 
@@ -191,25 +173,24 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
                 if wp.static(keep_distances):
                     if bit == _POINT_BIT:
                         kind, pair, corners = _point_pair(mesh, point, place + other - point)
+                owner = int(ContactClass.NONE)
                 if kind >= 0:
-                    decide(arguments, kind, pair, corners)
+                    owner = owner_of(arguments.step.motion, corners)
+                if owner != ContactClass.NONE:
+                    decide(arguments, kind, pair, corners, owner)
 
     return traversal_kernel(visit, _Arguments)
 
 
-def find_contacts_without_queues(broad_phase: BroadPhaseHierarchy, separation: float, **arrays) -> None:
-    """Finds all contacts of the motion whose boxes a broad phase has fitted last, however many there are.
+def find_contacts_without_queues(
+    broad_phase: BroadPhaseHierarchy, step: Step, dividing: DividingPlanes, status: SolveStatus
+) -> None:
+    """Finds all contacts of the motion that a broad phase has fitted last, as a whole, however many there are.
 
     Counts them, adds dividing planes as far as they fit, and finds the first contact of each vertex. Allocates nothing
     and does not synchronize. Slower than the detector, as neighbouring threads decide pairs of different difficulty.
-
-    Args:
-        broad_phase: The broad phase, fitted to all of the motion.
-        separation: Distance that projection moves contacts apart [m].
-        arrays: ``mesh``, ``motion``, ``vertices``, ``dividing`` and ``status`` of the step.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.separation = broad_phase.hierarchy, wp.float64(separation)
-    for name, struct in arrays.items():
-        setattr(arguments, name, struct)
-    broad_phase.traverse(_kernel(bool(arguments.motion.distances.radius)), arguments)
+    arguments.faces, arguments.step = broad_phase.hierarchy, step
+    arguments.dividing, arguments.status = dividing, status
+    broad_phase.traverse(_kernel(bool(step.motion.distances.radius)), arguments)

@@ -5,7 +5,7 @@ from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..state.motion import ModelMotion, continues
-from ..state.poses import inertia_at
+from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
 from ..substeps.inner_contacts import InnerContacts
@@ -68,7 +68,7 @@ def _add_impulses(
         of_particles[i] += particle_mass[i] * (vertices.velocity[i] - motion.velocity[i])
     if i < vertices.bodies.outcome.shape[0] and vertices.bodies.outcome[i] != 0:
         change = vertices.bodies.velocity[i] - motion.bodies.velocity[i]
-        inertia = inertia_at(motion.bodies, i, vertices.bodies.pose[i])
+        inertia = in_world(motion.bodies.inertia[i], vertices.bodies.pose[i])
         angular = to_single(inertia * to_double(wp.spatial_bottom(change)))
         of_bodies[i] += wp.spatial_vector(motion.bodies.mass[i] * wp.spatial_top(change), angular)
 
@@ -105,9 +105,6 @@ class CouplingHooks(WrappedSolver):
 
         ``SolverCoupledADMM`` handles hard attachments of bodies to particles within one entry only if its solver is
         ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
-
-    Attributes:
-        solver: The inner solver.
     """
 
     _motion: ModelMotion
@@ -132,23 +129,22 @@ class CouplingHooks(WrappedSolver):
 
     def coupling_harvest_proxy_wrenches(self, body_local_to_proxy_global, out_body_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
-        impulses = None if self._coupled is None else self._coupled.body_impulses
-        hook = "coupling_harvest_proxy_wrenches"
-        self._harvest(hook, _add_wrenches, impulses, body_local_to_proxy_global, out_body_f, options)
+        kind = "coupling_harvest_proxy_wrenches", "body_impulses", _add_wrenches
+        self._harvest(*kind, body_local_to_proxy_global, out_body_f, options)
 
     def coupling_harvest_proxy_particle_forces(self, particle_local_to_proxy_global, out_particle_f, **options) -> None:
         """Delegates to the inner solver, and adds the forces of the response unless the hook includes them."""
-        impulses = None if self._coupled is None else self._coupled.particle_impulses
-        hook = "coupling_harvest_proxy_particle_forces"
-        self._harvest(hook, _add_forces, impulses, particle_local_to_proxy_global, out_particle_f, options)
+        kind = "coupling_harvest_proxy_particle_forces", "particle_impulses", _add_forces
+        self._harvest(*kind, particle_local_to_proxy_global, out_particle_f, options)
 
-    def _harvest(self, hook, kernel, impulses, proxy, forces, options):
+    def _harvest(self, hook, impulses, kernel, proxy, forces, options):
         if self._inner_contacts is not None and options["contacts"] is not None:
             options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
-        if impulses is not None and not _is_default(self.solver, hook):  # the default includes changes of velocities
-            inputs = [impulses, proxy, options["dt"]]
-            wp.launch(kernel, len(impulses), inputs=inputs, outputs=[forces], device=impulses.device)
+        if self._coupled is not None and not _is_default(self.solver, hook):  # which includes changes of velocities
+            added = getattr(self._coupled, impulses)
+            inputs = [added, proxy, options["dt"]]
+            wp.launch(kernel, len(added), inputs=inputs, outputs=[forces], device=added.device)
 
 
 class _Coupled:

@@ -1,30 +1,13 @@
 """A solver around another one, which has all attributes of the inner solver."""
 
 import functools
-from typing import NamedTuple
 
-import newton
-import warp as wp
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from ..._arguments import check_instance
 from ..._one_thread import Occupied
 from ..._private_names.versions import warn_if_untested
-
-
-class StateArrays(NamedTuple):
-    """The arrays of a state, which an attribute of the state may replace later."""
-
-    particle_q: wp.array | None
-    particle_qd: wp.array | None
-    body_q: wp.array | None
-    body_qd: wp.array | None
-
-    @classmethod
-    def of(cls, state: newton.State) -> "StateArrays":
-        """Returns the arrays of a state as they are now."""
-        return cls(*(getattr(state, name) for name in cls._fields))
 
 
 class WrappedSolver(SolverBase, CouplingInterface):
@@ -37,10 +20,7 @@ class WrappedSolver(SolverBase, CouplingInterface):
     solver: SolverBase
 
     def __init__(self, solver: SolverBase):
-        """Wraps a solver.
-
-        Args:
-            solver: Any Newton solver.
+        """Wraps any solver of Newton.
 
         Raises:
             TypeError: If it is no solver of Newton.
@@ -79,24 +59,15 @@ class WrappedSolver(SolverBase, CouplingInterface):
         return getattr(self.solver, name)
 
 
-def _delegated_method(name):
-    """Returns a method that is that of the inner solver."""
+def _delegated_method(name, owner):
+    """Returns a method that is that of the inner solver; hooks of the coupling interface have a default."""
 
-    @functools.wraps(getattr(SolverBase, name))
+    @functools.wraps(getattr(owner, name))
     def method(self, *arguments, **options):
-        return getattr(self.solver, name)(*arguments, **options)
+        inner = self._hook(name) if owner is CouplingInterface else getattr(self.solver, name)
+        return inner(*arguments, **options)
 
     return method
-
-
-def _delegated_hook(name):
-    """Returns a hook of the coupling interface that is that of the inner solver."""
-
-    @functools.wraps(getattr(CouplingInterface, name))
-    def hook(self, *arguments, **options):
-        return self._hook(name)(*arguments, **options)
-
-    return hook
 
 
 def _delegated_property(name):
@@ -112,9 +83,9 @@ for _name in (
     "update_contacts",
     "validate_observables",
 ):
-    setattr(WrappedSolver, _name, _delegated_method(_name))
+    setattr(WrappedSolver, _name, _delegated_method(_name, SolverBase))
 for _name in ("collision_frequency", "collision_frequency_type", "supported_observables"):
     setattr(WrappedSolver, _name, _delegated_property(_name))
 for _name in dir(CouplingInterface):
     if _name.startswith("coupling_"):
-        setattr(WrappedSolver, _name, _delegated_hook(_name))
+        setattr(WrappedSolver, _name, _delegated_method(_name, CouplingInterface))

@@ -24,12 +24,12 @@ from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ..adjoint.arrays import attach_gradients, copied, launch_adjoint
+from ..adjoint.arrays import copied, filled, launch_adjoint, with_gradients
 from ..contacts.queue import PairQueue, queues_of
-from ..integration.wrapped_solver import StateArrays, WrappedSolver
+from ..integration.wrapped_solver import WrappedSolver
 from ..options import StageOptions, friction_of, particle_edge_lengths
 from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion
+from ..state.motion import ModelMotion, arrays_of
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from . import kernels
 
@@ -77,10 +77,10 @@ class ContactLayer(WrappedSolver):
             thickness: Thickness of the layer [m], above the minimum distances. It should be more than the longest path
                 of a step, and less than half of the shortest edge, as neighbours beyond the next push each other as
                 well. Default: a quarter of the median edge length, at most 0.45 of the shortest.
-            friction: As for :class:`.solver_ccd.SolverCCD`.
-            restitution: As for :class:`.solver_ccd.SolverCCD`.
+            friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
+            restitution: Share of the approaching velocity that comes back, in [0, 1].
             min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
-            particle_radius: As for :class:`.solver_ccd.SolverCCD`.
+            particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
 
         Raises:
             TypeError: If an argument has another type.
@@ -109,18 +109,17 @@ class ContactLayer(WrappedSolver):
         layer.thickness, layer.restitution = self.thickness, self.restitution
         layer.motion, layer.planes = self._motion.vertices, self._motion.planes
         layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
-        device = mesh.device
+        device, n = mesh.device, mesh.vertex_count
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
-        n = mesh.vertex_count
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
         self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
         layer.shares = wp.zeros(n, dtype=wp.float64, device=device)
         self._layer = layer
         self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
         self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
-        self._motion.set_start(self.model.particle_q, self.model.body_q)
-        self._set_end(self.model, 1.0)
+        self._motion.set_start(arrays_of(self.model))
+        self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
 
     @property
@@ -143,13 +142,7 @@ class ContactLayer(WrappedSolver):
     ) -> None:
         """Steps the inner solver, and pushes particles that have come into the layer.
 
-        Args:
-            state_in: The state at the start; the inner solver may change it.
-            state_out: The state at the end. May be the same, except on a tape.
-            control: As for the inner solver.
-            contacts: As for the inner solver.
-            dt: Length of the step [s], more than 0.
-            options: As for the inner solver.
+        Arguments are those of :meth:`.stage.CollisionStage.step`; on a tape, ``state_out`` must not be ``state_in``.
 
         Raises:
             TypeError: If ``dt`` is no number.
@@ -167,10 +160,10 @@ class ContactLayer(WrappedSolver):
                     raise NotImplementedError(
                         "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
                     )
-            self._motion.set_start(state_in.particle_q, state_in.body_q)
+            self._motion.set_start(arrays_of(state_in))
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with paused_tape() as tape:
-            end, device = StateArrays.of(state_out), self.mesh.device
+            end, device = arrays_of(state_out), self.mesh.device
             if end.particle_q is None:
                 return
             if tape is None or not end.particle_q.requires_grad:
@@ -193,9 +186,6 @@ class ContactLayer(WrappedSolver):
             run_on_host(forward, device)
             tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
-    def _set_end(self, end, dt):
-        self._motion.set_end(end.particle_q, end.particle_qd, end.body_q, dt, end.body_qd)
-
     def _detect(self):
         """Finds the pairs that may be in the layer."""
         detector = self._detector
@@ -207,20 +197,17 @@ class ContactLayer(WrappedSolver):
         """Changes the end of a step by the pushes of contacts; returns what the adjoint needs if that is recorded."""
         if self._reads_friction:
             self._motion.friction.read()
-        self._set_end(end, dt)
+        self._motion.set_end(end, dt)
         self._detect()
         layer, detector = self._layer, self._detector
         layer.dt = dt
         pairs = queues_of(detector)
-        for of_kind in pairs:
-            self._launch_over(kernels.sum_shares, of_kind, [layer, of_kind, self._share_sums])
+        self._launch_over(kernels.sum_shares, pairs, self._share_sums)
         inputs = [layer, detector.counters.array, detector.capacities, self._share_sums, self.skipped]
         self._launch(kernels.finish_shares, len(self._y), inputs)
-        for of_kind in pairs:
-            self._launch_over(kernels.sum_pushes, of_kind, [layer, of_kind, self._sums])
+        self._launch_over(kernels.sum_pushes, pairs, self._sums)
         recorded = self._recorded(pairs) if record else None
-        inputs = [layer, self._sums, end.particle_q, end.particle_qd]
-        self._launch(kernels.move_particles, len(end.particle_q), inputs)
+        self._launch(kernels.move_particles, len(end.particle_q), [layer, self._sums, end])
         return recorded
 
     def _backward(self, layer, pairs, start_q, particle_q, particle_qd):
@@ -228,28 +215,20 @@ class ContactLayer(WrappedSolver):
 
         Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
         from, and of restitution, where these have such arrays.
-
-        Args:
-            layer: The layer as it was recorded.
-            pairs: The pairs that may be in it, of each kind.
-            start_q: Gradient with respect to positions at the start.
-            particle_q: Gradient with respect to the positions at the end.
-            particle_qd: Gradient with respect to the velocities at the end.
         """
         n, particles, device = len(layer.motion.x0), len(particle_q), self.mesh.device
         of_changes = wp.zeros(n, dtype=wp.vec3, device=device)
         self._launch(kernels.begin_backward, particles, [layer, particle_q, particle_qd, of_changes])
-        layer, motion, planes = copied(layer, ()), copied(layer.motion, ()), copied(layer.planes, ())
-        of_motion = attach_gradients(motion, ("x0", "x1", "inverse_mass", "friction"))
-        of_planes = attach_gradients(planes, ("friction",))
-        of_shares = attach_gradients(layer, ("shares",)).shares
-        layer.motion, layer.planes = motion, planes
+        motion, of_motion = with_gradients(layer.motion, ("x0", "x1", "inverse_mass", "friction"))
+        planes, of_planes = with_gradients(layer.planes, ["friction"])
+        layer, of_layer = with_gradients(layer, ["shares"])
+        layer.motion, layer.planes, of_shares = motion, planes, of_layer.shares
         over_planes = (particles, len(planes.end))
         for queue in pairs:
-            launch_adjoint(kernels.add_pushes, len(queue.pairs), [layer, queue], [of_changes], device)
+            launch_adjoint(kernels.sum_pushes, len(queue.pairs), [layer, queue, None], [of_changes], device)
         launch_adjoint(kernels.add_pushes_of_planes, over_planes, [layer], [of_changes], device)
         for queue in pairs:
-            launch_adjoint(kernels.add_shares, len(queue.pairs), [layer, queue], [of_shares], device)
+            launch_adjoint(kernels.sum_shares, len(queue.pairs), [layer, queue, None], [of_shares], device)
         launch_adjoint(kernels.add_shares_of_planes, over_planes, [layer], [of_shares], device)
         inverse_mass = self.model.particle_inv_mass
         assert inverse_mass is not None
@@ -259,12 +238,9 @@ class ContactLayer(WrappedSolver):
     def _recorded(self, pairs):
         """Copies the layer and the pairs that may be in it for the adjoint; in a CUDA graph, all of the queues."""
         copies = []
-        for of_kind in pairs:
-            count = len(of_kind.pairs)
-            if not self.mesh.device.is_capturing:
-                count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
-            if count:
-                copies.append(copied(of_kind, {"pairs": count, "counts": None}))
+        for queue in pairs:
+            if count := filled(queue.pairs, queue.counts, queue.count):
+                copies.append(copied(queue, {"pairs": count, "counts": None}))
         layer = copied(self._layer, ("shares",))
         layer.motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
         layer.planes = copied(self._motion.planes, ("start", "end", "friction"))
@@ -273,12 +249,12 @@ class ContactLayer(WrappedSolver):
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
 
-    def _launch_over(self, kernel, of_kind, inputs):
-        """Launches a kernel over the pairs of a kind: those found on the CPU, on one thread, as sums are not atomic."""
-        count = len(of_kind.pairs)
-        if self.mesh.device.is_cpu:
-            count = min(count, int(of_kind.counts.numpy()[of_kind.count]))
-        self._launch(kernel, count, inputs)
+    def _launch_over(self, kernel, pairs, sums):
+        """Launches a kernel over pairs: those found on the CPU, on one thread, as sums are not atomic."""
+        for queue in pairs:
+            on_cpu = self.mesh.device.is_cpu
+            count = filled(queue.pairs, queue.counts, queue.count) if on_cpu else len(queue.pairs)
+            self._launch(kernel, count, [self._layer, queue, sums, None])
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:

@@ -4,14 +4,16 @@ import warp as wp
 
 from ...detection.approach_phase import MinDistances
 from ...detection.rings import are_within_rings
+from ...kernels.closest import closest_weights
 from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
-from ..contacts.closest import closest_vector, closest_weights
+from ..contacts.closest import closest_vector
 from ..contacts.constraints import contact_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..contacts.rules import are_on_body
-from ..schedule import has_overflowed
 from ..state.fixed_sum import add_to_sum, from_units, sum_of, to_units, with_delta
+from ..state.motion import StateArrays
 from ..state.planes import MovingPlanes, signed_distance
 from ..state.structs import Motion
 from ..state.vectors import ONE, ZERO, to_double, to_single
@@ -110,18 +112,6 @@ def _share_of(layer: Layer, depth: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _shares_of_pair(layer: Layer, queue: PairQueue, i: int):
-    """Returns the four vertices of a pair, and its shares of their masses, 0 if it is not in contact."""
-    corners = vertices_of(queue, i)
-    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
-    shares = wp.vec4d()
-    if depth > ZERO:
-        for j in range(4):
-            shares[j] = wp.abs(weights[j]) * _share_of(layer, depth)
-    return corners, shares
-
-
-@wp.func
 def _push(
     layer: Layer, normal: wp.vec3d, depth: wp.float64, path: wp.vec3d, resistance: wp.float64, friction: float
 ) -> wp.vec3d:
@@ -139,30 +129,6 @@ def _push(
         return along * normal
     holding = wp.float64(friction) * along / (length * part)  # more than 1 if friction could stop the contact
     return along * normal - across * (part * holding / wp.sqrt(ONE + holding * holding))
-
-
-@wp.func
-def _push_of_pair(layer: Layer, queue: PairQueue, i: int):
-    """Returns the four vertices of a pair, how much its push moves each [1/kg], and the push, 0 if there is none."""
-    motion = layer.motion
-    corners = vertices_of(queue, i)
-    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
-    resistance = ZERO
-    for j in range(4):
-        vertex = corners[j]
-        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
-    mobilities = wp.vec4d()
-    if depth <= ZERO or resistance <= ZERO:
-        return corners, mobilities, wp.vec3d()
-    path = wp.vec3d()
-    for j in range(4):
-        vertex = corners[j]
-        path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
-    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    push = _push(layer, normal, depth, path, resistance, friction)
-    for j in range(4):
-        mobilities[j] = weights[j] * wp.float64(motion.inverse_mass[corners[j]])
-    return corners, mobilities, push
 
 
 @wp.func
@@ -186,24 +152,22 @@ def place_vertices_between(layer: Layer, y: wp.array[wp.vec3]):
     y[vertex] = to_single(_between(layer.motion, vertex, theta))
 
 
-@wp.kernel(enable_backward=False)
-def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64]):
-    """Adds the shares of contacts to the sums of their vertices."""
-    i = wp.tid()
-    if has_pair(queue, i):
-        corners, shares = _shares_of_pair(layer, queue, i)
-        for j in range(4):
-            wp.atomic_add(sums, corners[j], to_units(shares[j]))
-
-
 @wp.kernel
-def add_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.float64]):
-    """Adds as :func:`sum_shares`, differentiably."""
+def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64], differentiable: wp.array[wp.float64]):
+    """Adds the shares of contacts to the sums of their vertices, or to ``differentiable`` ones instead."""
     i = wp.tid()
-    if has_pair(queue, i):
-        corners, shares = _shares_of_pair(layer, queue, i)
-        for j in range(4):
-            wp.atomic_add(sums, corners[j], shares[j])
+    if not has_pair(queue, i):
+        return
+    corners = vertices_of(queue, i)
+    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    if depth <= ZERO:
+        return
+    for j in range(4):
+        share = wp.abs(weights[j]) * _share_of(layer, depth)
+        if differentiable:
+            wp.atomic_add(differentiable, corners[j], share)
+        else:
+            wp.atomic_add(sums, corners[j], to_units(share))
 
 
 @wp.kernel(enable_backward=False)
@@ -237,30 +201,37 @@ def add_shares_of_planes(layer: Layer, sums: wp.array[wp.float64]):
     wp.atomic_add(sums, vertex, _share_of(layer, depth))
 
 
-@wp.kernel(enable_backward=False)
-def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64]):
-    """Adds what contacts move vertices by to the sums of these."""
-    i = wp.tid()
-    if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(layer, queue, i)
-        for j in range(4):
-            add_to_sum(sums, corners[j], 0, mobilities[j] * push)
-
-
 @wp.kernel
-def add_pushes(layer: Layer, queue: PairQueue, changes: wp.array[wp.vec3]):
-    """Adds as :func:`sum_pushes`, differentiably."""
+def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], differentiable: wp.array[wp.vec3]):
+    """Adds what contacts move vertices by to the sums of these, or to ``differentiable`` ones instead."""
     i = wp.tid()
-    if has_pair(queue, i):
-        corners, mobilities, push = _push_of_pair(layer, queue, i)
-        for j in range(4):
-            wp.atomic_add(changes, corners[j], to_single(mobilities[j] * push))
+    if not has_pair(queue, i):
+        return
+    motion = layer.motion
+    corners = vertices_of(queue, i)
+    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    resistance = ZERO
+    for j in range(4):
+        vertex = corners[j]
+        resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
+    if depth <= ZERO or resistance <= ZERO:
+        return
+    path = wp.vec3d()
+    for j in range(4):
+        vertex = corners[j]
+        path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
+    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    push = _push(layer, normal, depth, path, resistance, friction)
+    for j in range(4):
+        change = weights[j] * wp.float64(motion.inverse_mass[corners[j]]) * push
+        if differentiable:
+            wp.atomic_add(differentiable, corners[j], to_single(change))
+        else:
+            add_to_sum(sums, corners[j], 0, change)
 
 
 @wp.kernel(enable_backward=False)
-def move_particles(
-    layer: Layer, sums: wp.array2d[wp.int64], particle_q: wp.array[wp.vec3], particle_qd: wp.array[wp.vec3]
-):
+def move_particles(layer: Layer, sums: wp.array2d[wp.int64], end: StateArrays):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
     motion, vertex = layer.motion, wp.tid()
     for plane in range(layer.planes.end.shape[0]):
@@ -269,8 +240,8 @@ def move_particles(
     if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
         motion.velocity[vertex] += to_single(change / wp.float64(layer.dt))
-        particle_q[vertex] = motion.x1[vertex]
-        particle_qd[vertex] = motion.velocity[vertex]
+        end.particle_q[vertex] = motion.x1[vertex]
+        end.particle_qd[vertex] = motion.velocity[vertex]
     for axis in range(3):
         sums[vertex, axis] = wp.int64(0)
 

@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from ..state.fixed_sum import with_delta
-from ..state.poses import centre_of, inertia_at
-from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Constraints, Motion, Vertices, has_final_velocity
+from ..state.poses import centre_of, in_world
+from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Step, body_of, has_final_velocity
 from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
 
@@ -36,61 +36,60 @@ def _add(sums: wp.array2d[wp.int64], world: int, added: Any):
 
 
 @wp.func
-def turns(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+def turns(step: Step, vertex: int) -> bool:
     """Returns whether a vertex collided, and is free to turn by itself."""
-    outcome = vertices.outcome[vertex]
-    return motion.inverse_mass[vertex] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
+    outcome = step.vertices.outcome[vertex]
+    return step.motion.inverse_mass[vertex] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
 
 
 @wp.func
-def body_turns(motion: Motion, vertices: Vertices, body: int) -> bool:
+def body_turns(step: Step, body: int) -> bool:
     """Returns whether a body collided, and is free to turn."""
-    outcome = vertices.bodies.outcome[body]
-    return motion.bodies.inverse_mass[body] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
+    outcome = step.vertices.bodies.outcome[body]
+    return step.motion.bodies.inverse_mass[body] > 0.0 and outcome != 0 and not has_final_velocity(outcome)
 
 
 @wp.func
-def torque_of(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> wp.vec3d:
+def torque_of(step: Step, i: int) -> wp.vec3d:
     """Returns the change of angular momentum by a contact between free vertices and bodies [kg m^2/s].
 
     Position changes across the motion change it, and so do impulses at points that slid apart since the contact. For
     the position changes of bodies, see :func:`sum_body_moments`.
     """
+    motion, vertices, constraints = step.motion, step.vertices, step.constraints
     weights = constraints.weights[i]
     corners = constraints.vertices[i]
     moving = wp.vec4d(weights)
-    if motion.bodies.of_vertex:
-        for j in range(4):
-            if motion.bodies.of_vertex[corners[j]] >= 0:
-                moving[j] = ZERO
+    for j in range(4):
+        if body_of(motion, corners[j]) >= 0:
+            moving[j] = ZERO
     of_positions = wp.cross(constraints.position_multiplier[i], relative(moving, corners, motion.velocity))
     return of_positions + wp.cross(relative(weights, corners, vertices.x1), constraints.velocity_multiplier[i])
 
 
 @wp.func
-def acts(constraints: Constraints, i: int) -> bool:
+def acts(step: Step, i: int) -> bool:
     """Returns whether a constraint moved anything."""
-    position, velocity = constraints.position_multiplier[i], constraints.velocity_multiplier[i]
-    return wp.length_sq(position) + wp.length_sq(velocity) > ZERO
+    of_velocity = wp.length_sq(step.constraints.velocity_multiplier[i])
+    return wp.length_sq(step.constraints.position_multiplier[i]) + of_velocity > ZERO
 
 
 @wp.func
-def is_held(motion: Motion, vertices: Vertices, constraints: Constraints, i: int) -> bool:
+def is_held(step: Step, i: int) -> bool:
     """Returns whether a contact is with something that is not free."""
-    corners = constraints.vertices[i]
+    corners = step.constraints.vertices[i]
     held = corners[0] == corners[1]  # on a plane
     for j in range(4):
-        free = turns(motion, vertices, corners[j])
-        if motion.bodies.of_vertex:
-            body = motion.bodies.of_vertex[corners[j]]
-            if body >= 0:
-                free = body_turns(motion, vertices, body)
-        held = held or (constraints.weights[i][j] != ZERO and not free)
+        free = turns(step, corners[j])
+        body = body_of(step.motion, corners[j])
+        if body >= 0:
+            free = body_turns(step, body)
+        held = held or (step.constraints.weights[i][j] != ZERO and not free)
     return held
 
 
 @wp.kernel
-def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, threads: int, sums: wp.array2d[wp.int64]):
+def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
 
     For one contact they cancel; for many at once, which share vertices, they need not. Each of ``threads`` threads sums
@@ -98,17 +97,17 @@ def sum_torques(motion: Motion, vertices: Vertices, constraints: Constraints, th
     """
     world = int(0)
     added = _Torque()
-    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
-        own = motion.world[constraints.vertices[i][0]]
+    for i in range(wp.tid(), wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
+        own = step.motion.world[step.constraints.vertices[i][0]]
         if own != world:
             _add(sums, world, added)
             added = _Torque()
             world = own
-        if sums[world, HELD] == wp.int64(0) and acts(constraints, i):
-            if is_held(motion, vertices, constraints, i):
+        if sums[world, HELD] == wp.int64(0) and acts(step, i):
+            if is_held(step, i):
                 sums[world, HELD] = wp.int64(1)
             else:
-                torque = torque_of(motion, vertices, constraints, i)
+                torque = torque_of(step, i)
                 for axis in range(3):
                     added[axis] += _units(torque[axis])
     _add(sums, world, added)
@@ -133,19 +132,21 @@ def _moments(mass: wp.float64, x: wp.vec3d, half: wp.float64, inertia: wp.mat33d
 
 
 @wp.func
-def moments(motion: Motion, vertices: Vertices, vertex: int) -> Moments:
+def moments(step: Step, vertex: int) -> Moments:
     """Returns what a vertex adds to the sums of its world, from :data:`MASS` on."""
+    motion, vertices = step.motion, step.vertices
     mass = ONE / wp.float64(motion.inverse_mass[vertex])
     change = to_double(vertices.velocity[vertex]) - to_double(motion.velocity[vertex])
     return _moments(mass, to_double(vertices.x1[vertex]), ZERO, wp.mat33d(), mass * wp.dot(change, change))
 
 
 @wp.kernel
-def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+def sum_moments(step: Step, particles: int, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the moments of the vertices that collided, and the torques of those that were divided.
 
     Threads are as in :func:`sum_torques`.
     """
+    motion, vertices = step.motion, step.vertices
     world = int(0)
     added = _Sums()
     for vertex in range(wp.tid(), particles, threads):
@@ -154,8 +155,8 @@ def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int
             _add(sums, world, added)
             added = _Sums()
             world = own
-        if turns(motion, vertices, vertex) and sums[world, HELD] == wp.int64(0):
-            moment = moments(motion, vertices, vertex)
+        if turns(step, vertex) and sums[world, HELD] == wp.int64(0):
+            moment = moments(step, vertex)
             for i in range(MOMENTS):
                 added[MASS + i] += _units(moment[i])
             if vertices.outcome[vertex] & DIVIDED != 0:
@@ -168,32 +169,32 @@ def sum_moments(motion: Motion, vertices: Vertices, particles: int, threads: int
 
 
 @wp.func
-def body_moments(motion: Motion, vertices: Vertices, body: int):
+def body_moments(step: Step, body: int):
     """Returns the torque by the change of the pose of a body, and what the body adds to the moments of its world."""
-    mass = wp.float64(motion.bodies.mass[body])
-    x = vertices.bodies.centre[body]
-    inertia = inertia_at(motion.bodies, body, vertices.bodies.pose[body])
-    predicted = motion.bodies.velocity[body]
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    mass = wp.float64(bodies.mass[body])
+    x = moved.centre[body]
+    inertia = in_world(bodies.inertia[body], moved.pose[body])
+    predicted = bodies.velocity[body]
     linear = to_double(wp.spatial_top(predicted))
     angular = to_double(wp.spatial_bottom(predicted))
-    change = to_double(wp.spatial_top(vertices.bodies.velocity[body])) - linear
-    turn = to_double(wp.spatial_bottom(vertices.bodies.velocity[body])) - angular
-    moved = x - centre_of(motion.bodies, body, motion.bodies.end[body])
-    torque = mass * wp.cross(moved, linear)
-    torque += (inertia - inertia_at(motion.bodies, body, motion.bodies.end[body])) * angular
+    change = to_double(wp.spatial_top(moved.velocity[body])) - linear
+    turn = to_double(wp.spatial_bottom(moved.velocity[body])) - angular
+    torque = mass * wp.cross(x - centre_of(bodies, body, bodies.end[body]), linear)
+    torque += (inertia - in_world(bodies.inertia[body], bodies.end[body])) * angular
     half = HALF * wp.trace(inertia)
     square = mass * wp.length_sq(change) + wp.dot(turn, inertia * turn)
     return torque, _moments(mass, x, half, inertia, square)
 
 
 @wp.kernel
-def sum_body_moments(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+def sum_body_moments(step: Step, sums: wp.array2d[wp.int64]):
     """Sums the moments of the bodies that collided, and the torques by changes of their poses."""
     body = wp.tid()
-    world = wp.max(motion.bodies.world[body], 0)
-    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+    world = wp.max(step.motion.bodies.world[body], 0)
+    if not body_turns(step, body) or sums[world, HELD] != wp.int64(0):
         return
-    torque, total = body_moments(motion, vertices, body)
+    torque, total = body_moments(step, body)
     added = _Sums()
     for axis in range(3):
         added[axis] = _units(torque[axis])
@@ -248,27 +249,27 @@ def _totals(sums: wp.array2d[wp.int64], world: int):
 
 
 @wp.kernel
-def turn_vertices(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+def turn_vertices(step: Step, sums: wp.array2d[wp.int64]):
     """Turns the vertices that collided in each world, which removes the torque that contacts added."""
     vertex = wp.tid()
-    world = motion.world[vertex]
-    if not turns(motion, vertices, vertex) or sums[world, HELD] != wp.int64(0):
+    world = step.motion.world[vertex]
+    if not turns(step, vertex) or sums[world, HELD] != wp.int64(0):
         return
     torque, total = _totals(sums, world)
-    change, _turn = change_by_turn(torque, total, to_double(vertices.x1[vertex]))
-    vertices.velocity[vertex] = to_single(to_double(vertices.velocity[vertex]) + change)
+    change, _turn = change_by_turn(torque, total, to_double(step.vertices.x1[vertex]))
+    step.vertices.velocity[vertex] = to_single(to_double(step.vertices.velocity[vertex]) + change)
 
 
 @wp.kernel
-def turn_bodies(motion: Motion, vertices: Vertices, sums: wp.array2d[wp.int64]):
+def turn_bodies(step: Step, sums: wp.array2d[wp.int64]):
     """Turns the bodies that collided as :func:`turn_vertices` does the vertices of their world."""
     body = wp.tid()
-    world = wp.max(motion.bodies.world[body], 0)
-    if not body_turns(motion, vertices, body) or sums[world, HELD] != wp.int64(0):
+    world = wp.max(step.motion.bodies.world[body], 0)
+    if not body_turns(step, body) or sums[world, HELD] != wp.int64(0):
         return
     torque, total = _totals(sums, world)
-    change, turn = change_by_turn(torque, total, vertices.bodies.centre[body])
-    velocity = vertices.bodies.velocity[body]
+    change, turn = change_by_turn(torque, total, step.vertices.bodies.centre[body])
+    velocity = step.vertices.bodies.velocity[body]
     linear = to_double(wp.spatial_top(velocity)) + change
     angular = to_double(wp.spatial_bottom(velocity)) + turn
-    vertices.bodies.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
+    step.vertices.bodies.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))

@@ -9,8 +9,8 @@ pose, rounded as ``newton.State.body_q`` stores it. Where paths are cut, that of
 import warp as wp
 
 from ..state.fixed_sum import add_to_sum, sums_of
-from ..state.poses import centre_of, inverse_inertia_at, turned_pose, velocity_on_body
-from ..state.structs import NEVER, PROJECTED, Bodies, Constraints, Motion, MovedBodies, Vertices, has_final_velocity
+from ..state.poses import centre_of, in_world, turned_pose, velocity_on_body
+from ..state.structs import NEVER, PROJECTED, Bodies, Motion, MovedBodies, Step, body_of, can_move, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
 
 wp.set_module_options({"enable_backward": False})
@@ -26,63 +26,61 @@ def _body_of_side(motion: Motion, corners: wp.vec4i, side: int) -> int:
     """Returns the body of the first or second element of a constraint, -1 if there is none; a plane is none."""
     if side == 1 and corners[0] == corners[3]:
         return -1
-    return motion.bodies.of_vertex[corners[3 * side]]
+    return body_of(motion, corners[3 * side])
 
 
 @wp.func
-def _lever(motion: Motion, vertices: Vertices, constraints: Constraints, i: int, side: int, x: wp.array[wp.vec3]):
+def _lever(step: Step, i: int, side: int, x: wp.array[wp.vec3]):
     """Returns the lever of the first or second element of a constraint, at positions ``x`` of the vertices.
 
     Returns:
         The body, -1 if the side is no body that can be moved; the sum of the weights of its vertices, and the sum of
         their arms by weight [m].
     """
-    corners = constraints.vertices[i]
-    weights = constraints.weights[i]
-    body = _body_of_side(motion, corners, side)
-    if body >= 0 and motion.bodies.inverse_mass[body] == 0.0:
+    corners = step.constraints.vertices[i]
+    weights = step.constraints.weights[i]
+    body = _body_of_side(step.motion, corners, side)
+    if not can_move(step.motion, body):
         body = -1
     weight = ZERO
     arm = wp.vec3d()
     if body >= 0:
         for j in range(4):
-            if motion.bodies.of_vertex[corners[j]] == body:  # the other element is of another body
+            if step.motion.bodies.of_vertex[corners[j]] == body:  # the other element is of another body
                 weight += weights[j]
-                arm += weights[j] * (to_double(x[corners[j]]) - vertices.bodies.centre[body])
+                arm += weights[j] * (to_double(x[corners[j]]) - step.vertices.bodies.centre[body])
     return body, weight, arm
 
 
 @wp.func
-def activate_bodies(motion: Motion, vertices: Vertices, constraints: Constraints, i: int):
+def activate_bodies(step: Step, i: int):
     """Counts an active constraint for its bodies."""
     for side in range(2):
-        body = _body_of_side(motion, constraints.vertices[i], side)
+        body = _body_of_side(step.motion, step.constraints.vertices[i], side)
         if body >= 0:
-            wp.atomic_add(vertices.bodies.active, body, 1)
+            wp.atomic_add(step.vertices.bodies.active, body, 1)
 
 
 @wp.func
-def body_inverse_masses(
-    motion: Motion, vertices: Vertices, constraints: Constraints, i: int, x: wp.array[wp.vec3], relaxation: wp.float64
-):
+def body_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], relaxation: wp.float64):
     """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
 
     The inverse mass of a body is a matrix. The two numbers belong to a larger one, without products of the normal with
     other directions, so that sweeps converge.
     """
-    normal = constraints.normal[i]
+    normal = step.constraints.normal[i]
     along = ZERO
     across = ZERO
     for side in range(2):
-        body, weight, arm = _lever(motion, vertices, constraints, i, side, x)
+        body, weight, arm = _lever(step, i, side, x)
         if body >= 0:
-            parts = wp.max(wp.float64(vertices.bodies.active[body]) / relaxation, ONE)
-            inverse_inertia = vertices.bodies.inverse_inertia[body]
-            linear = weight * weight * wp.float64(motion.bodies.inverse_mass[body])
+            parts = wp.max(wp.float64(step.vertices.bodies.active[body]) / relaxation, ONE)
+            inverse_inertia = step.vertices.bodies.inverse_inertia[body]
+            linear = weight * weight * wp.float64(step.motion.bodies.inverse_mass[body])
             turned = wp.cross(inverse_inertia * wp.cross(arm, normal), arm)
             turned_along = wp.dot(turned, normal)
             product = ZERO
-            if constraints.friction[i] > 0.0:
+            if step.constraints.friction[i] > 0.0:
                 product = wp.length(turned - turned_along * normal)
             trace = wp.trace(inverse_inertia) * wp.length_sq(arm)
             trace -= wp.dot(arm, inverse_inertia * arm)
@@ -92,43 +90,27 @@ def body_inverse_masses(
 
 
 @wp.func
-def body_change(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    side: int,
-    change: wp.vec3d,
-    x: wp.array[wp.vec3],
-):
+def body_change(step: Step, i: int, side: int, change: wp.vec3d, x: wp.array[wp.vec3]):
     """Returns what the change of a multiplier does to the body on one side of its constraint.
 
     Returns:
         The body, -1 if there is none that can be moved; the change of its centre of mass and its turn, or of the
         velocities of both.
     """
-    body, weight, arm = _lever(motion, vertices, constraints, i, side, x)
+    body, weight, arm = _lever(step, i, side, x)
     shift = wp.vec3d()
     turn = wp.vec3d()
     if body >= 0:
-        shift = weight * wp.float64(motion.bodies.inverse_mass[body]) * change
-        turn = vertices.bodies.inverse_inertia[body] * wp.cross(arm, change)
+        shift = weight * wp.float64(step.motion.bodies.inverse_mass[body]) * change
+        turn = step.vertices.bodies.inverse_inertia[body] * wp.cross(arm, change)
     return body, shift, turn
 
 
 @wp.func
-def add_body_delta(
-    motion: Motion,
-    vertices: Vertices,
-    constraints: Constraints,
-    i: int,
-    change: wp.vec3d,
-    x: wp.array[wp.vec3],
-    sums: wp.array2d[wp.int64],
-):
+def add_body_delta(step: Step, i: int, change: wp.vec3d, x: wp.array[wp.vec3], sums: wp.array2d[wp.int64]):
     """Adds what the change of a multiplier does to the bodies of its constraint, at positions ``x`` of vertices."""
     for side in range(2):
-        body, shift, turn = body_change(motion, vertices, constraints, i, side, change, x)
+        body, shift, turn = body_change(step, i, side, change, x)
         if body >= 0:
             add_to_sum(sums, body, 0, shift)
             add_to_sum(sums, body, 3, turn)
@@ -139,17 +121,17 @@ def _set_centre(bodies: Bodies, moved: MovedBodies, body: int):
     """Sets the centre and inverse inertia of a body, where impulses act, to those of its pose."""
     pose = moved.pose[body]
     moved.centre[body] = centre_of(bodies, body, pose)
-    moved.inverse_inertia[body] = inverse_inertia_at(bodies, body, pose)
+    moved.inverse_inertia[body] = in_world(bodies.inverse_inertia[body], pose)
 
 
 @wp.kernel
-def begin_bodies(motion: Motion, vertices: Vertices):
+def begin_bodies(step: Step):
     """Initializes the bodies by their prediction, and clears everything else."""
     body = wp.tid()
-    moved = vertices.bodies
-    moved.pose[body] = motion.bodies.end[body]
-    moved.velocity[body] = motion.bodies.velocity[body]
-    _set_centre(motion.bodies, moved, body)
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    moved.pose[body] = bodies.end[body]
+    moved.velocity[body] = bodies.velocity[body]
+    _set_centre(bodies, moved, body)
     for axis in range(6):
         moved.delta_x[body, axis] = wp.int64(0)
         moved.delta_v[body, axis] = wp.int64(0)
@@ -162,25 +144,25 @@ def begin_bodies(motion: Motion, vertices: Vertices):
 
 
 @wp.func
-def move_body(motion: Motion, vertices: Vertices, body: int) -> bool:
+def move_body(step: Step, body: int) -> bool:
     """Moves a body by the sum of its changes by constraints, if it has active ones; returns whether it has."""
-    moved = vertices.bodies
-    moves = moved.active[body] != 0 and motion.bodies.inverse_mass[body] > 0.0
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    moves = moved.active[body] != 0 and bodies.inverse_mass[body] > 0.0
     if moves:
-        pose = motion.bodies.end[body]
+        pose = bodies.end[body]
         shift, turn = sums_of(moved.delta_x, body)
         if wp.length_sq(shift) + wp.length_sq(turn) > ZERO:  # else it keeps every bit of its pose
-            pose = turned_pose(motion.bodies, body, pose, shift, turn)
+            pose = turned_pose(bodies, body, pose, shift, turn)
         moved.pose[body] = pose
     return moves
 
 
 @wp.kernel
-def move_bodies(motion: Motion, vertices: Vertices, last: bool):
+def move_bodies(step: Step, last: bool):
     """Moves each body by the sum of its changes by constraints; the ``last`` sweep empties its active set."""
     body = wp.tid()
-    moved = vertices.bodies
-    moves = move_body(motion, vertices, body)
+    moved = step.vertices.bodies
+    moves = move_body(step, body)
     moved.moved[body] = wp.where(moves, 1, 0)
     if last:
         moved.active[body] = 0
@@ -189,52 +171,54 @@ def move_bodies(motion: Motion, vertices: Vertices, last: bool):
 
 
 @wp.kernel
-def place_vertices(motion: Motion, vertices: Vertices):
+def place_vertices(step: Step):
     """Moves the vertices of bodies that moved."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and vertices.bodies.moved[body] != 0:
-        vertices.x1[vertex] = wp.transform_point(vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
-        vertices.changed[vertex] = 1
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    vertex = bodies.particle_count + wp.tid()
+    body = bodies.of_vertex[vertex]
+    if body >= 0 and moved.moved[body] != 0:
+        step.vertices.x1[vertex] = wp.transform_point(moved.pose[body], bodies.position[wp.tid()])
+        step.vertices.changed[vertex] = 1
 
 
 @wp.kernel
-def move_to_end(motion: Motion, vertices: Vertices):
+def move_to_end(step: Step):
     """Makes impulses act on bodies in their poses at the end of the step."""
     body = wp.tid()
-    if motion.bodies.inverse_mass[body] > 0.0:
-        _set_centre(motion.bodies, vertices.bodies, body)
+    if step.motion.bodies.inverse_mass[body] > 0.0:
+        _set_centre(step.motion.bodies, step.vertices.bodies, body)
 
 
 @wp.func
-def change_body_velocity(motion: Motion, vertices: Vertices, body: int) -> bool:
+def change_body_velocity(step: Step, body: int) -> bool:
     """Changes the velocity of a body as :func:`.velocities.change_velocity` that of a vertex."""
-    moved = vertices.bodies
-    is_free = motion.bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    is_free = bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
     if is_free:
         linear, angular = sums_of(moved.delta_v, body)
-        linear += to_double(wp.spatial_top(motion.bodies.velocity[body]))
-        angular += to_double(wp.spatial_bottom(motion.bodies.velocity[body]))
+        linear += to_double(wp.spatial_top(bodies.velocity[body]))
+        angular += to_double(wp.spatial_bottom(bodies.velocity[body]))
         moved.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
     return is_free
 
 
 @wp.kernel
-def change_body_velocities(motion: Motion, vertices: Vertices, last: bool):
+def change_body_velocities(step: Step, last: bool):
     """Changes the velocity of each body that was not truncated; ``last`` empties its active set."""
     body = wp.tid()
-    moved = vertices.bodies
-    if moved.active[body] != 0:
-        change_body_velocity(motion, vertices, body)
+    active = step.vertices.bodies.active
+    if active[body] != 0:
+        change_body_velocity(step, body)
     if last:
-        moved.active[body] = 0
+        active[body] = 0
 
 
 @wp.kernel
-def set_vertex_velocities(motion: Motion, vertices: Vertices):
+def set_vertex_velocities(step: Step):
     """Sets the velocities of vertices to those of their bodies."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and motion.bodies.inverse_mass[body] > 0.0:
-        arm = to_double(vertices.x1[vertex]) - vertices.bodies.centre[body]
-        vertices.velocity[vertex] = velocity_on_body(vertices.bodies.velocity[body], arm)
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    vertex = bodies.particle_count + wp.tid()
+    body = bodies.of_vertex[vertex]
+    if can_move(step.motion, body):
+        arm = to_double(step.vertices.x1[vertex]) - moved.centre[body]
+        step.vertices.velocity[vertex] = velocity_on_body(moved.velocity[body], arm)

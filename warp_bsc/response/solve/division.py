@@ -7,19 +7,12 @@ start.
 
 import warp as wp
 
+from ..contacts import first_contact
 from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
-from ..contacts.first_contact import (
-    TIME_UNITS,
-    contact_index,
-    contact_kind,
-    contact_time,
-    packed_vertex,
-    share_before,
-    truncated_path,
-)
+from ..contacts.first_contact import TIME_UNITS
 from ..contacts.queue import PairQueue, queues_of, vertices_of
-from ..schedule import SolveStatus, divides_all_proximities, divides_proximities, is_freezing
+from ..schedule import Loop, Result, SolveStatus, divides_all_proximities, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.structs import (
@@ -29,15 +22,14 @@ from ..state.structs import (
     PROJECTED,
     TRUNCATED,
     UNCONSTRAINED,
-    Constraints,
     ContactKind,
     DividingPlanes,
-    Motion,
     Pace,
-    Vertices,
+    Step,
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
+from ..tuning import SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -45,61 +37,50 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def divide_proximities(
-    # in
-    motion: Motion,
-    status: SolveStatus,
-    separation: wp.float64,
-    # in and out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-):
+def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus):
     """Adds dividing planes for proximities, see :func:`.schedule.divides_proximities`.
 
     In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
     A constraint whose elements would meet changes velocities too.
     """
     i = wp.tid()
+    constraints, outcome = step.constraints, step.vertices.outcome
     if i >= constraints.count[0]:
         return
     kind = constraints.kind[i]
     if kind != ContactKind.VERTEX_FACE_PROXIMITY and kind != ContactKind.EDGE_EDGE_PROXIMITY:
         return
     corners = constraints.vertices[i]
-    if not divides_proximities(status, motion.world[corners[0]]) or moves_body(motion, constraints, i):
+    if not divides_proximities(status, step.motion.world[corners[0]]) or moves_body(step, i):
         return
     all_pairs = divides_all_proximities(status)
     if not all_pairs and constraints.pace[i] != Pace.RESTING:
         return
-    kept = min_distance_of(constraints, i)
-    pair_kind = kind_of_pair(kind)
-    meets = add_dividing_plane(motion, vertices, corners, pair_kind, separation, kept, dividing, False, all_pairs)
-    if meets and not has_pushed(constraints, i):
+    kept = min_distance_of(step, i)
+    meets = add_dividing_plane(step, corners, kind_of_pair(kind), kept, dividing, False, all_pairs)
+    if meets and not has_pushed(step, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):
-            vertex = corners[j]
-            if motion.inverse_mass[vertex] > 0.0:
-                vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
+            if step.motion.inverse_mass[corners[j]] > 0.0:
+                outcome[corners[j]] = outcome[corners[j]] | PROJECTED
 
 
 @wp.kernel
-def find_body_shares(
-    motion: Motion, vertices: Vertices, status: SolveStatus, dividing: DividingPlanes, record: StepRecord
-):
+def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, record: StepRecord):
     """Finds the share of the path of each body up to which its vertices are above their dividing planes.
 
     The vertices go straight here, but in an arc where the body turns: if one ends below its plane for that and
     collides, the next iteration cuts the path again. Where a contact has no plane, the path ends before that contact.
     If the step is recorded, first contacts are left for :func:`record_body_truncations`.
     """
+    motion, vertices = step.motion, step.vertices
     vertex = motion.bodies.particle_count + wp.tid()
     packed = vertices.first_contact[vertex]
     body = motion.bodies.of_vertex[vertex]
     if packed == NEVER or body < 0:
         return
     if is_recording(record):
-        wp.atomic_min(vertices.bodies.first_contact, body, packed_vertex(packed, vertex))
+        wp.atomic_min(vertices.bodies.first_contact, body, first_contact.packed_vertex(packed, vertex))
     else:
         vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
@@ -112,25 +93,26 @@ def find_body_shares(
     if divides:
         share = share_of_path(dividing, vertex, to_double(motion.x0[vertex]), to_double(vertices.x1[vertex]))
     if not complete:
-        share = wp.min(share, share_before(contact_time(packed)))
-    if not complete or contact_kind(packed) == ContactKind.NONE:
+        share = wp.min(share, SHARE_OF_PATH * first_contact.contact_time(packed))
+    if not complete or first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.bodies.loose[body] = 1
     wp.atomic_min(vertices.bodies.share, body, wp.int64(wp.floor(TIME_UNITS * share)))
 
 
 @wp.func
-def _freeze_body(motion: Motion, vertices: Vertices, body: int):
+def _freeze_body(step: Step, body: int):
     """Puts a body back in its pose at the start, without velocity."""
-    vertices.bodies.pose[body] = motion.bodies.start[body]
-    vertices.bodies.velocity[body] = wp.spatial_vector()
-    vertices.bodies.outcome[body] = vertices.bodies.outcome[body] | FROZEN
+    moved = step.vertices.bodies
+    moved.pose[body] = step.motion.bodies.start[body]
+    moved.velocity[body] = wp.spatial_vector()
+    moved.outcome[body] = moved.outcome[body] | FROZEN
 
 
 @wp.kernel
-def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.float64):
+def cut_bodies(step: Step, status: SolveStatus, dt: wp.float64):
     """Moves each body whose path is cut back along it, or freezes it in its pose at the start."""
     body = wp.tid()
-    moved = vertices.bodies
+    bodies, moved = step.motion.bodies, step.vertices.bodies
     share = moved.share[body]
     moved.share[body] = WHOLE_PATH
     moved.first_contact[body] = NEVER
@@ -139,23 +121,23 @@ def cut_bodies(motion: Motion, vertices: Vertices, status: SolveStatus, dt: wp.f
     if moved.moved[body] == 0:
         return
     if share == FREEZES:
-        _freeze_body(motion, vertices, body)
-        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        _freeze_body(step, body)
+        wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
-    start = motion.bodies.start[body]
-    end = pose_between(motion.bodies, body, start, moved.pose[body], wp.float64(share) / TIME_UNITS)
+    start = bodies.start[body]
+    end = pose_between(bodies, body, start, moved.pose[body], wp.float64(share) / TIME_UNITS)
     moved.pose[body] = end
     outcome = moved.outcome[body] | TRUNCATED
     if moved.loose[body] == 0:
         moved.outcome[body] = outcome | DIVIDED
         return
-    moved.velocity[body] = velocity_between(motion.bodies, body, start, end, dt)
+    moved.velocity[body] = velocity_between(bodies, body, start, end, dt)
     moved.outcome[body] = (outcome | DIVIDED) - DIVIDED
 
 
 @wp.func
 def _record_truncation(
-    vertices: Vertices,
+    step: Step,
     vertex: int,
     body: int,
     cuts: bool,
@@ -169,11 +151,11 @@ def _record_truncation(
     if entry >= record.vertex.shape[0]:
         return
     record.vertex[entry] = wp.where(body < 0, vertex, -1)
-    record.end[entry] = vertices.x1[vertex]
+    record.end[entry] = step.vertices.x1[vertex]
     record.body[entry] = body
     if body >= 0:
-        record.pose[entry] = vertices.bodies.pose[body]
-    if contact_kind(packed) == ContactKind.EDGE_EDGE:
+        record.pose[entry] = step.vertices.bodies.pose[body]
+    if first_contact.contact_kind(packed) == ContactKind.EDGE_EDGE:
         _record_contact(vertex, cuts, packed, edge_edge, entry, record)
     else:
         _record_contact(vertex, cuts, packed, vertex_face, entry, record)
@@ -182,11 +164,11 @@ def _record_truncation(
 @wp.func
 def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
     """Records the contact that a path is truncated before."""
-    kind = wp.where(cuts, contact_kind(packed), NO_CONTACT)
-    i = contact_index(packed)
+    kind = wp.where(cuts, first_contact.contact_kind(packed), NO_CONTACT)
+    i = first_contact.contact_index(packed)
     record.kind[entry] = kind
     record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = contact_time(packed)
+    record.toi[entry] = first_contact.contact_time(packed)
     if kind != ContactKind.PLANE and kind != NO_CONTACT:
         record.contact[entry] = vertices_of(contacts, i)
         record.within_tolerance[entry] = contacts.within_tolerance[i]
@@ -196,17 +178,18 @@ def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQue
 
 
 @wp.func
-def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes, vertex: int):
+def _keep_on_sides(step: Step, dividing: DividingPlanes, vertex: int):
     """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided.
 
     One without a new plane is there, as no projection follows the first planes of its world.
     """
+    vertices = step.vertices
     first = dividing.first[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or first < 0 or first == dividing.kept[vertex]:
+    if step.motion.inverse_mass[vertex] == 0.0 or first < 0 or first == dividing.kept[vertex]:
         return
     dividing.kept[vertex] = first
     x1 = vertices.x1[vertex]
-    end, truncated = position_on_sides(dividing, vertex, motion.x0[vertex], x1)
+    end, truncated = position_on_sides(dividing, vertex, step.motion.x0[vertex], x1)
     if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
         vertices.x1[vertex] = end
         vertices.changed[vertex] = 1
@@ -214,25 +197,23 @@ def _keep_on_sides(motion: Motion, vertices: Vertices, dividing: DividingPlanes,
 
 
 @wp.func
-def _freeze_vertex(motion: Motion, vertices: Vertices, vertex: int):
+def _freeze_vertex(step: Step, vertex: int):
     """Puts a vertex back to its start, without velocity."""
-    vertices.x1[vertex] = motion.x0[vertex]
+    vertices = step.vertices
+    vertices.x1[vertex] = step.motion.x0[vertex]
     vertices.velocity[vertex] = wp.vec3()
     vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
 
 
 @wp.kernel
 def truncate_vertices(
-    # in
-    motion: Motion,
+    step: Step,
     vertex_face: PairQueue,
     edge_edge: PairQueue,
-    dt: wp.float64,
-    # in and out
-    vertices: Vertices,
     dividing: DividingPlanes,
     status: SolveStatus,
     record: StepRecord,
+    dt: wp.float64,
 ):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
@@ -240,10 +221,11 @@ def truncate_vertices(
     ``max_truncations`` iterations vertices that still collide are frozen.
     """
     vertex = wp.tid()
+    motion, vertices = step.motion, step.vertices
     packed = vertices.first_contact[vertex]
     if packed == NEVER:
         if dividing.first:
-            _keep_on_sides(motion, vertices, dividing, vertex)
+            _keep_on_sides(step, dividing, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
@@ -253,11 +235,11 @@ def truncate_vertices(
     if not cuts and outcome & FROZEN != 0:
         return
     if is_recording(record):
-        _record_truncation(vertices, vertex, -1, cuts, packed, vertex_face, edge_edge, record)
+        _record_truncation(step, vertex, -1, cuts, packed, vertex_face, edge_edge, record)
     vertices.changed[vertex] = 1
     if not cuts:
-        _freeze_vertex(motion, vertices, vertex)
-        wp.atomic_add(status.loop.newly_frozen, 0, 1)
+        _freeze_vertex(step, vertex)
+        wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = motion.x0[vertex]
     end = vertices.x1[vertex]
@@ -266,12 +248,12 @@ def truncate_vertices(
         end, truncated = position_on_sides(dividing, vertex, x0, end)
         outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
     if not complete:
-        path = truncated_path(to_double(x0), to_double(end), contact_time(packed))
+        path = first_contact.truncated_path(to_double(x0), to_double(end), first_contact.contact_time(packed))
         end = to_single(to_double(x0) + path)
         outcome = outcome | TRUNCATED
         if not divides:
             vertices.velocity[vertex] = to_single(path / dt)
-    if divides and contact_kind(packed) == ContactKind.NONE:
+    if divides and first_contact.contact_kind(packed) == ContactKind.NONE:
         vertices.velocity[vertex] = (end - x0) / float(dt)
         outcome = outcome | UNCONSTRAINED
     vertices.x1[vertex] = end
@@ -279,59 +261,52 @@ def truncate_vertices(
 
 
 @wp.kernel
-def record_body_truncations(
-    motion: Motion, vertices: Vertices, record: StepRecord, vertex_face: PairQueue, edge_edge: PairQueue
-):
+def record_body_truncations(step: Step, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord):
     """Records the pose of each body whose path is truncated next, before the first contact of its vertices."""
-    vertex = motion.bodies.particle_count + wp.tid()
-    packed = vertices.first_contact[vertex]
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    vertex = bodies.particle_count + wp.tid()
+    packed = step.vertices.first_contact[vertex]
     if packed == NEVER:
         return
-    vertices.first_contact[vertex] = NEVER
-    body = motion.bodies.of_vertex[vertex]
-    if body < 0 or motion.bodies.inverse_mass[body] == 0.0 or vertices.bodies.outcome[body] & FROZEN != 0:
+    step.vertices.first_contact[vertex] = NEVER
+    body = bodies.of_vertex[vertex]
+    if body < 0 or bodies.inverse_mass[body] == 0.0 or moved.outcome[body] & FROZEN != 0:
         return
-    if vertices.bodies.first_contact[body] == packed_vertex(packed, vertex):
-        cuts = vertices.bodies.share[body] != FREEZES
-        _record_truncation(vertices, vertex, body, cuts, packed, vertex_face, edge_edge, record)
+    if moved.first_contact[body] == first_contact.packed_vertex(packed, vertex):
+        cuts = moved.share[body] != FREEZES
+        _record_truncation(step, vertex, body, cuts, packed, vertex_face, edge_edge, record)
 
 
 @wp.kernel
-def freeze_undetected(motion: Motion, vertices: Vertices, status: SolveStatus):
-    """Freezes all vertices if the last detection was incomplete."""
-    vertex = wp.tid()
-    if status.results.undetected[0] == 1 and motion.inverse_mass[vertex] > 0.0:
-        _freeze_vertex(motion, vertices, vertex)
-
-
-@wp.kernel
-def freeze_undetected_bodies(motion: Motion, vertices: Vertices, status: SolveStatus):
-    """Freezes all bodies if the last detection was incomplete."""
-    body = wp.tid()
-    frozen = status.results.undetected[0] == 1 and motion.bodies.inverse_mass[body] > 0.0
-    vertices.bodies.moved[body] = wp.where(frozen, 1, 0)
-    if frozen:
-        _freeze_body(motion, vertices, body)
+def freeze_undetected(step: Step, particles: int, bodies: int, status: SolveStatus):
+    """Freezes all particles and bodies if the last detection was incomplete; thread i has one of each."""
+    i = wp.tid()
+    undetected = status.results[Result.UNDETECTED] == 1
+    if i < particles and undetected and step.motion.inverse_mass[i] > 0.0:
+        _freeze_vertex(step, i)
+    if i < bodies:
+        frozen = undetected and step.motion.bodies.inverse_mass[i] > 0.0
+        step.vertices.bodies.moved[i] = wp.where(frozen, 1, 0)
+        if frozen:
+            _freeze_body(step, i)
 
 
 def divide(work: Workspace, dt: float) -> None:
     """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
     work.reserve_truncations()
-    motion, vertices, status, record = work.motion.vertices, work.vertices, work.status, work.record
-    contacts = queues_of(work.detector)[:2]
+    contacts, changed = queues_of(work.detector)[:2], [work.dividing, work.status]
     if not work.differentiable:
-        inputs = [motion, status, work.separation, vertices, work.constraints, work.dividing]
-        work.launch_over_constraints(divide_proximities, inputs)
-    work.launch_over_particles(truncate_vertices, [motion, *contacts, dt, vertices, work.dividing, status, record])
-    work.launch_over_shape_vertices(find_body_shares, status, work.dividing, record)
+        work.launch_over_constraints(divide_proximities, *changed)
+    work.launch_over_particles(truncate_vertices, *contacts, *changed, work.record, dt)
+    work.launch_over_shape_vertices(find_body_shares, *changed, work.record)
     if work.recorder is not None:
-        work.launch_over_shape_vertices(record_body_truncations, record, *contacts)
-    work.launch_over_bodies(cut_bodies, status, dt)
+        work.launch_over_shape_vertices(record_body_truncations, *contacts, work.record)
+    work.launch_over_bodies(cut_bodies, work.status, dt)
     work.launch_over_shape_vertices(place_vertices)
 
 
 def freeze_if_undetected(work: Workspace) -> None:
     """Freezes everything if the last detection was incomplete: a recorded step whose CUDA graph is too small."""
-    work.launch_over_particles(freeze_undetected, [work.motion.vertices, work.vertices, work.status])
-    work.launch_over_bodies(freeze_undetected_bodies, work.status)
+    particles, bodies = work.particle_count, work.body_count
+    work.launch(freeze_undetected, max(particles, bodies), [work.step, particles, bodies, work.status])
     work.launch_over_shape_vertices(place_vertices)

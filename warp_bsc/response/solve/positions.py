@@ -2,36 +2,22 @@
 
 import warp as wp
 
-from ..contacts.constraints import gap, min_distance_of
-from ..schedule import SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
+from ..contacts.constraints import gap, min_distance_of, moves_body
+from ..schedule import Loop, SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
-from ..state.structs import PROJECTED, Constraints, ContactKind, Motion, Pace, Vertices
-from ..state.vectors import ZERO, relative
+from ..state.structs import PROJECTED, ContactKind, Pace, Step
+from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .sweeps import (
-    activate,
-    add_delta,
-    after_sweep,
-    finish_sweep,
-    is_held_by_friction,
-    max_sweeps,
-    momentum_of,
-    path_of,
-    position_multiplier_after,
-    repeat,
-    tolerance_of,
-)
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def activate_position_constraints(
-    motion: Motion, status: SolveStatus, tolerance: wp.float64, vertices: Vertices, constraints: Constraints
-):
+def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64):
     """Fills the active set for positions: constraints that are violated, and those that may pull something back.
 
     Constraints met within the tolerance cost nothing, and move nothing. Nor do edges at rest near each other where
@@ -39,81 +25,78 @@ def activate_position_constraints(
     which hold it as well.
     """
     i = wp.tid()
+    motion, constraints = step.motion, step.constraints
     if i >= constraints.count[0]:
         return
     corners = constraints.vertices[i]
     world = motion.world[corners[0]]
     resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
-    if resting_edges and is_dividing(status, world, status.loop.iteration[0]):
-        kept = min_distance_of(constraints, i)
+    if resting_edges and is_dividing(status, world, status.loop[Loop.ITERATION]):
+        kept = min_distance_of(step, i)
         start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
         if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
             return
-    past = status.loop.sweep[0] >= max_sweeps(motion, constraints, status, i, status.slow_position_sweeps)
+    past = status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
     if past or not is_projecting(status, world):
         return
     normal = constraints.normal[i]
     separation = constraints.separation[i]
-    distance = gap(vertices, constraints, i)
+    distance = gap(step, i)
     if constraints.kind[i] == ContactKind.PLANE:  # whose separation is an offset
         predicted = wp.dot(normal, relative(constraints.weights[i], corners, motion.x1))
         if predicted < separation:
             tolerance = wp.min(tolerance, TOLERANCE_OF_CHANGE * (separation - predicted))
     else:
-        tolerance = wp.min(tolerance, TOLERANCE_OF_DISTANCE * (separation - min_distance_of(constraints, i)))
-    tolerance = tolerance_of(motion, constraints, i, tolerance)
+        tolerance = wp.min(tolerance, TOLERANCE_OF_DISTANCE * (separation - min_distance_of(step, i)))
+    tolerance *= wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE)
     active = distance < -tolerance
     if not active and is_reversible(status, constraints.pace[i] != Pace.FAST):
         multiplier = constraints.position_multiplier[i]
         if wp.length_sq(multiplier) > ZERO:
             friction = wp.float64(constraints.friction[i])
-            path = path_of(motion, vertices, constraints, i)
-            active = distance > tolerance or not is_held_by_friction(multiplier, normal, path, friction, tolerance)
+            path = sweeps.path_of(step, i)
+            active = distance > tolerance or not sweeps.is_held_by_friction(
+                multiplier, normal, path, friction, tolerance
+            )
     if active:
-        activate(motion, vertices, constraints, i)
+        sweeps.activate(step, i)
 
 
 @wp.kernel
-def project_positions(
-    motion: Motion, status: SolveStatus, vertices: Vertices, constraints: Constraints, record: StepRecord
-):
+def project_positions(step: Step, status: SolveStatus, record: StepRecord):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     place = wp.tid()
+    vertices, constraints = step.vertices, step.constraints
     if wp.int64(place) >= constraints.active_count[0]:
         return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    last_sweep = max_sweeps(motion, constraints, status, i, status.slow_position_sweeps) - 1
-    momentum = momentum_of(constraints, status, i, last_sweep)
+    momentum = sweeps.momentum_of(step, status, i, status.slow_position_sweeps)
     if pushes_only:
-        violated = gap(vertices, constraints, i) < ZERO
+        violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
-    multiplier = position_multiplier_after(motion, vertices, constraints, i, pushes_only)
+    multiplier = sweeps.position_multiplier_after(step, i, pushes_only)
     old = constraints.position_multiplier[i]
-    new = after_sweep(constraints, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.position_multiplier[i] = new
-    sums = vertices.particle_delta_x
-    add_delta(motion, vertices, constraints, i, new - old, motion.x1, sums, vertices.bodies.delta_x)
+    sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
 @wp.func
-def move_vertex(motion: Motion, vertices: Vertices, vertex: int) -> bool:
+def move_vertex(step: Step, vertex: int) -> bool:
     """Moves a vertex by the sum of its changes by constraints, if it can be moved; returns whether it can."""
-    moves = motion.inverse_mass[vertex] > 0.0
+    moves = step.motion.inverse_mass[vertex] > 0.0
     if moves:
-        vertices.x1[vertex] = with_delta(motion.x1[vertex], vertices.particle_delta_x, vertex)
+        step.vertices.x1[vertex] = with_delta(step.motion.x1[vertex], step.vertices.particle_delta_x, vertex)
     return moves
 
 
 @wp.kernel
-def update_positions(
-    motion: Motion, last: bool, vertices: Vertices, constraints: Constraints, status: SolveStatus, record: StepRecord
-):
+def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: bool):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    if not finish_sweep(vertices, constraints, status, record, last, vertex):
-        return
-    if move_vertex(motion, vertices, vertex):
+    vertices = step.vertices
+    if sweeps.finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
@@ -123,7 +106,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    repeat(work.status, work.reserve_entries, lambda first, last: _sweep(work, first, last, tolerance))
+    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -133,18 +116,14 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    work.reserve_entries(1)
-    _sweep(work, True, True, 1.0)
+    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
-def _sweep(work, first, last, tolerance):
-    """Sweeps over the constraints once; the first sweep fills the active set, the last empties it."""
-    motion, changed = work.motion.vertices, [work.vertices, work.constraints]
-    if first:
-        inputs = [motion, work.status, tolerance * work.tolerance]
-        work.launch_over_constraints(activate_position_constraints, [*inputs, *changed])
-    work.launch_over_active_set(project_positions, [motion, work.status, *changed, work.record])
-    inputs = [motion, last, *changed, work.status, work.record]
-    work.launch_over_particles(update_positions, inputs, at_least_once=True)
+def _activate(work, tolerance):
+    work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
+
+
+def _update(work, last):
+    work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from .mesh import ModelMesh
+
 
 @wp.kernel
 def _write_friction(
@@ -35,20 +37,13 @@ class Friction:
         of_shapes: The coefficients of shapes from which they are read, as ``newton.Model.shape_material_mu``.
     """
 
-    def __init__(
-        self,
-        of_particles: wp.array[float],
-        of_shapes: wp.array[float],
-        *,
-        particle_count: int,
-        vertex_shapes: wp.array[int],
-        plane_shapes: wp.array[int],
-    ):
-        """Reads the coefficients for the first time, of vertices of particles, of those of shapes, and of planes."""
-        self.of_particles, self.of_shapes, device = of_particles, of_shapes, of_particles.device
-        self._inputs = [of_particles, of_shapes, particle_count, vertex_shapes, plane_shapes]
-        self.vertices = wp.zeros(particle_count + len(vertex_shapes), dtype=float, device=device)
-        self.planes = wp.zeros(len(plane_shapes), dtype=float, device=device)
+    def __init__(self, mesh: ModelMesh, of_particles: wp.array[float], of_shapes: wp.array[float]):
+        """Reads the coefficients of the vertices and planes of a mesh for the first time."""
+        self.of_particles, self.of_shapes = of_particles, of_shapes
+        shapes = mesh.device_shape_vertices.shape, mesh.device_planes.shape
+        self._inputs = [of_particles, of_shapes, mesh.model.particle_count, *shapes]
+        self.vertices = wp.zeros(mesh.vertex_count, dtype=float, device=mesh.device)
+        self.planes = wp.zeros(len(shapes[1]), dtype=float, device=mesh.device)
         self.read()
 
     def read(self) -> None:

@@ -6,11 +6,11 @@ import numpy as np
 import warp as wp
 from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
-from ..._arguments import checked_distance, checked_distances, checked_integer
+from ..._arguments import checked_integer
 from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
 from ..tuning import SEGMENTS
-from .structs import Incidence
+from .structs import Connectivity, Incidence
 
 MAX_SEGMENTS = 1024
 """Most triangles around a round shape; a sphere has about the square of them."""
@@ -24,35 +24,34 @@ _Array = TypeVar("_Array", np.ndarray, wp.array)
 
 
 class ShapeVertices(NamedTuple, Generic[_Array]):
-    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays.
+    """The vertices of the tessellated rigid shapes, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        position: Positions [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3].
-        body: Body that the vertex moves with, -1 for none, int32, shape [n].
-        shape: Shape that the vertex belongs to, as in ``model.shape_material_mu``, int32, shape [n].
-    """
-
-    position: _Array
-    body: _Array
-    shape: _Array
+    position: _Array  # [m] in the frame of the body, or of the world where there is none, float32, shape [n, 3]
+    body: _Array  # that the vertex moves with, -1 for none, int32
+    shape: _Array  # that the vertex belongs to, as in ``model.shape_material_mu``, int32
 
 
 class Planes(NamedTuple, Generic[_Array]):
-    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays.
+    """The infinite planes, each the boundary of a solid half-space, as NumPy or as Warp arrays of length n."""
 
-    Attributes:
-        point: A point of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3].
-        normal: Unit normal out of the solid, in the same frame, float32, shape [n, 3].
-        body: Body that the plane moves with, -1 for none, int32, shape [n].
-        shape: Shape of the plane, int32, shape [n].
-        world: World of the plane, -1 for all worlds, int32, shape [n].
-    """
+    point: _Array  # of the plane [m] in the frame of the body, or of the world, float32, shape [n, 3]
+    normal: _Array  # of unit length, out of the solid, in the same frame, float32, shape [n, 3]
+    body: _Array  # that the plane moves with, -1 for none, int32
+    shape: _Array  # int32
+    world: _Array  # -1 for all worlds, int32
 
-    point: _Array
-    normal: _Array
-    body: _Array
-    shape: _Array
-    world: _Array
+
+@wp.struct
+class Placement:
+    """Where the vertices and the planes of a mesh are in a state."""
+
+    particle_q: wp.array[wp.vec3]
+    body_q: wp.array[wp.transform]
+    shape_vertex_position: wp.array[wp.vec3]
+    shape_vertex_body: wp.array[int]
+    plane_point: wp.array[wp.vec3]
+    plane_normal: wp.array[wp.vec3]
+    plane_body: wp.array[int]
 
 
 class ModelMesh(CollisionMesh):
@@ -75,8 +74,7 @@ class ModelMesh(CollisionMesh):
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
-        device_vertex_edges: The edges of each vertex, :class:`Incidence`.
-        device_edge_faces: The faces of each edge, :class:`Incidence`.
+        connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
     """
 
@@ -113,8 +111,9 @@ class ModelMesh(CollisionMesh):
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
         tessellations = {}
-        shapes, worlds, positions, faces = [], [], [np.empty((0, 3))], [_soft_faces(model)]
-        vertex_count = model.particle_count
+        triangles, vertex_count = elements_of(model.tri_indices, 3), model.particle_count
+        faces = [triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)]
+        shapes, worlds, positions = [], [], [np.empty((0, 3))]
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
             if key not in tessellations:
@@ -140,8 +139,10 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
         self.device_planes = Planes(*map(self._on_device, self.planes))
-        self.device_vertex_edges = _incidence(self.edges, vertex_count, self.device)
-        self.device_edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
+        self.connectivity = connectivity = Connectivity()
+        connectivity.faces, connectivity.edges = self.device_faces, self.device_edges
+        connectivity.vertex_edges = _incidence(self.edges, vertex_count, self.device)
+        connectivity.edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
@@ -151,33 +152,19 @@ class ModelMesh(CollisionMesh):
         """Whether a vertex or a plane moves with a body."""
         return bool((self.shape_vertices.body >= 0).any() or (self.planes.body >= 0).any())
 
-    def keep_distances(
-        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
-    ) -> None:
-        """Sets the minimum distances of pairs, with arguments and errors as of :meth:`min_distances`."""
-        self.distances = self.min_distances(min_distance, radius, reach=reach)
-
-    def min_distances(
-        self, min_distance: float, radius: float | np.ndarray | wp.array | None, *, reach: float
-    ) -> MinDistances:
+    def min_distances(self, min_distance: float, radii: np.ndarray, *, reach: float) -> MinDistances:
         """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 
         Args:
             min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
-            radius: Radius of each particle [m], as the distance, shape [particle_count], or one for all; None for 0.
+            radii: Radius of each particle [m], shape [particle_count], or one for all.
             reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
-
-        Raises:
-            TypeError: If ``min_distance`` or ``radius`` is no number.
-            ValueError: If one of them has another shape or is out of range.
         """
-        distance, count = checked_distance(min_distance, "min_distance"), self.model.particle_count
-        radii = radius.numpy() if isinstance(radius, wp.array) else radius
-        every = np.full(self.vertex_count, 0.5 * distance)
-        every[:count] += checked_distances(0.0 if radii is None else radii, "radius", count)
-        group = np.full(self.vertex_count, -1)
+        count, group = self.model.particle_count, np.full(self.vertex_count, -1)
+        every = np.full(self.vertex_count, 0.5 * min_distance)
+        every[:count] += radii
         group[count:] = self.shape_vertices.body + 1
-        return make_min_distances(self, every, of_planes=0.5 * distance, reach=reach, group=group)
+        return make_min_distances(self, every, of_planes=0.5 * min_distance, reach=reach, group=group)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
@@ -198,22 +185,24 @@ class ModelMesh(CollisionMesh):
         Raises:
             ValueError: If an array has another length.
         """
-        self.check_lengths(particle_q, body_q, out)
-        inputs = [particle_q, body_q, self.device_shape_vertices.position, self.device_shape_vertices.body]
+        if len(out) != self.vertex_count:
+            raise ValueError(f"out must have length {self.vertex_count}, not {len(out)}")
+        inputs = [self.place(particle_q, body_q)]
         wp.launch(_write_positions, self.vertex_count, inputs=inputs, outputs=[out], device=self.device)
 
-    def check_lengths(
-        self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None, out: wp.array[wp.vec3]
-    ) -> None:
-        """Raises ValueError if an array as of :meth:`positions` has another length."""
-        for name, array, count in (
-            ("particle_q", particle_q, self.model.particle_count),
-            ("body_q", body_q, self.model.body_count),
-            ("out", out, self.vertex_count),
-        ):
+    def place(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> Placement:
+        """Returns where vertices and planes are in a state, with arguments and errors as of :meth:`positions`."""
+        place, model = Placement(), self.model
+        given = ("particle_q", particle_q, model.particle_count), ("body_q", body_q, model.body_count)
+        for name, array, count in given:
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
+        place.particle_q, place.body_q = particle_q, body_q
+        vertices, planes = self.device_shape_vertices, self.device_planes
+        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
+        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
+        return place
 
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
@@ -226,34 +215,20 @@ class ModelMesh(CollisionMesh):
 
 
 @wp.func
-def vertex_position(
-    vertex: int,
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    shape_vertex_position: wp.array[wp.vec3],
-    shape_vertex_body: wp.array[int],
-) -> wp.vec3:
+def vertex_position(place: Placement, vertex: int) -> wp.vec3:
     """Returns the position of a vertex of a :class:`ModelMesh` [m], see :meth:`ModelMesh.positions`."""
-    i = vertex - particle_q.shape[0]
+    i = vertex - place.particle_q.shape[0]
     if i < 0:
-        return particle_q[vertex]
-    if shape_vertex_body[i] < 0:
-        return shape_vertex_position[i]
-    return wp.transform_point(body_q[shape_vertex_body[i]], shape_vertex_position[i])
+        return place.particle_q[vertex]
+    body = place.shape_vertex_body[i]
+    if body < 0:
+        return place.shape_vertex_position[i]
+    return wp.transform_point(place.body_q[body], place.shape_vertex_position[i])
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def _write_positions(
-    # in
-    particle_q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    shape_vertex_position: wp.array[wp.vec3],
-    shape_vertex_body: wp.array[int],
-    # out
-    positions: wp.array[wp.vec3],
-):
-    vertex = wp.tid()
-    positions[vertex] = vertex_position(vertex, particle_q, body_q, shape_vertex_position, shape_vertex_body)
+def _write_positions(place: Placement, positions: wp.array[wp.vec3]):
+    positions[wp.tid()] = vertex_position(place, wp.tid())
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -288,21 +263,20 @@ def are_infinite_planes(model: Model) -> np.ndarray:
     return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)
 
 
-def _soft_faces(model):
-    """Returns the triangles of the model, then the other surface triangles of its tetrahedra, shape [n, 3]."""
-    triangles = np.empty((0, 3), np.int32) if model.tri_indices is None else model.tri_indices.numpy()
-    if model.tet_indices is None:
-        return triangles
-    sides = sides_of(model.tet_indices.numpy())
+def elements_of(indices: wp.array | None, n: int) -> np.ndarray:
+    """Returns the elements of a model, which have ``n`` vertices each, shape [element_count, n]."""
+    return np.empty((0, n), dtype=np.int32) if indices is None else indices.numpy().reshape(-1, n)
+
+
+def outer_sides(tetrahedra: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Returns the outer sides of tetrahedra without the triangles, counterclockwise from outside, shape [n, 3]."""
+    sides = tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    if not len(sides):
+        return sides
     # an inner side belongs to two tetrahedra; with the triangles counted twice, the missing sides occur once
     corners = np.sort(np.concatenate([sides, triangles, triangles]), axis=1)
     _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
-    return np.concatenate([triangles, sides[first[count == 1]]])
-
-
-def sides_of(tetrahedra: np.ndarray) -> np.ndarray:
-    """Returns the sides of tetrahedra, shape [n, 4], counterclockwise from outside, shape [4 n, 3]."""
-    return tetrahedra[:, [[0, 2, 1], [1, 2, 3], [0, 1, 3], [0, 3, 2]]].reshape(-1, 3)
+    return sides[first[count == 1]]
 
 
 def _strands(model, faces):
@@ -313,8 +287,7 @@ def _strands(model, faces):
     count = model.particle_count
     bare = np.ones(count, dtype=bool)
     bare[faces[faces < count]] = False
-    if model.tet_indices is not None:
-        bare[model.tet_indices.numpy()] = False
+    bare[elements_of(model.tet_indices, 4)] = False
     if not model.spring_count:
         return None, np.flatnonzero(bare)
     springs = model.spring_indices.numpy().reshape(-1, 2)

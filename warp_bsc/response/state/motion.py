@@ -6,10 +6,10 @@ import warp as wp
 from newton import BodyFlags
 
 from .friction import Friction
-from .mesh import ModelMesh, vertex_position
+from .mesh import ModelMesh, Placement, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
-from .structs import Bodies, Motion
+from .structs import Bodies, Motion, add_zeros, body_of, can_move
 from .vectors import to_double
 
 _SAME_POSE = 1e-5
@@ -17,44 +17,34 @@ _SAME_POSE = 1e-5
 
 
 @wp.struct
-class _Placement:
-    """Where the vertices and the planes of a mesh are in a state."""
+class StateArrays:
+    """The arrays of a state, which an attribute of the state may replace later; None where it has none."""
 
     particle_q: wp.array[wp.vec3]
+    particle_qd: wp.array[wp.vec3]
     body_q: wp.array[wp.transform]
-    shape_vertex_position: wp.array[wp.vec3]
-    shape_vertex_body: wp.array[int]
-    plane_point: wp.array[wp.vec3]
-    plane_normal: wp.array[wp.vec3]
-    plane_body: wp.array[int]
+    body_qd: wp.array[wp.spatial_vector]
+
+
+def arrays_of(state: newton.State | newton.Model) -> StateArrays:
+    """Returns the arrays of a state as they are now."""
+    arrays = StateArrays()
+    for name in StateArrays.vars:
+        setattr(arrays, name, getattr(state, name))
+    return arrays
 
 
 @wp.func
-def _position(place: _Placement, vertex: int) -> wp.vec3:
-    return vertex_position(vertex, place.particle_q, place.body_q, place.shape_vertex_position, place.shape_vertex_body)
-
-
-@wp.func
-def _place_plane(place: _Placement, i: int, planes: wp.array[wp.vec4d]):
+def _place_plane(place: Placement, i: int, planes: wp.array[wp.vec4d]):
     """Writes a plane, if there is one of that number."""
     if i < planes.shape[0]:
         planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
 
 
 @wp.func
-def _is_movable(motion: Motion, body: int) -> bool:
-    """Returns whether the response can move a body, -1 for none."""
-    if body < 0 or not motion.bodies.inverse_mass:
-        return False
-    return motion.bodies.inverse_mass[body] > 0.0
-
-
-@wp.func
 def moves_with_body(motion: Motion, vertex: int) -> bool:
     """Returns whether a vertex is of a body that the response can move."""
-    if not motion.bodies.of_vertex:
-        return False
-    return _is_movable(motion, motion.bodies.of_vertex[vertex])
+    return can_move(motion, body_of(motion, vertex))
 
 
 @wp.func
@@ -90,13 +80,13 @@ def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
 
 
 @wp.kernel(enable_backward=False)
-def _write_start(place: _Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
+def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
     _place_plane(place, i, planes.start)
     if i >= motion.x0.shape[0]:
         return
-    x = _position(place, i)
+    x = vertex_position(place, i)
     motion.x0[i] = x
     if last and motion.inverse_mass[i] > 0.0:
         for axis in range(3):
@@ -107,14 +97,7 @@ def _write_start(place: _Placement, last: wp.array[wp.vec3], motion: Motion, pla
 
 @wp.kernel(enable_backward=False)
 def _write_bodies(
-    # in
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_inv_mass: wp.array[float],
-    body_flags: wp.array[int],
-    worlds: int,
-    # in and out
-    motion: Motion,
+    end: StateArrays, body_inv_mass: wp.array[float], body_flags: wp.array[int], worlds: int, motion: Motion
 ):
     """Writes poses, velocities and inverse masses of bodies at the end of the step.
 
@@ -122,8 +105,8 @@ def _write_bodies(
     worlds.
     """
     body = wp.tid()
-    pose = body_q[body]
-    velocity = body_qd[body]
+    pose = end.body_q[body]
+    velocity = end.body_qd[body]
     movable = wp.isfinite(wp.transform_get_translation(pose)) and wp.isfinite(wp.transform_get_rotation(pose))
     movable = movable and wp.isfinite(wp.length(velocity)) and body_flags[body] & BodyFlags.KINEMATIC == 0
     movable = movable and (worlds <= 1 or motion.bodies.world[body] >= 0)
@@ -135,7 +118,7 @@ def _write_bodies(
 @wp.kernel(enable_backward=False)
 def _write_end(
     # in
-    place: _Placement,
+    place: Placement,
     particle_qd: wp.array[wp.vec3],
     dt: float,
     last: wp.array[wp.vec3],
@@ -150,7 +133,7 @@ def _write_end(
     the last step left it: it would otherwise pass undetected what is in its way, if a program moves it between steps.
     """
     i = wp.tid()
-    if last and i < planes.end.shape[0] and not _is_movable(motion, place.plane_body[i]):
+    if last and i < planes.end.shape[0] and not can_move(motion, place.plane_body[i]):
         if continues(motion, planes.world[i]) and wp.isfinite(planes.end[i]):
             planes.start[i] = planes.end[i]
     _place_plane(place, i, planes.end)
@@ -160,7 +143,7 @@ def _write_end(
         if continues(motion, motion.world[i]) and wp.isfinite(last[i]) and wp.isfinite(motion.x0[i]):
             motion.x0[i] = last[i]
     x0 = motion.x0[i]
-    x1 = _position(place, i)
+    x1 = vertex_position(place, i)
     velocity = (x1 - x0) / dt
     if i < particle_qd.shape[0]:
         velocity = particle_qd[i]
@@ -207,10 +190,8 @@ class ModelMotion:
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
-        for name in ("x0", "x1", "velocity"):
-            setattr(vertices, name, wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=device))
-        vertices.is_not_finite = wp.zeros(mesh.vertex_count, dtype=int, device=device)
-        vertices.interrupted = wp.zeros(max(1, model.world_count) + 1, dtype=int, device=device)
+        add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
+        add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
         self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
@@ -220,8 +201,7 @@ class ModelMotion:
         of_planes = mesh.device_planes
         planes.friction, planes.world = friction.planes, of_planes.world
         planes.shape, planes.body = of_planes.shape, of_planes.body
-        for name in ("start", "end"):
-            setattr(planes, name, wp.zeros(len(friction.planes), dtype=wp.vec4d, device=device))
+        add_zeros(planes, ("start", "end"), len(friction.planes), device)
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies
         if moves_bodies:
@@ -229,8 +209,7 @@ class ModelMotion:
             vertices.bodies.responds = int(responds_to_bodies)
         self.keeps_poses = moves_bodies or bool(model.requires_grad and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
-            for name in ("start", "end"):
-                setattr(vertices.bodies, name, wp.zeros(model.body_count, dtype=wp.transform, device=device))
+            add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
@@ -247,8 +226,7 @@ class ModelMotion:
         bodies.position = mesh.device_shape_vertices.position
         bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
         bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
-        bodies.inverse_mass = wp.zeros(model.body_count, dtype=float, device=device)
-        bodies.velocity = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
+        add_zeros(bodies, ("inverse_mass", "velocity"), model.body_count, device)
         return bodies
 
     def remember(self, last: wp.array[wp.vec3]) -> None:
@@ -282,53 +260,35 @@ class ModelMotion:
         if world_mask is None:
             interrupted.fill_(1)
         else:
-            inputs, outputs = [world_mask], [interrupted]
-            wp.launch(_interrupt, len(interrupted), inputs=inputs, outputs=outputs, device=self.mesh.device)
+            wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=self.mesh.device)
 
     def starts(self) -> list[wp.array]:
         """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
         arrays: list[wp.array] = [self.vertices.interrupted]
         return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
-    def set_start(self, particle_q: wp.array[wp.vec3] | None, body_q: wp.array[wp.transform] | None) -> None:
-        """Copies the positions at the start of a step, from arrays as of :meth:`.state.mesh.ModelMesh.positions`."""
-        self.mesh.check_lengths(particle_q, body_q, self.vertices.x0)
-        inputs = [self._place(particle_q, body_q), self._last, self.vertices, self.planes]
+    def set_start(self, start: StateArrays) -> None:
+        """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
+        inputs = [self.mesh.place(start.particle_q, start.body_q), self._last, self.vertices, self.planes]
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
-            wp.copy(self.vertices.bodies.start, body_q)
+            wp.copy(self.vertices.bodies.start, start.body_q)
 
-    def set_end(
-        self,
-        particle_q: wp.array[wp.vec3] | None,
-        particle_qd: wp.array[wp.vec3] | None,
-        body_q: wp.array[wp.transform] | None,
-        dt: float,
-        body_qd: wp.array[wp.spatial_vector] | None = None,
-    ) -> None:
+    def set_end(self, end: StateArrays, dt: float) -> None:
         """Copies the predicted positions and velocities at the end of a step of length ``dt`` [s], after its start.
 
         Velocities of bodies are read only if the response can move bodies.
         """
-        self.mesh.check_lengths(particle_q, body_q, self.vertices.x1)
+        place = self.mesh.place(end.particle_q, end.body_q)
         if self.moves_bodies:
-            self.set_body_ends(body_q, body_qd)
+            self.set_body_ends(end)
         elif self.keeps_poses:
-            wp.copy(self.vertices.bodies.end, body_q)
-        inputs = [self._place(particle_q, body_q), particle_qd, dt, self._last, self.vertices, self.planes]
+            wp.copy(self.vertices.bodies.end, end.body_q)
+        inputs = [place, end.particle_qd, dt, self._last, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
-    def set_body_ends(self, body_q: wp.array[wp.transform] | None, body_qd: wp.array[wp.spatial_vector] | None) -> None:
+    def set_body_ends(self, end: StateArrays) -> None:
         """Copies the predicted poses and velocities of bodies, but not the positions of their vertices."""
         model = self.mesh.model
-        inputs = [body_q, body_qd, model.body_inv_mass, model.body_flags, model.world_count]
+        inputs = [end, model.body_inv_mass, model.body_flags, model.world_count]
         wp.launch(_write_bodies, model.body_count, inputs=inputs, outputs=[self.vertices], device=self.mesh.device)
-
-    def _place(self, particle_q, body_q):
-        """Returns where the vertices and the planes are in a state."""
-        mesh, place = self.mesh, _Placement()
-        place.particle_q, place.body_q = particle_q, body_q
-        vertices, planes = mesh.device_shape_vertices, mesh.device_planes
-        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
-        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
-        return place

@@ -81,22 +81,10 @@ def velocity_between(
 
 
 @wp.func
-def _in_world(matrix: wp.mat33, pose: wp.transform) -> wp.mat33d:
-    """Returns a matrix in the frame of a body in the frame of the world."""
+def in_world(matrix: wp.mat33, pose: wp.transform) -> wp.mat33d:
+    """Returns an inertia, or its inverse, of a body in the frame of the world, given that in the frame of the body."""
     rotation = wp.quat_to_matrix(_rotation(pose))
     return rotation * wp.mat33d(matrix) * wp.transpose(rotation)
-
-
-@wp.func
-def inertia_at(bodies: Bodies, body: int, pose: wp.transform) -> wp.mat33d:
-    """Returns the inertia of a body in a pose about its centre of mass, in the frame of the world [kg m^2]."""
-    return _in_world(bodies.inertia[body], pose)
-
-
-@wp.func
-def inverse_inertia_at(bodies: Bodies, body: int, pose: wp.transform) -> wp.mat33d:
-    """Returns the inverse inertia of a body in a pose about its centre of mass, in the frame of the world."""
-    return _in_world(bodies.inverse_inertia[body], pose)
 
 
 @wp.func

@@ -1,9 +1,11 @@
 """The record of a step: everything that its adjoint needs in order to go back through it, last change first."""
 
+from typing import Literal
+
 import warp as wp
 
-from ..schedule import SolveStatus, views_of
-from .structs import Constraints
+from ..schedule import Loop, SolveStatus, views_of
+from .structs import Constraints, Step, add_zeros
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,11 +17,12 @@ MAX_OFFSETS = wp.constant(64)
 """Capacity of the offsets, one for each iteration of detect and project."""
 
 OFFSETS = "sweep_offsets", "constraint_offsets", "truncation_offsets"
+"""Arrays of a record that have an element for each iteration."""
 
-PER_ENTRY = "constraint", "multiplier", "previous_multiplier", "momentum"
+_PER_TRUNCATION = "vertex", "end", "body", "pose", "contact", "kind", "within_tolerance", "toi", "coordinates", "normal"
 
-PER_TRUNCATION = "vertex", "end", "body", "pose", "contact", "kind", "within_tolerance", "toi", "coordinates", "normal"
-"""Arrays of a record that have an element for each iteration, each entry, and each truncated path."""
+GROWING = {"entries": ("constraint", "multiplier", "previous_multiplier", "momentum"), "truncations": _PER_TRUNCATION}
+"""Arrays of a record that have an element for each entry or each truncated path, by the name of their count."""
 
 
 @wp.struct
@@ -31,6 +34,7 @@ class RecordCounts:
     truncations: wp.array[int]  # truncated paths
     dropped: wp.array[int]  # 1 if constraints were dropped
     grazing: wp.array[int]  # contacts whose gradients are clamped
+    complete: wp.array[int]  # of a copy for an adjoint, 1 if nothing is missing
 
 
 @wp.struct
@@ -117,61 +121,44 @@ class StepRecorder:
 
     def __init__(self, device: wp.Device, *, max_sweeps: int):
         """Allocates buffers for this many sweeps, and none yet for their entries or for truncations."""
-        self._device = device
         self.record = record = StepRecord()
         self.counts = wp.zeros(len(RecordCounts.vars), dtype=int, device=device)
         record.counts = views_of(RecordCounts, self.counts)
-        record.sweep_ends = wp.zeros(max_sweeps, dtype=int, device=device)
-        for name in OFFSETS:
-            setattr(record, name, wp.zeros(int(MAX_OFFSETS), dtype=int, device=device))
-        for names in (PER_ENTRY, PER_TRUNCATION):
-            self._allocate(names, 0)
+        add_zeros(record, ["sweep_ends"], max_sweeps, device)
+        add_zeros(record, OFFSETS, int(MAX_OFFSETS), device)
+        for names in GROWING.values():
+            add_zeros(record, names, 0, device)
 
-    def begin(self) -> StepRecord:
-        """Clears the record, and returns it for the next step."""
-        self.counts.zero_()
-        return self.record
-
-    def reserve_entries(self, more: int) -> StepRecord:
-        """Reserves ``more`` entries, and returns the record. Synchronizes with the device."""
-        return self._reserve(PER_ENTRY, self.record.counts.entries, more)
-
-    def reserve_truncations(self, more: int) -> StepRecord:
-        """Reserves ``more`` truncated paths, and returns the record. Synchronizes with the device."""
-        return self._reserve(PER_TRUNCATION, self.record.counts.truncations, more)
-
-    def _reserve(self, names, count, more):
-        filled = int(count.numpy()[0])
+    def reserve(self, kind: Literal["entries", "truncations"], more: int) -> None:
+        """Reserves ``more`` entries or truncated paths, which synchronizes; does nothing in a CUDA graph."""
+        if self.counts.device.is_capturing:
+            return
+        names, filled = GROWING[kind], int(getattr(self.record.counts, kind).numpy()[0])
         old = {name: getattr(self.record, name) for name in names}
         if filled + more > len(old[names[0]]):
-            self._allocate(names, 2 * (filled + more))
+            add_zeros(self.record, names, 2 * (filled + more), self.counts.device)
             for name in names if filled else ():
                 wp.copy(getattr(self.record, name), old[name], count=filled)
-        return self.record
-
-    def _allocate(self, names, capacity):
-        for name in names:
-            setattr(self.record, name, wp.empty(capacity, dtype=StepRecord.vars[name].type.dtype, device=self._device))
 
 
 @wp.kernel
-def record_offsets(constraints: Constraints, status: SolveStatus, record: StepRecord, after: int):
+def record_offsets(step: Step, status: SolveStatus, record: StepRecord, after: int):
     """Records the offsets of an iteration, or those after the last; iterations that freeze share one offset."""
     last = status.max_iterations + status.max_truncations + 1
-    iteration = status.loop.iteration[0]
+    iteration = status.loop[Loop.ITERATION]
     if after == 1 or iteration <= last:
         i = wp.min(iteration, last) + after
         record.sweep_offsets[i] = record.counts.sweeps[0]
-        record.constraint_offsets[i] = constraints.count[0]
+        record.constraint_offsets[i] = step.constraints.count[0]
         record.truncation_offsets[i] = record.counts.truncations[0]
 
 
 @wp.kernel
-def check_complete(constraints: Constraints, record: StepRecord, complete: wp.array[int]):
-    """Sets ``complete`` to 1 if everything that a step did fits in these constraints and its record, else to 0."""
+def check_complete(constraints: Constraints, record: StepRecord):
+    """Sets whether the record is complete: whether all that a step did fits in these constraints and in the record."""
     counts = record.counts
     fits = constraints.count[0] <= constraints.vertices.shape[0] and counts.dropped[0] == 0
     fits = fits and counts.sweeps[0] <= record.sweep_ends.shape[0]
     fits = fits and counts.entries[0] <= record.constraint.shape[0]
     fits = fits and counts.truncations[0] <= record.vertex.shape[0]
-    complete[0] = wp.where(fits, 1, 0)
+    counts.complete[0] = wp.where(fits, 1, 0)

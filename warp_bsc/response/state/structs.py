@@ -1,9 +1,11 @@
 """Arrays of the response as structs: the predicted motion, the vertices and bodies that it moves, and constraints."""
 
+from collections.abc import Iterable
 from enum import IntEnum
 
 import warp as wp
 
+from ..._private_names.of_warp import struct_type
 from ...detection.approach_phase import MinDistances
 
 
@@ -159,6 +161,34 @@ class Constraints:
     active_count: wp.array[wp.int64]
 
 
+@wp.struct
+class Step:
+    """A mesh, its motion, and what the response moves and knows of it, as kernels take them."""
+
+    mesh: Connectivity
+    motion: Motion
+    vertices: Vertices
+    constraints: Constraints
+    separation: wp.float64  # distance that projection moves contacts apart [m]
+    restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
+
+
+@wp.func
+def body_of(motion: Motion, vertex: int) -> int:
+    """Returns the body of a vertex of a shape; -1 if it has none, or if the response moves no bodies."""
+    if motion.bodies.of_vertex:
+        return motion.bodies.of_vertex[vertex]
+    return -1
+
+
+@wp.func
+def can_move(motion: Motion, body: int) -> bool:
+    """Returns whether the response can move a body in this step, -1 for none."""
+    if body < 0 or not motion.bodies.inverse_mass:
+        return False
+    return motion.bodies.inverse_mass[body] > 0.0
+
+
 @wp.func
 def has_final_velocity(outcome: int) -> bool:
     """Returns whether the velocity of a vertex follows from its path, and constraints do not change it."""
@@ -188,39 +218,17 @@ class DividingPlanes:
     kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
 
 
-def allocate(struct_type: type, size: int, device: wp.Device, **sizes):
+def add_zeros(struct, names: Iterable[str], size: int | tuple[int, ...], device: wp.Device) -> None:
+    """Sets arrays of a struct, given by name, to zeros of a size."""
+    for name in names:
+        dtype = struct_type(struct).vars[name].type.dtype
+        setattr(struct, name, wp.zeros(size, dtype=dtype, device=device))
+
+
+def allocate(of_type: type, size: int, device: wp.Device, **sizes):
     """Returns a struct whose arrays are zeros of a size, those named in ``sizes`` of their own sizes."""
-    struct = struct_type()
-    for name, var in struct_type.vars.items():
+    struct = of_type()
+    for name, var in of_type.vars.items():
         if hasattr(var.type, "dtype"):  # not a struct
-            setattr(struct, name, wp.zeros(sizes.get(name, size), dtype=var.type.dtype, device=device))
+            add_zeros(struct, [name], sizes.get(name, size), device)
     return struct
-
-
-def allocate_vertices(count: int, device: wp.Device) -> Vertices:
-    """Returns vertices without contacts."""
-    vertices = allocate(Vertices, count, device, particle_delta_x=(count, 3), particle_delta_v=(count, 3))
-    vertices.first_contact.fill_(int(NEVER))
-    return vertices
-
-
-def allocate_bodies(count: int, device: wp.Device) -> MovedBodies:
-    """Returns bodies that nothing has moved."""
-    return allocate(MovedBodies, count, device, delta_x=(count, 6), delta_v=(count, 6))
-
-
-def allocate_constraints(capacity: int, device: wp.Device, *, keep_distances: bool = False) -> Constraints:
-    """Returns constraints, none yet, with this capacity."""
-    min_distances = capacity if keep_distances else 0
-    return allocate(Constraints, capacity, device, count=1, active_count=1, min_distance=min_distances)
-
-
-def allocate_dividing_planes(
-    vertices: int, capacity: int, device: wp.Device, *, keep_distances: bool = False
-) -> DividingPlanes:
-    """Returns lists without planes for this many vertices, with a capacity for all planes together."""
-    sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
-    planes = allocate(DividingPlanes, capacity, device, **sizes, half=capacity if keep_distances else 0)
-    planes.first.fill_(int(NO_NODE))
-    planes.kept.fill_(int(NO_NODE))
-    return planes

@@ -1,7 +1,6 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -9,9 +8,17 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
-from ..schedule import SolveStatus, allocate_status, clear_status
+from ..schedule import (
+    MAX_ITERATIONS,
+    SWEEPS_PER_BATCH,
+    Loop,
+    SolveStatus,
+    allocate_status,
+    clear_status,
+    elements_of,
+    start_sweeps,
+)
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
-from .mesh import ModelMesh
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -19,37 +26,27 @@ from .structs import (
     NO_NODE,
     NOT_FINITE,
     SUMS,
-    Connectivity,
     Constraints,
     DividingPlanes,
-    Motion,
+    MovedBodies,
+    Step,
     Vertices,
-    allocate_bodies,
-    allocate_constraints,
-    allocate_dividing_planes,
-    allocate_vertices,
+    allocate,
 )
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def _begin(
-    # in
-    motion: Motion,
-    worlds: int,
-    # out
-    vertices: Vertices,
-    constraints: Constraints,
-    dividing: DividingPlanes,
-    status: SolveStatus,
-):
+def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatus):
     """Initializes the vertices by their prediction, and clears everything else."""
     i = wp.tid()
+    motion, vertices = step.motion, step.vertices
     if i == 0:
         clear_status(status)
-        constraints.count[0] = 0
-        dividing.count[0] = 0
+        step.constraints.count[0] = 0
+        if dividing.count:
+            dividing.count[0] = 0
     if i < worlds:
         status.contact_iteration[i] = -1
         status.is_fast[i] = 0
@@ -59,7 +56,7 @@ def _begin(
         return
     for axis in range(3):
         if motion.x0[i][axis] != vertices.x1[i][axis]:  # moved between steps
-            status.loop.recount[0] = 1
+            status.loop[Loop.RECOUNT] = 1
     vertices.x1[i] = motion.x1[i]
     vertices.velocity[i] = motion.velocity[i]
     for axis in range(3):
@@ -68,136 +65,116 @@ def _begin(
     vertices.first_contact[i] = NEVER
     vertices.changed[i] = 0
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
-    dividing.first[i] = NO_NODE
-    dividing.kept[i] = NO_NODE
-
-
-@dataclass(frozen=True)
-class Resolution:
-    """The result of a step; the next step overwrites its arrays.
-
-    Attributes:
-        vertices: The vertices as they were moved.
-        constraints: The constraints that moved them.
-        status: The solve status at the end.
-    """
-
-    vertices: Vertices
-    constraints: Constraints
-    status: SolveStatus
+    if dividing.first:
+        dividing.first[i] = NO_NODE
+        dividing.kept[i] = NO_NODE
 
 
 class Workspace:
-    """The buffers that a step works on, reused from step to step, on one device.
+    """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
     Attributes:
-        detector: The detector of contacts.
-        crossing_candidates: The detector of edges that may cross faces.
-        mesh: The mesh.
-        connectivity: Its elements, for kernels.
-        motion: The motion of the step that is being resolved; it is only read.
-        vertices: The vertices and bodies as they are moved.
-        constraints: The constraints.
+        step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
-        status: The solve status.
-        status_values: The arrays that the parts of ``status`` are views of.
+        loop: Views of single elements of ``status.loop``, by :class:`.schedule.Loop`, for conditions on the device.
+        results: The same of ``status.results``, by :class:`.schedule.Result`.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
-        separation: Distance that projection moves contacts apart [m].
         tolerance: Tolerance of constraints on positions [m].
-        restitution: Share of the approaching velocity that comes back, array of one float.
-        differentiable: Whether steps may be recorded.
+        differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
+            as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
-        device: The device.
     """
-
-    motion: ModelMotion
 
     def __init__(
         self,
-        mesh: ModelMesh,
+        motion: ModelMotion,
         *,
         separation: float,
         restitution: wp.array[float],
-        differentiable: bool,
-        moves_bodies: bool,
-        max_iterations: int,
+        max_iterations: int = MAX_ITERATIONS,
     ):
-        """Allocates buffers.
-
-        Args:
-            mesh: The mesh.
-            separation: Distance that projection moves contacts apart [m].
-            restitution: Share of the approaching velocity that comes back, in [0, 1], array of one float.
-            differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not
-                divided, as whether a constraint is active would otherwise depend on tiny changes, and results jump.
-            moves_bodies: Whether motions have bodies that can be moved.
-            max_iterations: Iterations of detect and project.
-        """
-        self.mesh, self.device = mesh, mesh.device
-        self.separation, self.restitution = separation, restitution
-        self.differentiable, self.keeps_distances = differentiable, mesh.distances is not None
+        """Allocates buffers for steps of a motion; separation [m] and restitution are those of :class:`.Step`."""
+        self.mesh = mesh = motion.mesh
+        self.device, vertices = mesh.device, mesh.vertex_count
+        self.differentiable = differentiable = mesh.model.requires_grad
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
-        self.particle_count, self.shape_vertex_count = (
-            mesh.model.particle_count,
-            mesh.vertex_count - mesh.model.particle_count,
-        )
-        self.body_count = mesh.model.body_count if moves_bodies else 0
-        device = self.device
+        self.particle_count, device = mesh.model.particle_count, mesh.device
+        self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
-        self.connectivity = Connectivity()
-        self.connectivity.faces, self.connectivity.edges = mesh.device_faces, mesh.device_edges
-        self.connectivity.vertex_edges = mesh.device_vertex_edges
-        self.connectivity.edge_faces = mesh.device_edge_faces
-        self.vertices = allocate_vertices(mesh.vertex_count, device)
-        if moves_bodies:
-            self.vertices.bodies = allocate_bodies(self.body_count, device)
-        self.constraints = allocate_constraints(0, device)
-        self._retired: list[Constraints] = []
-        capacity = DIVIDING_PLANES * self.particle_count
-        self._dividing_planes = allocate_dividing_planes(
-            mesh.vertex_count, capacity, device, keep_distances=self.keeps_distances
-        )
-        self.dividing = DividingPlanes() if differentiable else self._dividing_planes
+        self.step = step = Step()
+        step.mesh = mesh.connectivity
+        self.motion = motion
+        step.separation, step.restitution = separation, restitution
+        size = vertices, 3
+        step.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
+        if motion.moves_bodies:
+            size = self.body_count, 6
+            step.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
+        step.constraints = allocate(Constraints, 0, device, count=1, active_count=1)
+        self._retired: list[wp.array] = []
+        self.dividing = DividingPlanes()
+        if not differentiable:
+            capacity = DIVIDING_PLANES * self.particle_count
+            sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
+            self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
-        self.status, self.status_values = allocate_status(self.worlds, device, **limits)
+        self.status = allocate_status(self.worlds, device, **limits)
+        self.loop, self.results = elements_of(self.status.loop), elements_of(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
-        self.vertices_at_planes = mesh.vertex_count if moves_bodies else self.particle_count
+        self.vertices_at_planes = mesh.vertex_count if motion.moves_bodies else self.particle_count
         self.max_penetrations = self.vertices_at_planes * int(planes_of_a_world)
         self.kept = wp.zeros(1, dtype=int, device=device)
-        self.turn = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
+        self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         self._max_blocks = BLOCKS * device.sm_count
 
     @property
-    def resolution(self) -> Resolution:
-        """The step as it was resolved last."""
-        return Resolution(self.vertices, self.constraints, self.status)
+    def motion(self) -> ModelMotion:
+        """The motion of the step that is being resolved."""
+        return self._motion
 
-    def begin(self, motion: ModelMotion, recorder: StepRecorder | None) -> None:
+    @motion.setter
+    def motion(self, motion: ModelMotion) -> None:
+        self._motion, self.step.motion = motion, motion.vertices
+
+    @property
+    def vertices(self) -> Vertices:
+        """The vertices and bodies as they are moved."""
+        return self.step.vertices
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints."""
+        return self.step.constraints
+
+    def begin(self, recorder: StepRecorder | None) -> None:
         """Initializes everything for a step.
 
         Raises:
             RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
         """
-        self.motion, self.recorder = motion, recorder
+        self.recorder = recorder
         self.record = StepRecord()  # which records nothing
         if recorder is not None:
-            if not self.device.is_capturing:
-                recorder.reserve_entries(MIN_ENTRIES)
-            elif not len(recorder.record.constraint):
+            recorder.reserve("entries", MIN_ENTRIES)
+            if not len(recorder.record.constraint):
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
-            self.record = recorder.begin()
-        outputs = [self.vertices, self.constraints, self._dividing_planes, self.status]
+            recorder.counts.zero_()
+            self.record = recorder.record
         size = max(len(self.vertices.x1), self.worlds + 1)
-        self.launch(_begin, size, [motion.vertices, self.worlds], outputs)
+        self.launch(_begin, size, [self.step, self.worlds, self.dividing, self.status])
+
+    def _if_distances(self, capacity):
+        """Returns a capacity, or 0 without minimum distances."""
+        return 0 if self.mesh.distances is None else capacity
 
     @property
     def max_contacts(self) -> int:
@@ -206,17 +183,19 @@ class Workspace:
 
     def reserve(self, more: int) -> None:
         """Reserves ``more`` constraints, and as many for later iterations; does nothing in a CUDA graph."""
-        old = self.constraints
         if self.device.is_capturing:
             return
-        filled = int(old.count.numpy()[0])
-        if len(old.vertices) < filled + more:
+        filled = int(self.constraints.count.numpy()[0])
+        if len(self.constraints.vertices) < filled + more:
             capacity = filled + ITERATIONS_RESERVED * more
-            self.constraints = new = allocate_constraints(capacity, self.device, keep_distances=self.keeps_distances)
-            for name in Constraints.vars if filled else ():
-                array = getattr(old, name)
-                wp.copy(getattr(new, name), array, count=min(filled, len(array)))
-            self._retired.append(old)  # a CUDA graph may still write to it
+            sizes = {"count": 1, "active_count": 1, "min_distance": self._if_distances(capacity)}
+            new = allocate(Constraints, capacity, self.device, **sizes)
+            for name in Constraints.vars:
+                old = getattr(self.constraints, name)
+                if filled:
+                    wp.copy(getattr(new, name), old, count=min(filled, len(old)))
+                self._retired.append(old)  # a CUDA graph may still write to it
+            self.step.constraints = new
 
     def grow(self) -> bool:
         """Enlarges the constraints, without the proximities, if those did not fit; returns whether. Synchronizes."""
@@ -230,17 +209,17 @@ class Workspace:
     def record_offsets(self, after: int = 0) -> None:
         """Records, if the step is recorded, where an iteration begins or, with 1, where the last ended."""
         if self.recorder is not None:
-            self.launch(record_offsets, 1, [self.constraints, self.status, self.record, after])
+            self.launch(record_offsets, 1, [self.step, self.status, self.record, after])
 
     def reserve_entries(self, sweeps: int) -> None:
         """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
         if self.recorder is not None and not self.device.is_capturing:
-            self.record = self.recorder.reserve_entries(sweeps * int(self.constraints.count.numpy()[0]))
+            self.recorder.reserve("entries", sweeps * int(self.constraints.count.numpy()[0]))
 
     def reserve_truncations(self) -> None:
         """Reserves a truncation for each particle and body, if the step is recorded; does nothing in a CUDA graph."""
-        if self.recorder is not None and not self.device.is_capturing:
-            self.record = self.recorder.reserve_truncations(self.particle_count + self.body_count)
+        if self.recorder is not None:
+            self.recorder.reserve("truncations", self.particle_count + self.body_count)
 
     def launch(self, kernel: wp.Kernel, size: int, inputs: Sequence, outputs: Sequence = ()) -> None:
         """Launches a kernel on the device."""
@@ -251,11 +230,7 @@ class Workspace:
 
         On the CPU it runs on one thread, unlike :func:`warp_bsc.detection.launch.launch_over_queue`, because Warp's
         additions are not atomic there. On a GPU each thread takes several entries, so that capacity costs little.
-
-        Args:
-            kernel: The kernel, which takes an entry of each queue.
-            queues: Queues, each with its counts and the index of its own count.
-            inputs: Arguments of the kernel.
+        Queues have their counts and the index of their own count with them; a thread takes an entry of each.
         """
         if self.device.is_cpu:
             entries = max(min(len(queue), int(counts.numpy()[count])) for queue, counts, count in queues)
@@ -264,24 +239,43 @@ class Workspace:
             entries = max(len(queue) for queue, _counts, _count in queues)
             wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._max_blocks)
 
-    def launch_over_constraints(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel over the constraints."""
-        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], inputs)
+    def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
+        """Launches a kernel over the constraints, with the step as its first input, as in all that follow."""
+        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], [self.step, *inputs])
 
-    def launch_over_active_set(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+    def launch_over_active_set(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the active constraints."""
-        self.launch_over(kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], inputs)
+        self.launch_over(
+            kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], [self.step, *inputs]
+        )
 
-    def launch_over_particles(self, kernel: wp.Kernel, inputs: Sequence, *, at_least_once: bool = False) -> None:
+    def launch_over_particles(self, kernel: wp.Kernel, *inputs, at_least_once: bool = False) -> None:
         """Launches a kernel over the particles; ``at_least_once`` even if there are none."""
-        self.launch(kernel, max(self.particle_count, int(at_least_once)), inputs)
+        self.launch(kernel, max(self.particle_count, int(at_least_once)), [self.step, *inputs])
 
     def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the bodies, if they can be moved, with motion and vertices as its first inputs."""
+        """Launches a kernel over the bodies, if they can be moved."""
         if self.body_count:
-            self.launch(kernel, self.body_count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, self.body_count, [self.step, *inputs])
 
     def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the vertices of shapes, if bodies can be moved, like :meth:`launch_over_bodies`."""
+        """Launches a kernel over the vertices of shapes, if bodies can be moved."""
         if self.body_count:
-            self.launch(kernel, self.shape_vertex_count, [self.motion.vertices, self.vertices, *inputs])
+            self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
+
+    def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
+
+        The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
+        """
+        self.reserve_entries(number)
+        activate()
+        for i in range(number):
+            self.launch_over_active_set(project, self.status, self.record)
+            update(self, i == number - 1)
+
+    def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
+        """Repeats batches of sweeps until no constraint is active, at most MAX_SWEEPS times; none in divided worlds."""
+        self.launch(start_sweeps, 1, [self.status])
+        batch = {"number": int(SWEEPS_PER_BATCH), "activate": activate, "project": project, "update": update}
+        wp.capture_while(self.loop[Loop.MORE_SWEEPS], self.sweep, **batch)

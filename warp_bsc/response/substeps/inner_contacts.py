@@ -171,9 +171,12 @@ class InnerContacts:
         wp.launch(_pack, contacts.soft_contact_max, inputs=inputs, outputs=outputs, device=self._device)
         return contacts_with(contacts, buffers.counters, buffers.arrays)
 
+    def _buffers_of(self, contacts):
+        return self._buffers.get(_key(contacts, _arrays_of(contacts)))
+
     def packed(self, contacts: newton.Contacts) -> newton.Contacts:
         """Returns the contacts that the inner solver got in the last step instead of those of the program."""
-        buffers = self._buffers.get(_key(contacts, _arrays_of(contacts)))
+        buffers = self._buffers_of(contacts)
         return contacts if buffers is None else contacts_with(contacts, buffers.counters, buffers.arrays)
 
     def unpack(self, forces: wp.array | None, contacts: newton.Contacts | None) -> None:
@@ -185,7 +188,7 @@ class InnerContacts:
         """
         if forces is None or contacts is None:
             return
-        buffers = self._buffers.get(_key(contacts, _arrays_of(contacts)))
+        buffers = self._buffers_of(contacts)
         if buffers is None:
             return
         first = contacts.rigid_contact_max

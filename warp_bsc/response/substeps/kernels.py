@@ -3,10 +3,10 @@
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, approach_of
-from ..schedule import SolveStatus
-from ..state.motion import moves_with_body, predicted_position, predicted_velocity
+from ..schedule import Loop, Result, SolveStatus
+from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
-from ..state.structs import Constraints, ContactKind, Motion, Vertices
+from ..state.structs import ContactKind, Motion, Step, can_move
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,16 +16,6 @@ _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 """Separation of a constraint that no motion violates, so that it never acts [m]."""
 
 
-@wp.struct
-class SubstepState:
-    """Positions and velocities of a ``newton.State``."""
-
-    particle_q: wp.array[wp.vec3]
-    particle_qd: wp.array[wp.vec3]
-    body_q: wp.array[wp.transform]
-    body_qd: wp.array[wp.spatial_vector]
-
-
 @wp.kernel
 def use_substeps(unfinished: wp.array[int], number: int, substeps: wp.array[int]):
     """Writes the number of substeps of a step that collides; 0 of others."""
@@ -33,22 +23,22 @@ def use_substeps(unfinished: wp.array[int], number: int, substeps: wp.array[int]
 
 
 @wp.kernel
-def find_worlds(motion: Motion, constraints: Constraints, has_constraints: wp.array[int]):
+def find_worlds(step: Step, has_constraints: wp.array[int]):
     """Marks the worlds that have constraints."""
     i = wp.tid()
-    if i < constraints.count[0]:
-        has_constraints[motion.world[constraints.vertices[i][0]]] = 1
+    if i < step.constraints.count[0]:
+        has_constraints[step.motion.world[step.constraints.vertices[i][0]]] = 1
 
 
 @wp.kernel
-def keep_detection(constraints: Constraints, status: SolveStatus, detected: wp.array[int], is_fast: wp.array[int]):
+def keep_detection(step: Step, status: SolveStatus, detected: wp.array[int], is_fast: wp.array[int]):
     """Keeps the numbers of constraints and contacts, and which worlds have fast or pushing contacts."""
     world = wp.tid()
     is_fast[world] = status.is_fast[world]
     if world == 0:
-        detected[0] = constraints.count[0]
-        detected[1] = status.results.first_hits[0]
-        status.loop.recount[0] = 0  # the start remains where crossings are counted
+        detected[0] = step.constraints.count[0]
+        detected[1] = status.results[Result.FIRST_HITS]
+        status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
 
 
 @wp.kernel
@@ -60,7 +50,7 @@ def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: S
     """
     world = wp.tid()
     status.is_fast[world] = wp.max(status.is_fast[world], is_fast[world])
-    status.results.first_hits[0] = detected[1]
+    status.results[Result.FIRST_HITS] = detected[1]
 
 
 @wp.kernel
@@ -77,12 +67,6 @@ def begin_substeps(
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
 
-@wp.func
-def _share(substeps: int, done: int) -> float:
-    """Returns the share of the whole step that a number of substeps makes."""
-    return float(done) / float(substeps)
-
-
 @wp.kernel
 def start_substep(
     # in
@@ -92,26 +76,26 @@ def start_substep(
     dt: float,
     remaining: wp.array[int],
     detected: wp.array[int],
-    end: SubstepState,
+    end: StateArrays,
     # in and out
-    substep: Motion,
-    constraints: Constraints,
+    step: Step,
     status: SolveStatus,
     # out
     substep_planes: MovingPlanes,
-    vertices: Vertices,
 ):
-    """Writes the motion of a substep.
+    """Writes the motion of a substep to that of ``step``, given the motion of the whole step.
 
     Particles, and bodies that the response can move, end where the inner solver predicts them; shapes go a share of
     their path in the whole step.
     """
     i = wp.tid()
-    before = _share(substeps, substeps - remaining[0])
-    after = _share(substeps, substeps - remaining[0] + 1)
+    done = substeps - remaining[0]
+    before = float(done) / float(substeps)
+    after = float(done + 1) / float(substeps)
+    substep, vertices = step.motion, step.vertices
     if i == 0:
-        constraints.count[0] = detected[0]
-        status.loop.iteration[0] = 0
+        step.constraints.count[0] = detected[0]
+        status.loop[Loop.ITERATION] = 0
     if i < planes.start.shape[0]:
         path = planes.end[i] - planes.start[i]
         substep_planes.start[i] = planes.start[i] + wp.float64(before) * path
@@ -148,14 +132,13 @@ def start_substep(
 
 
 @wp.kernel
-def reset_constraints(
-    substep: Motion, vertices: Vertices, detected: wp.array[int], constraints: Constraints, status: SolveStatus
-):
+def reset_constraints(step: Step, status: SolveStatus, detected: wp.array[int]):
     """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
     i = wp.tid()
     if i == 0:
-        status.loop.iteration[0] = 1
-        status.loop.active[0] = 0  # positions and velocities are swept without regard to a detection
+        status.loop[Loop.ITERATION] = 1
+        status.loop[Loop.ACTIVE] = 0  # positions and velocities are swept without regard to a detection
+    constraints = step.constraints
     if i >= constraints.count[0]:
         return
     constraints.position_multiplier[i] = wp.vec3d()
@@ -166,21 +149,15 @@ def reset_constraints(
         constraints.separation[i] = _NEVER_VIOLATED
         return
     corners = constraints.vertices[i]
-    constraints.approach[i] = approach_of(
-        substep, vertices, corners, constraints.weights[i], constraints.normal[i], constraints.separation[i]
-    )
+    weights, normal, separation = constraints.weights[i], constraints.normal[i], constraints.separation[i]
+    constraints.approach[i] = approach_of(step, corners, weights, normal, separation)
 
 
 @wp.kernel
-def end_substep(
-    vertices: Vertices,
-    remaining: wp.array[int],
-    substep: Motion,
-    state: SubstepState,
-    body_q_prev: wp.array[wp.transform],
-):
+def end_substep(step: Step, remaining: wp.array[int], state: StateArrays, body_q_prev: wp.array[wp.transform]):
     """Makes the end of a substep the start of the next, of vertices and of bodies that the response can move."""
     i = wp.tid()
+    substep, vertices = step.motion, step.vertices
     if i == 0:
         remaining[0] = remaining[0] - 1
     if i < state.particle_q.shape[0]:
@@ -210,12 +187,11 @@ def move_bodies(
 ):
     """Writes poses at both ends of a substep, between those of the whole step, of bodies that cannot be moved."""
     body = wp.tid()
-    if motion.bodies.of_vertex:
-        if motion.bodies.inverse_mass[body] > 0.0:
-            return
+    if can_move(motion, body):
+        return
     done = substeps - remaining[0]
-    body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done))
-    body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], _share(substeps, done + 1))
+    body_q_in[body] = _pose_between(body_q_start[body], body_q_end[body], float(done) / float(substeps))
+    body_q_out[body] = _pose_between(body_q_start[body], body_q_end[body], float(done + 1) / float(substeps))
 
 
 @wp.func
@@ -226,27 +202,27 @@ def _pose_between(start: wp.transform, end: wp.transform, share: float) -> wp.tr
 
 
 @wp.kernel
-def end_body_substeps(takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState):
+def end_body_substeps(step: Step, takes_substeps: wp.array[int], after: StateArrays, state: StateArrays):
     """Makes the poses after the substeps the predicted ones, in worlds that take substeps."""
+    bodies = step.motion.bodies
     body = wp.tid()
-    if motion.bodies.inverse_mass[body] == 0.0 or takes_substeps[wp.max(motion.bodies.world[body], 0)] == 0:
+    if bodies.inverse_mass[body] == 0.0 or takes_substeps[wp.max(bodies.world[body], 0)] == 0:
         return
-    motion.bodies.end[body] = after.body_q[body]
-    motion.bodies.velocity[body] = after.body_qd[body]
+    bodies.end[body] = after.body_q[body]
+    bodies.velocity[body] = after.body_qd[body]
     state.body_q[body] = after.body_q[body]
     state.body_qd[body] = after.body_qd[body]
 
 
 @wp.kernel
-def end_substeps(
-    takes_substeps: wp.array[int], after: SubstepState, motion: Motion, state: SubstepState, vertices: Vertices
-):
+def end_substeps(step: Step, takes_substeps: wp.array[int], after: StateArrays, state: StateArrays):
     """Makes the substeps the predicted motion, in worlds that take them, and puts vertices back to the start.
 
     Vertices of bodies follow the predicted poses, so that :func:`end_body_substeps` comes first.
     """
     i = wp.tid()
-    vertices.x1[i] = motion.x0[i]
+    motion = step.motion
+    step.vertices.x1[i] = motion.x0[i]
     if moves_with_body(motion, i):
         x1 = predicted_position(motion, i)
         motion.x1[i] = x1

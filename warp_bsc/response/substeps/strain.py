@@ -4,7 +4,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..schedule import SolveStatus
+from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
 from ..tuning import COMPRESSION, STRAIN
 
@@ -53,7 +53,7 @@ def choose_substeps(
 ):
     """Chooses the number of substeps of each world, 0 where contacts strain little; ``substeps`` is the largest."""
     world = wp.tid()
-    status.loop.recount[0] = 0  # the start remains where crossings are counted
+    status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
     predicted = strain[world] / STRAIN
     number[world] = 0
     if predicted > 1.0:

@@ -27,11 +27,11 @@ from newton.solvers import SolverBase
 
 from ..._private_names.of_newton import attributes_of, body_q_prev, may_allocate
 from ..contacts.detect import detect_penetrations
+from ..schedule import Loop
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
-from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion
-from ..state.workspace import Resolution, Workspace
+from ..state.motion import ModelMotion, arrays_of
+from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts, resolve_contacts
 from . import kernels
 from .strain import choose_substeps, edges_at_rest, measure_strain
@@ -76,38 +76,24 @@ class Substeps:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not repeated.
     """
 
-    def __init__(
-        self,
-        step: Callable[..., None],
-        solver: SolverBase,
-        mesh: ModelMesh,
-        motion: ModelMotion,
-        work: Workspace,
-        substeps: Sequence[int],
-        *,
-        moves_bodies: bool = False,
-    ):
+    def __init__(self, step: Callable[..., None], solver: SolverBase, work: Workspace, substeps: Sequence[int]):
         """Allocates buffers.
 
         Args:
             step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
-            mesh: The mesh.
-            motion: The motion of the whole step.
-            work: The workspace of the step.
-            substeps: Numbers of substeps to choose from, each at least 2, sorted; a single one is taken by every step
-                that collides.
-            moves_bodies: Whether the response can move bodies.
+            work: The workspace, with the motion of the whole step.
+            substeps: Numbers to choose from, each at least 2, sorted; one alone is taken by every step that collides.
 
         Raises:
             RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
         """
         self._choices, self._chooses = substeps, len(substeps) > 1
         self._step, self._solver = step, solver
-        self._mesh, self._motion, self._work = mesh, motion, work
-        self._moves_bodies, self._may_allocate = moves_bodies, may_allocate(solver)
-        self._substep = ModelMotion(mesh, motion.friction, moves_bodies=moves_bodies)
-        model, device, worlds = mesh.model, mesh.device, work.worlds
+        self._mesh, self._motion, self._work = work.mesh, work.motion, work
+        self._moves_bodies, self._may_allocate = work.motion.moves_bodies, may_allocate(solver)
+        self._substep = ModelMotion(work.mesh, work.motion.friction, moves_bodies=self._moves_bodies)
+        model, device, worlds = work.mesh.model, work.device, work.worlds
         self._start, self._in, self._out = model.state(), model.state(), model.state()
         self._copies: dict[str, wp.array] = {}  # of arrays of the inner solver
         self.substeps = wp.zeros(1, dtype=int, device=device)
@@ -146,8 +132,8 @@ class Substeps:
 
     def resolve(
         self, state: newton.State, control: newton.Control | None, contacts: newton.Contacts | None, dt: float
-    ) -> Resolution:
-        """Returns the motion without its contacts, like :func:`.step.resolve`, and writes it to a state.
+    ) -> None:
+        """Makes the motion free of its contacts, like :func:`.step.resolve`; writes the end of substeps to a state.
 
         Args:
             state: The state at the end of the step, as the inner solver predicted it.
@@ -160,7 +146,8 @@ class Substeps:
                 allocate memory.
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
-        find_contacts(work, self._motion)
+        work.motion = self._motion  # also after an error in a substep
+        find_contacts(work)
         if self._chooses:
             if in_graph and self._may_allocate:
                 solver = type(self._solver).__name__
@@ -169,19 +156,18 @@ class Substeps:
                 )
             self._resolve_and_choose(dt)
         else:
-            work.launch(kernels.use_substeps, 1, [work.status.loop.unfinished, self._choices[0]], [self.substeps])
+            work.launch(kernels.use_substeps, 1, [work.loop[Loop.UNFINISHED], self._choices[0]], [self.substeps])
         step = _Step(state, control, contacts, dt, self._arrays_of_solver())
         if in_graph and self._may_allocate:
             self._take_substeps(step)
         else:
             wp.capture_if(self.substeps, self._take_substeps, step=step)
         wp.capture_if(self.substeps, self._finish, dt=dt)
-        return work.resolution
 
     def _resolve_and_choose(self, dt):
         """Resolves the motion, chooses the substeps of each world, and if there are any, detects its contacts again."""
         work = self._work
-        wp.copy(self._unfinished, work.status.loop.unfinished)
+        wp.copy(self._unfinished, work.loop[Loop.UNFINISHED])
         self.substeps.zero_()
         resolve_contacts(work, dt)
         wp.capture_if(self._unfinished, self._choose)
@@ -199,17 +185,16 @@ class Substeps:
     def _find_contacts_again(self):
         work = self._work
         wp.copy(work.vertices.x1, self._motion.vertices.x0)  # where crossings are counted
-        find_contacts(work, self._motion)
+        find_contacts(work)
 
     def _take_substeps(self, step):
         """Repeats the step in substeps, and writes the end to the predicted motion and to the state."""
         work = self._work
         add_proximities(work)
         self._has_constraints.zero_()
-        inputs = [self._motion.vertices, work.constraints, self._has_constraints]
-        work.launch_over_constraints(kernels.find_worlds, inputs)
-        inputs, outputs = [work.constraints, work.status], [self._detected, self._is_fast]
-        work.launch(kernels.keep_detection, work.worlds, inputs, outputs)
+        work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
+        inputs = [work.step, work.status, self._detected, self._is_fast]
+        work.launch(kernels.keep_detection, work.worlds, inputs)
         for array, saved in step.arrays:
             wp.copy(saved, array)
         for i, substeps in enumerate(self._choices):
@@ -220,14 +205,14 @@ class Substeps:
 
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
-        work, mesh, start, motion = self._work, self._mesh, self._in, self._motion.vertices
+        work, mesh, start = self._work, self._mesh, self._in
         self._remaining.fill_(substeps)
         inputs = [self._has_constraints, self._number, substeps, work.status]
         work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
-        wp.copy(self._substep.vertices.x0, motion.x0)
+        wp.copy(self._substep.vertices.x0, self._motion.vertices.x0)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
         if poses is not None:
             wp.copy(poses, self._start.body_q)
@@ -239,16 +224,17 @@ class Substeps:
         attributes.update(kept)
         for array, saved in step.arrays:
             wp.copy(array, saved)
-        inputs = [self._takes_substeps, _arrays_of(start), motion, _arrays_of(step.state)]
+        work.motion = self._motion
+        inputs = [work.step, self._takes_substeps, arrays_of(start), arrays_of(step.state)]
         if self._moves_bodies:
             work.launch(kernels.end_body_substeps, mesh.model.body_count, inputs)
-        work.launch(kernels.end_substeps, mesh.vertex_count, inputs, [work.vertices])
+        work.launch(kernels.end_substeps, mesh.vertex_count, inputs)
 
     def _take_substep(self, substeps, step):
         """Steps the inner solver, and projects its motion onto the constraints."""
         work, mesh, motion, substep = self._work, self._mesh, self._motion, self._substep
         start, end, bodies = self._in, self._out, mesh.model.body_count
-        starts = _arrays_of(start)  # now: solvers may replace arrays of a state
+        starts = arrays_of(start)  # now: solvers may replace arrays of a state
         if bodies:
             inputs = [motion.vertices, self._start.body_q, step.state.body_q, substeps, self._remaining]
             work.launch(kernels.move_bodies, bodies, inputs, [start.body_q, end.body_q])
@@ -258,35 +244,25 @@ class Substeps:
         self._step(start, end, step.control, step.contacts, substep_dt)
         work.motion = substep
         if self._moves_bodies:
-            substep.set_body_ends(end.body_q, end.body_qd)
+            substep.set_body_ends(arrays_of(end))
             work.launch_over_bodies(begin_bodies)
-        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, _arrays_of(end)]
-        outputs = [substep.vertices, work.constraints, work.status, substep.planes, work.vertices]
+        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, arrays_of(end)]
         size = max(mesh.vertex_count, len(motion.planes.start))
-        work.launch(kernels.start_substep, size, inputs, outputs)
+        work.launch(kernels.start_substep, size, [*inputs, work.step, work.status, substep.planes])
         if work.max_penetrations:
             work.reserve(work.max_penetrations)
             detect_penetrations(work, ahead=True)
-        inputs = [substep.vertices, work.vertices, self._detected, work.constraints, work.status]
-        work.launch_over_constraints(kernels.reset_constraints, inputs)
+        work.launch_over_constraints(kernels.reset_constraints, work.status, self._detected)
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
         velocities.project(work, substep_dt)
         start.assign(self._start)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
-        inputs = [work.vertices, self._remaining, substep.vertices, starts, poses]
+        inputs = [work.step, self._remaining, starts, poses]
         work.launch(kernels.end_substep, max(mesh.vertex_count, bodies), inputs)
 
     def _finish(self, dt):
         """Detects and resolves the contacts of the motion that the substeps made."""
         work = self._work
-        find_contacts(work, self._motion)
+        find_contacts(work)
         work.launch(kernels.restore_detection, work.worlds, [self._detected, self._is_fast], [work.status])
         resolve_contacts(work, dt)
-
-
-def _arrays_of(state):
-    """Returns positions and velocities of a state as a struct."""
-    arrays = kernels.SubstepState()
-    for name in kernels.SubstepState.vars:
-        setattr(arrays, name, getattr(state, name))
-    return arrays
