@@ -25,6 +25,17 @@ def ball_over_sheet(device, mass=0.2):
     return model
 
 
+def two_balls_over_sheet(device):
+    """Two balls in free flight, far from a sheet."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for x in (-0.5, 0.5):
+        body = builder.add_body(xform=wp.transform(wp.vec3(x, 0.0, 0.5), wp.quat_identity()))
+        builder.add_shape_sphere(body, radius=0.05)
+    add_patch(builder, 3, 0.05, (0.0, 0.0, 0.0), fixed=True)
+    builder.color()
+    return builder.finalize(device=device)
+
+
 def entries(model, rigid, cloth):
     """The bodies of a model for one solver, the particles for another."""
     joints, particles = list(range(model.joint_count)), list(range(model.particle_count))
@@ -255,6 +266,38 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
     assert report.certified and report.hits == 0
     # the sheet is at rest but for the rounding of its elastic forces; the ball would carry it by its radius
     np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)
+
+
+def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch):
+    """A stage that is an entry of a coupled solver has a view of the model, of which states have fewer bodies."""
+    model, stages, runs = two_balls_over_sheet(device), [], []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
+        return stages[-1]
+
+    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0])]
+    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
+    solver = SolverCoupledProxy(model, entries(model, rigid, make), SolverCoupledProxy.Config(proxies=proxies))
+    start, end = model.state(), model.state()
+    names = "body_q", "body_qd", "particle_q", "particle_qd"
+
+    def step():
+        runs.append([getattr(start, name).numpy() for name in names])
+        solver.step(start, end, None, None, DT)
+
+    def spoil(graph):
+        stages[0].report.device_totals.undetected_steps.fill_(1)
+        for name in names:
+            getattr(start, name).fill_(wp.nan)
+
+    captured = bsc.CapturedSteps(step, stages[0], [start])
+    monkeypatch.setattr(wp, "capture_launch", spoil)
+    captured._graph = "a graph"
+    captured()
+    assert captured.retaken == 1 and model.body_count > stages[0].model.body_count
+    for name, found in zip(names, runs[0], strict=True):
+        np.testing.assert_array_equal(found, getattr(model, name).numpy())
 
 
 def test_hooks_are_those_of_the_inner_solver(device):

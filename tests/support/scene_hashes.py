@@ -22,7 +22,7 @@ import warp_bsc as bsc
 
 STEPS = 8
 KINDS = 17
-VARYING_ON_GPU = 5, 12, 16
+VARYING_ON_GPU = 5, 12, 13, 16
 """Kinds of scenes in which ``SolverSemiImplicit`` adds up the forces on a particle in any order."""
 COUNTS = "steps", "uncertified_steps", "truncated_steps", "frozen_steps", "total_remaining", "total_excluded"
 COUNTS += "hits", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen", "substeps"

@@ -1,5 +1,6 @@
 """Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,17 @@ from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
 from .layer.contact_layer import ContactLayer
 from .stage import CollisionStage
+
+
+def _clone(x: Any) -> Any:
+    """Returns a copy of an array, or of a state or a namespace of one; the model of a state may be any."""
+    if isinstance(x, wp.array):
+        return wp.clone(x, requires_grad=False)
+    copied = copy.copy(x)
+    for name, value in vars(x).items():
+        if isinstance(value, (wp.array, newton.Model.AttributeNamespace)):
+            setattr(copied, name, _clone(value))
+    return copied
 
 
 class CapturedSteps:
@@ -68,9 +80,7 @@ class CapturedSteps:
             restored.append(self._report.total_values)
         if self._layer is not None:
             restored.append(self._layer.skipped)
-        self._saved: list[tuple[Any, Any]] = [  # each state with a copy of its type
-            (x, wp.clone(x) if isinstance(x, wp.array) else solver.model.state()) for x in restored
-        ]
+        self._saved = [(x, _clone(x)) for x in restored]
         self._graph = None
         self.retaken = 0
 
