@@ -283,7 +283,8 @@ def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch)
     names = "body_q", "body_qd", "particle_q", "particle_qd"
 
     def step():
-        runs.append([getattr(start, name).numpy() for name in names])
+        if not wp.get_device(device).is_capturing:
+            runs.append([getattr(start, name).numpy() for name in names])
         solver.step(start, end, None, None, DT)
 
     def spoil(graph):
