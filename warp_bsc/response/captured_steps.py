@@ -1,6 +1,7 @@
 """Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 import copy
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,7 +33,7 @@ class CapturedSteps:
     needs larger ones freezes all particles or loses its gradients, and the report counts it. Such a run is taken back:
     the state and the totals of the report become those before it, the function runs outside the graph, where buffers
     grow, and is captured anew. So is the first run. Other solvers have nothing to take back, and on the CPU the
-    function runs as it is.
+    function runs as it is. So it does, after a warning, where CUDA cannot make a graph of what was captured.
 
     Without a tape no step of a :class:`.solver_ccd.SolverCCD` needs this: it completes detections for which a graph is
     too small, and any graph will do. Such steps may run here as well, and none is taken back.
@@ -82,6 +83,7 @@ class CapturedSteps:
             restored.append(self._layer.skipped)
         self._saved = [(x, _clone(x)) for x in restored]
         self._graph = None
+        self._captures = self._device.is_cuda
         self.retaken = 0
 
     @one_at_a_time
@@ -97,7 +99,7 @@ class CapturedSteps:
 
     def _capture(self):
         self._graph = None
-        if self._device.is_cuda:
+        if self._captures:
             with wp.ScopedCapture(self._device) as capture:
                 self._steps()
             self._graph = capture.graph
@@ -107,7 +109,12 @@ class CapturedSteps:
         for x, saved in self._saved:
             saved.assign(x)
         lost = self._count_lost()
-        wp.capture_launch(self._graph)
+        try:
+            wp.capture_launch(self._graph)
+        except RuntimeError as error:  # CUDA makes no graph of some captures, with adjoints of bodies for example
+            warnings.warn(f"CapturedSteps run without a CUDA graph, which cannot be made: {error}", stacklevel=4)
+            self._captures = False
+            return False
         if self._count_lost() == lost:
             return True
         for x, saved in self._saved:

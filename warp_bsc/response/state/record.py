@@ -128,6 +128,7 @@ class StepRecorder:
         add_zeros(record, OFFSETS, int(MAX_OFFSETS), device)
         for names in GROWING.values():
             add_zeros(record, names, 0, device)
+        self._retired: list[dict[str, wp.array]] = []
 
     def reserve(self, kind: Literal["entries", "truncations"], more: int) -> None:
         """Reserves ``more`` entries or truncated paths, which synchronizes; does nothing in a CUDA graph."""
@@ -136,6 +137,7 @@ class StepRecorder:
         names, filled = GROWING[kind], int(getattr(self.record.counts, kind).numpy()[0])
         old = {name: getattr(self.record, name) for name in names}
         if filled + more > len(old[names[0]]):
+            self._retired.append(old)  # a CUDA graph may still write to it
             add_zeros(self.record, names, 2 * (filled + more), self.counts.device)
             for name in names if filled else ():
                 wp.copy(getattr(self.record, name), old[name], count=filled)
