@@ -250,7 +250,7 @@ def test_a_cylinder_widens_a_sleeve():
     program = load_module(FOLDER / "substeps.py")
     scene = program.Sleeve()
     scene.duration = 0.2
-    run = program.Run(scene, 1.0 / 240.0, None).simulate()
+    run = program.Run(scene, 1.0 / 120.0, None).simulate()
     report = run.solver.report
     assert report.totals.uncertified_steps == report.totals.frozen_steps == report.totals.truncated_steps == 0
     assert 0.3 < run.stretch() < 1.0 and report.hits > 50
