@@ -162,6 +162,16 @@ def test_no_package_has_a_circle_inside(package):
     assert not found, "\n".join(sorted(found))
 
 
+def test_no_chain_in_the_response_is_longer_than_nine():
+    modules = modules_of_a_package("response")
+
+    @functools.cache
+    def depth(module):
+        return 1 + max((depth(imported) for imported in modules.get(module, ())), default=0)
+
+    assert 5 < max(map(depth, modules)) <= 9
+
+
 def test_no_chain_of_packages_is_longer_than_seven():
     def depth(package):
         return 1 + max((depth(imported) for imported in PACKAGES[package]), default=0)

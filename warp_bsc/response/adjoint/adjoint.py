@@ -14,9 +14,9 @@ from ..schedule import SWEEPS_PER_BATCH
 from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, add_zeros, allocate
 from ..state.workspace import Workspace
-from . import kernels, restore
+from . import kernels, restore, structs
 from .arrays import copied, filled, launch_adjoint, with_gradients
-from .restore import Move, Projection, RestoredStep
+from .structs import Move, Projection, RestoredStep
 
 _UNUSED_OF_CONSTRAINTS = {"count", "min_distance", "last_sweep", "active_set", "active_count"}
 
@@ -29,7 +29,7 @@ class RecordedStep:
     """A copy of a step for its adjoint: its record and results, as far as they fit in the buffers of a CUDA graph.
 
     Attributes:
-        restored: The step at its end, :class:`.adjoint.restore.RestoredStep` without a cursor.
+        restored: The step at its end, :class:`.adjoint.structs.RestoredStep` without a cursor.
         mesh: The mesh, :class:`.state.mesh.ModelMesh`.
         friction: The coefficients of its vertices and planes, :class:`.state.friction.Friction`.
         moves_bodies: Whether the response can move bodies.
@@ -75,10 +75,10 @@ class StepAdjoint:
         self._moves_bodies, self._bodies, self._vertices_and_bodies = recorded.moves_bodies, bodies, vertices + bodies
         self._shape_vertices = len(self._mesh.shape_vertices.body) if recorded.moves_bodies else 0
         self._constraints, self._truncations = len(given.constraints.vertices), len(recorded.restored.record.vertex)
-        self._gradients = gradients = allocate(restore.Gradients, vertices, device)
-        gradients.bodies = of_bodies = allocate(restore.BodyGradients, bodies, device)
+        self._gradients = gradients = allocate(structs.Gradients, vertices, device)
+        gradients.bodies = of_bodies = allocate(structs.BodyGradients, bodies, device)
         self._restored = restored = copied(recorded.restored)
-        restored.cursor = allocate(restore.Cursor, 1, device)
+        restored.cursor = allocate(structs.Cursor, 1, device)
         restored.status = copied(restored.status, ["loop"])
         restored.planes, self._of_planes = with_gradients(restored.planes, ("start", "end", "friction"))
         self._step = step = restored.step
@@ -102,8 +102,8 @@ class StepAdjoint:
         self._sums = wp.zeros(bodies, dtype=wp.spatial_vectord, device=device)
         self._sums.grad = of_bodies.shift
         self._times = wp.zeros(self._truncations, dtype=wp.float64, device=device, requires_grad=True)
-        paths = allocate(restore.Paths, self._truncations, device)
-        self._paths, self._of_paths = with_gradients(paths, restore.Paths.vars)
+        paths = allocate(structs.Paths, self._truncations, device)
+        self._paths, self._of_paths = with_gradients(paths, structs.Paths.vars)
         moved = step.vertices
         sums, of_changes = (moved.particle_delta_x, moved.bodies.delta_x), (gradients.x1, of_bodies.shift)
         self._positions = self._projection(step.motion.x1, "position_multiplier", sums, of_changes)
@@ -130,16 +130,16 @@ class StepAdjoint:
         Adds to the gradients of the model with respect to masses, inertias and coefficients, where it has such arrays.
 
         Args:
-            of_state: The arrays of :class:`.adjoint.restore.StateGradients`, in its order; those of bodies may be
+            of_state: The arrays of :class:`.adjoint.structs.StateGradients`, in its order; those of bodies may be
                 omitted if the model has none.
         """
         recorded, restored, gradients, of_motion = self._recorded, self._restored, self._gradients, self._of_motion
         step, cursor, both = self._step, restored.cursor, self._vertices_and_bodies
         motion = step.motion
-        of_states, of_model = restore.StateGradients(), restore.ModelGradients()
-        for name, array in zip(restore.StateGradients.vars, of_state, strict=False):
+        of_states, of_model = structs.StateGradients(), structs.ModelGradients()
+        for name, array in zip(structs.StateGradients.vars, of_state, strict=False):
             setattr(of_states, name, array)
-        for name in restore.ModelGradients.vars:
+        for name in structs.ModelGradients.vars:
             array = step.restitution if name == "restitution" else getattr(self._mesh.model, name)
             setattr(of_model, name, array.grad)
         wp.copy(restored.status.loop, recorded.restored.status.loop)

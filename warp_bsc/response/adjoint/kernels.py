@@ -43,7 +43,7 @@ from ..state.record import NO_CONTACT, truncation_at
 from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
 from ..tuning import SHARE_OF_PATH
-from .restore import Paths, Projection, RestoredStep, entry_of, is_movable
+from .structs import Paths, Projection, RestoredStep, entry_of, is_movable
 
 
 @wp.func
