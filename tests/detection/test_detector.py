@@ -1,38 +1,23 @@
 """Meshes and the collision detector: all pairs by brute force, known scenes, the same answer always, bad input."""
 
-import copy
-import gc
-import re
-
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
 from benchmark_data import data_folder
+from collision_results import assert_same
 from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
-from warp_bsc.detection.contact_buffer import ContactBuffer
-from warp_bsc.detection.intersections import IntersectionFinder, find_intersections
+from warp_bsc.detection.intersections import find_intersections
 from warp_bsc.detection.launch import retry_until_fits
 from warp_bsc.detection.pipeline import DetectionPipeline
 from warp_bsc.detection.settings import Count
 from warp_bsc.kernels.signs import FREE
 
 METHODS = ("float", "conservative", "exact")
-
-
-@pytest.fixture(params=[BroadPhaseSimd, BroadPhaseHierarchy], ids=["simd", "hierarchy"])
-def broad_phase(request, monkeypatch, device):
-    """Both broad phases where both run, whatever the detector would choose."""
-    if device.is_cuda and request.param is BroadPhaseSimd:
-        pytest.skip("SIMD packets are for the CPU")
-    chosen = "BroadPhaseSimd" if device.is_cpu else "BroadPhaseHierarchy"
-    monkeypatch.setattr(f"warp_bsc.detection.broad_phase.{chosen}", request.param)
-    return request.param
 
 
 def all_collisions(mesh, x0, x1):
@@ -158,27 +143,6 @@ def test_candidates_that_do_not_fit_at_first_are_not_lost(broad_phase):
     assert c.stats.edge_edge.candidates == 300 * 297 // 2
 
 
-def test_intersections_are_exactly_those_of_all_pairs(broad_phase):
-    rng = np.random.default_rng(4)
-    x = rng.integers(-4, 5, (18, 3)).astype(np.float32)
-    mesh = bsc.CollisionMesh(np.arange(18).reshape(6, 3), 18)
-    edges, faces = np.meshgrid(np.arange(len(mesh.edges)), np.arange(6), indexing="ij")
-    pairs = np.stack([edges.ravel(), faces.ravel()], axis=1)
-    pairs = pairs[mesh.edges[pairs[:, 0], 0] // 3 != pairs[:, 1]]
-    expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[mesh.faces[pairs[:, 1]]])]
-    assert len(expected)
-    np.testing.assert_array_equal(bsc.CollisionDetector(mesh).find_intersections(x), expected)
-
-
-def test_touching_configurations_intersect_and_flat_ones_do_not():
-    positions, faces = grid(8)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(positions)))
-    assert len(detector.find_intersections(positions)) == 0
-    folded = positions.copy()
-    folded[-1] = positions[0]
-    assert len(detector.find_intersections(folded))
-
-
 def test_degenerate_meshes_are_handled(broad_phase):
     x = np.zeros((4, 3), dtype=np.float32)
     for faces in (np.zeros((0, 3), dtype=int), [[0, 1, 2]], [[0, 0, 1], [2, 2, 3]]):
@@ -268,16 +232,6 @@ def test_vertices_that_no_face_uses_take_no_part(value, on_device, broad_phase):
         detector.detect(positions(x0), positions(x1))
     with pytest.raises(ValueError, match=r"x\[7\]"):
         detector.find_intersections(positions(x1))
-
-
-FIELDS = [
-    f"{kind}{field}" for kind in ("vertex_face", "edge_edge") for field in ("", "_toi", "_coordinates", "_normal")
-]
-
-
-def assert_same(collisions, others):
-    for field in FIELDS:
-        assert getattr(collisions, field).tobytes() == getattr(others, field).tobytes(), field
 
 
 def test_queues_with_room_for_one_entry_grow(broad_phase):
@@ -380,106 +334,6 @@ def test_every_pair_a_candidate(broad_phase):
     assert c.stats.edge_edge.candidates == 6000 * 5997 // 2
 
 
-def test_results_that_someone_holds_outlive_the_next_detection():
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    held = [detector.detect(x0, x1), detector.detect(x0, x0), detector.detect(x0, x1)]
-    detector.find_intersections(x1)
-    assert len(held[1].edge_edge) == 0
-    assert_same(held[0], held[2])
-
-
-def buffer_addresses(c):
-    """Addresses of all arrays that a result owns on the device."""
-    buffers = [rows.buffer for rows in c._rows.values()]
-    return {getattr(buffer, name).ptr for buffer in buffers for name in ContactBuffer.vars}
-
-
-@pytest.mark.parametrize("keep", [lambda c: c, copy.copy, lambda c: [c, c.vertex_face]], ids=["kept", "copied", "read"])
-def test_buffers_of_a_result_that_someone_holds_are_not_used_again(keep):
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    expected = bsc.CollisionDetector(detector.mesh).detect(x0, x1)
-    addresses, kept = set(), []
-    for i in range(6):
-        c = detector.detect(x0, x1)
-        assert not addresses & buffer_addresses(c)
-        addresses |= buffer_addresses(c)
-        kept.append(keep(c))
-        detector.detect(x1, x0 + np.float32(0.001 * i))  # other collisions, in buffers that are free at once
-    for c in kept:
-        assert_same(c[0] if isinstance(c, list) else c, expected)
-
-
-@pytest.mark.parametrize("collected", [False, True], ids=["dropped", "in a cycle"])
-def test_buffers_of_results_that_are_garbage_are_used_again(collected):
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    seen = []
-    for _ in range(4 if collected else 100):  # collecting garbage takes long
-        c = detector.detect(x0, x1)
-        assert len(c.vertex_face) and len(c.edge_edge)
-        seen.append(buffer_addresses(c))
-        if collected:
-            cycle = [c]
-            cycle.append(cycle)
-            del c, cycle
-            gc.collect()
-    assert seen[2] == seen[0]  # the second detection still holds the first result
-    arrays = 2 * len(seen[0]) if not collected else len(seen[0])
-    assert len(set.union(*seen)) == arrays
-
-
-def test_buffers_with_too_few_rows_are_not_used_again():
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    expected = detector.detect(x0, x1)
-    assert len(expected.edge_edge) > 64
-    for _ in range(3):
-        assert len(detector.detect(x0, x0).edge_edge) == 0
-        assert_same(detector.detect(x0, x1), expected)
-
-
-def test_many_results_dropped_at_once_leave_few_buffers():
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    results = [detector.detect(x0, x1) for _ in range(8)]
-    addresses = [buffer_addresses(c) for c in results]
-    results.clear()
-    again = [detector.detect(x0, x1) for _ in range(8)]
-    reused = set.union(*addresses) & set.union(*(buffer_addresses(c) for c in again))
-    assert len(reused) >= 2 * len(addresses[0])
-    assert len(detector._result_buffers._free) + len(detector._result_buffers._returned) <= 4
-
-
-def test_buffers_of_differentiable_results_stay_theirs(device):
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
-    start = wp.array(x0, dtype=wp.vec3, device=device, requires_grad=True)
-    end = wp.array(x1, dtype=wp.vec3, device=device)
-    arrays = detector.detect(start, end).arrays
-    pairs = arrays.edge_edge.numpy().copy()
-    for _ in range(3):
-        detector.detect(x1, x0)
-    assert len(pairs) and np.array_equal(arrays.edge_edge.numpy(), pairs)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_results_are_of_the_positions_detected_whatever_becomes_of_these(method):
-    positions, faces = grid(2, np.float64)
-    positions = np.concatenate([positions, [[0.005, 0.005, 0.01], [0.006, 0.005, 0.02], [0.005, 0.006, 0.02]]])
-    end = positions.copy()
-    end[9, 2] = 0.0  # ends on an edge and on a corner of faces: for exact arithmetic to decide
-    mesh = bsc.CollisionMesh(np.concatenate([faces, [[9, 10, 11]]]), 12)
-    detector = bsc.CollisionDetector(mesh, method=method)
-    expected = detector.detect(positions, end)
-    x0, x1 = (wp.array(x, dtype=wp.vec3d, device=mesh.device) for x in (positions, end))
-    c = detector.detect(x0, x1)
-    x1.assign(positions)
-    assert len(c.vertex_face)
-    assert_same(c, expected)
-
-
 def test_detectors_side_by_side_do_not_disturb_one_another():
     x0, x1, faces = crumpled(0)
     mesh = bsc.CollisionMesh(faces, len(x0))
@@ -487,98 +341,6 @@ def test_detectors_side_by_side_do_not_disturb_one_another():
     a, b = first.detect(x0, x1), second.detect(x1, x0)
     assert_same(a, bsc.CollisionDetector(mesh).detect(x0, x1))
     assert_same(b, bsc.CollisionDetector(mesh).detect(x1, x0))
-
-
-@pytest.fixture
-def captured():
-    """A captured detection: detector, its results, positions on the device, and a function that replays it."""
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
-    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
-    detector.detect(start, end)
-    with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.capture(start, end)
-    return detector, c, start, end, lambda: wp.capture_launch(capture.graph)
-
-
-@pytest.mark.gpu
-def test_a_graph_finds_what_a_detection_finds(captured):
-    detector, c, start, end, replay = captured
-    on_cpu = bsc.CollisionDetector(bsc.CollisionMesh(detector.mesh.faces, detector.mesh.vertex_count, device="cpu"))
-    for seed in (0, 1, 2):
-        x0, x1, _ = crumpled(seed)
-        start.assign(x0)
-        end.assign(x1)
-        expected = on_cpu.detect(x0, x1)
-        for _ in range(34):
-            replay()
-            assert_same(c.read(), expected)
-        assert c.read().certified and not c.read().overflowed
-
-
-@pytest.mark.gpu
-def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured):
-    detector, c, _, end, replay = captured
-    replay()
-    expected = c.read().edge_edge.tolist()
-    assert len(detector.find_intersections(end))
-    assert c.read().edge_edge.tolist() == expected
-
-
-@pytest.mark.gpu
-def test_a_graph_says_that_a_queue_was_too_small(captured):
-    detector, _, start, end, _ = captured
-    detector._pipeline.edge_edge._allocate_contacts(1)
-    with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.capture(start, end)
-    wp.capture_launch(capture.graph)
-    assert c.read().overflowed and not c.read().certified
-    (overflow,) = c.read().overflows
-    assert re.fullmatch("edge_edge contacts: [0-9]+ do not fit in the capacity 1", overflow)
-    assert detector.detect(start, end).certified  # grows
-    wp.capture_launch(capture.graph)  # writes to the queues that it was captured with
-    with pytest.raises(RuntimeError, match="capture again"):
-        c.read()
-    with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.capture(start, end)
-    wp.capture_launch(capture.graph)
-    assert c.read().certified and not c.read().overflowed
-
-
-@pytest.mark.gpu
-def test_a_graph_says_that_a_position_is_not_finite(captured):
-    _, c, _, end, replay = captured
-    positions = end.numpy()
-    positions[7, 1] = np.nan
-    end.assign(positions)
-    replay()
-    assert not c.read().certified
-
-
-@pytest.mark.gpu
-def test_capturing_first_is_refused():
-    x0, x1, faces = crumpled(0)
-    detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0"))
-    start, end = (wp.array(x, dtype=wp.vec3, device="cuda:0") for x in (x0, x1))
-    with pytest.raises(RuntimeError, match="detect once"), wp.ScopedCapture(device="cuda:0"):
-        detector.capture(start, end)
-
-
-@pytest.mark.gpu
-def test_two_detectors_on_two_streams(captured):
-    _, c, start, end, replay = captured
-    x0, _, faces = crumpled(3)
-    replay()
-    expected = c.read().vertex_face.tolist()
-    streams = [wp.Stream("cuda:0"), wp.Stream("cuda:0")]
-    detectors = [bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")) for _ in streams]
-    results = []
-    for detector, stream, positions in zip(detectors, streams, ((start, end), (end, start)), strict=True):
-        with wp.ScopedStream(stream):
-            results.append(detector.detect(*positions))
-    assert results[0].vertex_face.tolist() == expected
-    alone = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device="cuda:0")).detect(end, start)
-    assert_same(results[1], alone)
 
 
 def test_worlds_do_not_collide_with_one_another(broad_phase):
@@ -626,101 +388,6 @@ def test_worlds_of_any_number_are_kept_apart(broad_phase):
         assert c.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0], [9, 2], [10, 2], [11, 2]]
 
 
-def test_a_finder_of_intersections_is_used_again(broad_phase):
-    """Trees kept from one configuration to the next give the pairs that new ones give, and exactly those that cross."""
-    rng = np.random.default_rng(7)
-    faces = np.arange(300).reshape(100, 3)
-    mesh = bsc.CollisionMesh(faces, 300)
-    finder = IntersectionFinder(mesh)
-    for scale in (8.0, 7.5, 0.01, 40.0, 3.0):
-        corner = rng.uniform(-scale, scale, (100, 1, 3))
-        x = (corner + rng.uniform(-2, 2, (100, 3, 3))).reshape(300, 3).astype(np.float32)
-        found = finder.find(x)
-        edges, others = (numbers.ravel() for numbers in np.indices((len(mesh.edges), len(faces))))
-        pairs = np.stack([edges, others], axis=1)[mesh.edges[edges, 0] // 3 != others]
-        expected = pairs[checker.edge_face_crossings(x[mesh.edges[pairs[:, 0]]], x[faces[pairs[:, 1]]])]
-        np.testing.assert_array_equal(found.pairs, expected)
-        assert found.crosses.all()  # no three random points are in line with a fourth
-
-
-def test_an_edge_that_touches_a_face_does_not_cross_it(broad_phase):
-    face = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
-    edges = {
-        ((1, 1, -1), (1, 1, 1)): True,
-        ((1, 1, 0), (1, 1, 1)): False,  # an end is in the face
-        ((0, 1, -1), (0, 1, 1)): False,  # passes its boundary
-        ((0, 0, -1), (0, 0, 1)): False,  # passes a corner
-        ((1, 1, 0), (2, 1, 0)): False,  # lies in it
-        ((-1, 1, 0), (5, 1, 0)): False,
-        ((1, 1, 0), (1, 1, 0)): False,  # a point
-    }
-    x = np.array([*face, *(end for edge in edges for end in edge)], dtype=np.float64)
-    corners = [[3 + 2 * i, 4 + 2 * i, 4 + 2 * i] for i in range(len(edges))]
-    mesh = bsc.CollisionMesh([[0, 1, 2], *corners], len(x))
-    found = IntersectionFinder(mesh).find(x)
-    of_face = found.pairs[:, 1] == 0
-    own = dict(zip(map(tuple, mesh.edges[found.pairs[of_face, 0]]), found.crosses[of_face], strict=True))
-    assert own == {(3 + 2 * i, 4 + 2 * i): crosses for i, crosses in enumerate(edges.values())}
-
-
-@pytest.mark.parametrize("ridge", [-1.0, 0.0, 1.0])
-def test_an_edge_crosses_two_faces_where_it_passes_their_common_side(ridge, broad_phase):
-    """The faces are a roof with a ridge at height 0 along y, a flat sheet, or a gutter; their outer sides are lower."""
-    x = [(0, -4, 0), (0, 4, 0), (-4, 0, ridge), (4, 0, ridge)]
-    edges = {
-        ((0, 1, -1), (0, 1, 1)): True,
-        ((-1, 2, -4), (1, 2, 4)): True,
-        ((-4, 1, -1), (4, 1, 1)): ridge == 0.0,  # flatter than the roof: it touches the ridge
-        ((0, 1, 0), (0, 1, 1)): False,
-        ((0, -4, -1), (0, -4, 1)): False,
-    }
-    x = np.array([*x, *(end for edge in edges for end in edge)], dtype=np.float64)
-    corners = [[4 + 2 * i, 5 + 2 * i, 5 + 2 * i] for i in range(len(edges))]
-    for faces in ([[0, 1, 2], [1, 0, 3]], [[2, 0, 1], [0, 1, 3]]):  # also of mixed orientation
-        mesh = bsc.CollisionMesh([*faces, *corners], len(x))
-        found = IntersectionFinder(mesh).find(x)
-        for face in (0, 1):
-            of_face = found.pairs[:, 1] == face
-            own = dict(zip(map(tuple, mesh.edges[found.pairs[of_face, 0]]), found.crosses[of_face], strict=True))
-            assert own == {(4 + 2 * i, 5 + 2 * i): crosses for i, crosses in enumerate(edges.values())}
-    mesh = bsc.CollisionMesh([[0, 1, 2], [1, 0, 3], [0, 1, 3], *corners], len(x))
-    assert not IntersectionFinder(mesh).find(x).crosses.any()  # three faces have that side
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_flat_sheets_at_rest_need_no_exact_arithmetic(dtype, monkeypatch, broad_phase):
-    """Pairs of one plane, which no orientation in space decides, are apart in a coordinate plane."""
-    positions, faces = grid(24)
-    turned, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
-    decided = []
-    decide = checker.edge_face_crossings
-    monkeypatch.setattr(checker, "edge_face_crossings", lambda *pair: decided.append(len(pair[0])) or decide(*pair))
-    for turn in (np.eye(3), np.eye(3)[[2, 0, 1]], turned):
-        x = (positions @ turn).astype(dtype)
-        mesh = bsc.CollisionMesh(faces, len(x))
-        assert len(IntersectionFinder(mesh).find(x).pairs) == 0
-    assert sum(decided) <= len(faces) // 100
-
-
-def test_edges_beside_faces_do_not_meet_them(broad_phase):
-    """Edges and faces with small integer coordinates in one plane, of all positions to each other."""
-    rng = np.random.default_rng(8)
-    x = rng.integers(0, 5, (4000, 5, 3)).astype(np.float64)
-    x[..., 2] = x[..., 0] - 2 * x[..., 1]
-    x += 100.0 * np.stack(np.indices((20, 20, 10)), axis=-1).reshape(-1, 1, 3)  # queries are far from each other
-    faces = np.arange(20000).reshape(4000, 5)
-    mesh = bsc.CollisionMesh(np.concatenate([faces[:, 2:], faces[:, [0, 1, 1]]]), 20000)
-    found = IntersectionFinder(mesh).find(x.reshape(-1, 3))
-    found = {
-        (*edge, *face) for edge, face in zip(mesh.edges[found.pairs[:, 0]], mesh.faces[found.pairs[:, 1]], strict=True)
-    }
-    truth = checker.edge_face_crossings(x[:, :2], x[:, 2:])
-    assert 1000 < truth.sum() < 3000
-    for query, meets in zip(faces.tolist(), truth.tolist(), strict=True):
-        if not (x[query[0] // 5, 0] == x[query[0] // 5, 1]).all():
-            assert (tuple(query) in found) == meets
-
-
 def test_a_detector_used_again_forgets_nothing(broad_phase):
     """Trees are kept from one detection to the next, also where everything has moved elsewhere meanwhile."""
     rng = np.random.default_rng(2)
@@ -734,21 +401,3 @@ def test_a_detector_used_again_forgets_nothing(broad_phase):
         assert_same(again, first)
         assert again.stats.vertex_face == first.stats.vertex_face
         assert again.stats.edge_edge == first.stats.edge_edge
-
-
-def test_intersections_at_the_end_of_a_motion(broad_phase):
-    """A finder that shares the detector's trees finds the same, at the end of a motion and elsewhere."""
-    rng = np.random.default_rng(5)
-    mesh = bsc.CollisionMesh(np.arange(600).reshape(200, 3), 600)
-    detector = bsc.CollisionDetector(mesh)
-    finder = detector.intersection_finder()
-    for scale in (3.0, 3.1, 0.5, 12.0, 4.0):
-        corner = rng.uniform(-scale, scale, (200, 1, 3))
-        x0, x1 = ((corner + rng.uniform(-2, 2, (200, 3, 3))).reshape(-1, 3) for _ in range(2))
-        at_start = finder.find(x0)
-        expected = bsc.CollisionDetector(mesh).detect(x0, x1)
-        assert_same(detector.detect(x0, x1), expected)
-        at_end = finder.find(x1, is_end=True)
-        np.testing.assert_array_equal(at_start.pairs, find_intersections(mesh, x0))
-        np.testing.assert_array_equal(at_end.pairs, find_intersections(mesh, x1))
-        assert len(at_end.pairs)
