@@ -1,4 +1,4 @@
-"""Registers gradients of device functions without building these, so that importing the package takes half the time."""
+"""Registers gradients of device functions without building these, which takes a quarter of the import otherwise."""
 
 import contextlib
 from collections.abc import Callable, Iterator
