@@ -46,6 +46,20 @@ def entries(model, rigid, cloth):
     ]
 
 
+def with_proxy(model, inner="vbd", iterations=1, **options):
+    """A coupled solver in which the first body is a proxy in the entry of the cloth, and the stage in that entry."""
+    stages = []
+
+    def make(view):
+        stages.append(bsc.SolverCCD(SOLVERS[inner](view)))
+        return stages[-1]
+
+    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0], **options)]
+    config = SolverCoupledProxy.Config(proxies=proxies, iterations=iterations)
+    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
+    return SolverCoupledProxy(model, entries(model, rigid, make), config), stages[0]
+
+
 def fall(model, solver, steps):
     """Poses of the first body after each step, and the last state."""
     start, end = model.state(), model.state()
@@ -67,17 +81,9 @@ def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, ite
     model, steps = ball_over_sheet(device, mass), 40
     alone = bsc.SolverCCD(SOLVERS[inner](model))
     expected, _ = fall(model, alone, steps)
-    stages = []
-
-    def make(view):
-        stages.append(bsc.SolverCCD(SOLVERS[inner](view)))
-        return stages[-1]
-
-    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0], mode=mode)]
-    config = SolverCoupledProxy.Config(proxies=proxies, iterations=iterations)
-    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
-    poses, state = fall(model, SolverCoupledProxy(model, entries(model, rigid, make), config), steps)
-    report = stages[0].report
+    solver, stage = with_proxy(model, inner, iterations, mode=mode)
+    poses, state = fall(model, solver, steps)
+    report = stage.report
     assert (report.totals.steps, report.totals.uncertified_steps, report.crossings) == (iterations * steps, 0, 0)
     lags = mode == "lagged" and iterations == 1
     np.testing.assert_allclose(poses[:, :3], expected[:, :3], atol=5e-3 if lags else 2e-3)
@@ -239,15 +245,8 @@ def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations,
 @pytest.mark.parametrize("resets", [False, True])
 def test_proxies_start_where_a_program_sets_them_first(resets, device):
     """A ball that begins, or is put by a reset, below a sheet has not passed it on its way from anywhere else."""
-    model, stages = ball_over_sheet(device), []
-
-    def make(view):
-        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
-        return stages[-1]
-
-    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0])]
-    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
-    solver = SolverCoupledProxy(model, entries(model, rigid, make), SolverCoupledProxy.Config(proxies=proxies))
+    model = ball_over_sheet(device)
+    solver, stage = with_proxy(model)
     start, end = model.state(), model.state()
     if resets:
         solver.step(start, end, None, None, 0.1 * DT)
@@ -262,23 +261,15 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
         solver.reset(start, flags=newton.StateFlags.NONE)
     start.clear_forces()
     solver.step(start, end, None, None, DT)
-    report = stages[0].report
-    assert report.certified and report.hits == 0
+    assert stage.report.certified and stage.report.hits == 0
     # the sheet is at rest but for the rounding of its elastic forces; the ball would carry it by its radius
     np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)
 
 
 def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch):
     """A stage that is an entry of a coupled solver has a view of the model, of which states have fewer bodies."""
-    model, stages, runs = two_balls_over_sheet(device), [], []
-
-    def make(view):
-        stages.append(bsc.SolverCCD(SOLVERS["vbd"](view)))
-        return stages[-1]
-
-    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0])]
-    rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
-    solver = SolverCoupledProxy(model, entries(model, rigid, make), SolverCoupledProxy.Config(proxies=proxies))
+    model, runs = two_balls_over_sheet(device), []
+    solver, stage = with_proxy(model)
     start, end = model.state(), model.state()
     names = "body_q", "body_qd", "particle_q", "particle_qd"
 
@@ -288,15 +279,15 @@ def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch)
         solver.step(start, end, None, None, DT)
 
     def spoil(graph):
-        stages[0].report.device_totals.undetected_steps.fill_(1)
+        stage.report.device_totals.undetected_steps.fill_(1)
         for name in names:
             getattr(start, name).fill_(wp.nan)
 
-    captured = bsc.CapturedSteps(step, stages[0], [start])
+    captured = bsc.CapturedSteps(step, stage, [start])
     monkeypatch.setattr(wp, "capture_launch", spoil)
     captured._graph = "a graph"
     captured()
-    assert captured.retaken == 1 and model.body_count > stages[0].model.body_count
+    assert captured.retaken == 1 and model.body_count > stage.model.body_count
     for name, found in zip(names, runs[0], strict=True):
         np.testing.assert_array_equal(found, getattr(model, name).numpy())
 

@@ -433,6 +433,10 @@ def test_captured_steps_run_where_no_graph_can_be_made(device, monkeypatch):
         warnings.simplefilter("error")
         steps()
     assert (runs, steps.retaken) == ([0, 1], 0)
+    steps._graph, steps._is_made = "a graph that has run", True
+    with pytest.raises(RuntimeError, match="invalid argument"):
+        steps()
+    assert runs == [0, 1]
 
 
 @pytest.mark.parametrize("support", ["plane", "box"])

@@ -1,6 +1,8 @@
 """Gradients through the collision stage: against central differences, flagged where they are of no use, and lasting."""
 
+import gc
 import itertools
+import weakref
 
 import newton
 import numpy as np
@@ -9,6 +11,7 @@ import warp as wp
 
 import warp_bsc as bsc
 from warp_bsc.response.adjoint.adjoint import RecordedStep, StepAdjoint
+from warp_bsc.response.state.record import StepRecorder
 
 DT = 1.0 / 600.0
 STEPS = 40
@@ -279,6 +282,16 @@ def test_many_tape_iterations_take_no_more_memory(device):
             before = used()
     assert scene.hits > 120
     assert used() - before < 2**19
+
+
+def test_a_record_that_grows_keeps_the_arrays_that_a_graph_may_write_to(device):
+    recorder = StepRecorder(wp.get_device(device), max_sweeps=4)
+    kept = []
+    for more in (4, 40):
+        recorder.reserve("entries", more)
+        kept.append(weakref.ref(recorder.record.multiplier))
+    gc.collect()
+    assert kept[0]() is not None and len(kept[0]()) < len(kept[1]())
 
 
 def test_state_at_the_start_must_be_kept(device):

@@ -104,9 +104,8 @@ def may_allocate(solver: SolverBase) -> bool:
     from these, counts as one that allocates. Where the contract is broken, Warp raises an error when the step is
     captured.
     """
-    if type(solver) is SolverStyle3D and solver.device.is_cuda:
-        return True
-    return type(solver) not in (SolverVBD, SolverStyle3D) or solver.collision_pipeline is not None
+    allocates_nothing = type(solver) is SolverVBD or (type(solver) is SolverStyle3D and solver.device.is_cpu)
+    return not allocates_nothing or solver.collision_pipeline is not None
 
 
 def attributes_of(solver: SolverBase) -> dict[str, Any]:

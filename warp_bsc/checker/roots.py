@@ -1,4 +1,4 @@
-"""Real roots of polynomials with integer coefficients, by the theorem of Sturm and Tarski."""
+"""Real roots of polynomials with integer coefficients, by Taylor series or else by the theorem of Sturm and Tarski."""
 
 import bisect
 import functools
@@ -71,7 +71,10 @@ def inner_part(f):
 
 
 def isolated_roots(f):
-    """Yields (lower, upper) around each root of f inside (0, 1), in order; these times are no roots, nor 0 and 1."""
+    """Yields (lower, upper) around each root of f inside (0, 1), in order, narrow unless a root is of even order.
+
+    These times are no roots of f, which has none at 0 and 1.
+    """
     sturm = _signed_remainders(f, differentiate(f))
     intervals = [(0, 1)]
     while intervals:

@@ -82,7 +82,7 @@ class CapturedSteps:
         if self._layer is not None:
             restored.append(self._layer.skipped)
         self._saved = [(x, _clone(x)) for x in restored]
-        self._graph = None
+        self._graph, self._is_made = None, False  # a capture is made into a graph when it is launched first
         self._captures = self._device.is_cuda
         self.retaken = 0
 
@@ -98,7 +98,7 @@ class CapturedSteps:
             self._capture()
 
     def _capture(self):
-        self._graph = None
+        self._graph, self._is_made = None, False
         if self._captures:
             with wp.ScopedCapture(self._device) as capture:
                 self._steps()
@@ -111,7 +111,10 @@ class CapturedSteps:
         lost = self._count_lost()
         try:
             wp.capture_launch(self._graph)
+            self._is_made = True
         except RuntimeError as error:  # CUDA makes no graph of some captures, with adjoints of bodies for example
+            if self._is_made:
+                raise
             warnings.warn(f"CapturedSteps run without a CUDA graph, which cannot be made: {error}", stacklevel=4)
             self._captures = False
             return False

@@ -112,7 +112,7 @@ class SolveStatus:
     slow_velocity_sweeps: int
 
 
-def elements_of(values: wp.array) -> list[wp.array]:
+def single_elements(values: wp.array) -> list[wp.array]:
     """Returns views of the single elements of an array, which conditions on the device and the host can read."""
     return [values[i : i + 1] for i in range(len(values))]
 
@@ -120,7 +120,7 @@ def elements_of(values: wp.array) -> list[wp.array]:
 def views_of(struct_type: type, values: wp.array):
     """Returns a struct whose fields, in their order, are views of one element each of an array."""
     struct = struct_type()
-    for name, element in zip(struct_type.vars, elements_of(values), strict=True):
+    for name, element in zip(struct_type.vars, single_elements(values), strict=True):
         setattr(struct, name, element)
     return struct
 

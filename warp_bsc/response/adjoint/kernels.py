@@ -40,10 +40,10 @@ from ..state.motion import moves_with_body, predicted_velocity
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transformed_plane
 from ..state.poses import centre_of, in_world, pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step
+from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
 from ..tuning import SHARE_OF_PATH
-from .structs import Paths, Projection, RestoredStep, entry_of, is_movable
+from .structs import Paths, Projection, RestoredStep, entry_of
 
 
 @wp.func
@@ -281,7 +281,7 @@ def _pose_by(step: Step, sums: wp.array[wp.spatial_vectord], body: int) -> wp.tr
     change = sums[body]
     motion = step.motion
     pose = motion.bodies.end[body]
-    if is_movable(motion, body) and step.vertices.bodies.outcome[body] != 0:
+    if can_move(motion, body) and step.vertices.bodies.outcome[body] != 0:
         pose = turned_pose(motion.bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
     return pose
 
@@ -299,7 +299,7 @@ def project_vertices(step: Step, sums: wp.array[wp.spatial_vectord], positions: 
     motion = step.motion
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and is_movable(motion, body):
+    if can_move(motion, body):
         pose = _pose_by(step, sums, body)
         positions[vertex] = wp.transform_point(pose, motion.bodies.position[wp.tid()])
 
@@ -310,7 +310,7 @@ def place_vertices(step: Step, positions: wp.array[wp.vec3]):
     motion = step.motion
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and is_movable(motion, body):
+    if can_move(motion, body):
         positions[vertex] = wp.transform_point(step.vertices.bodies.pose[body], motion.bodies.position[wp.tid()])
 
 
@@ -320,7 +320,7 @@ def vertex_velocities(step: Step, velocities: wp.array[wp.vec3]):
     motion, vertices = step.motion, step.vertices
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
-    if body >= 0 and is_movable(motion, body):
+    if can_move(motion, body):
         arm = to_double(vertices.x1[vertex]) - vertices.bodies.centre[body]
         velocities[vertex] = velocity_on_body(vertices.bodies.velocity[body], arm)
 
@@ -329,7 +329,7 @@ def vertex_velocities(step: Step, velocities: wp.array[wp.vec3]):
 def set_centres(motion: Motion, poses: wp.array[wp.transform], moved: MovedBodies):
     """Computes where impulses act on bodies in given poses, see :func:`.solve.bodies.move_to_end`."""
     body = wp.tid()
-    if is_movable(motion, body):
+    if can_move(motion, body):
         moved.centre[body] = centre_of(motion.bodies, body, poses[body])
         moved.inverse_inertia[body] = in_world(motion.bodies.inverse_inertia[body], poses[body])
 

@@ -12,7 +12,7 @@ from ..solve.sweeps import add_delta, count_active
 from ..solve.velocities import change_velocity
 from ..state.fixed_sum import sums_of
 from ..state.record import truncation_at
-from ..state.structs import Motion
+from ..state.structs import Motion, can_move
 from .structs import (
     Cursor,
     Gradients,
@@ -23,7 +23,6 @@ from .structs import (
     RestoredStep,
     StateGradients,
     entry_of,
-    is_movable,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -37,7 +36,7 @@ def begin_gradients(restored: RestoredStep, of_state: StateGradients, gradients:
     if body >= 0:
         pose = of_state.body_q[body]
         twist = of_state.body_qd[body]
-        if undetected and is_movable(motion, body):
+        if undetected and can_move(motion, body):
             of_motion.bodies.start[body] = pose
             pose = wp.transform(wp.vec3(), wp.quat())
             twist = wp.spatial_vector()
@@ -187,7 +186,7 @@ def collect_gradients_on_bodies(
     vertex = motion.bodies.particle_count + wp.tid()
     body = motion.bodies.of_vertex[vertex]
     collected = wp.vec3()
-    if body >= 0 and is_movable(motion, body):
+    if can_move(motion, body):
         collected = of_vertices[vertex] + more[vertex]
         of_vertices[vertex] = wp.vec3()
         more[vertex] = wp.vec3()
@@ -238,7 +237,7 @@ def finish_body_gradients(
         for i in range(6):
             velocity[i] = velocity[i] + missing
         of_state.body_qd[body] = velocity
-        if is_movable(motion, body):
+        if can_move(motion, body):
             masses = of_model.body_inv_mass
             if masses:
                 masses[body] = masses[body] + of_motion.bodies.inverse_mass[body] + missing

@@ -7,7 +7,7 @@ import warp as wp
 from ..schedule import SolveStatus
 from ..state.planes import MovingPlanes
 from ..state.record import StepRecord
-from ..state.structs import Motion, Step
+from ..state.structs import Step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -125,9 +125,3 @@ def entry_of(record: StepRecord, sweep: int, place: int) -> int:
     if sweep > 0:
         entry += record.sweep_ends[sweep - 1]
     return wp.where(entry < record.sweep_ends[sweep], entry, -1)
-
-
-@wp.func
-def is_movable(motion: Motion, body: int) -> bool:
-    """Returns whether the response can move a body in this step."""
-    return motion.bodies.inverse_mass[body] > 0.0

@@ -15,7 +15,7 @@ from ..schedule import (
     SolveStatus,
     allocate_status,
     clear_status,
-    elements_of,
+    single_elements,
     start_sweeps,
 )
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
@@ -123,7 +123,7 @@ class Workspace:
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status = allocate_status(self.worlds, device, **limits)
-        self.loop, self.results = elements_of(self.status.loop), elements_of(self.status.results)
+        self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
         self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)

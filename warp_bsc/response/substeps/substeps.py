@@ -63,8 +63,8 @@ class Substeps:
 
     Limitations:
         In a CUDA graph, a step that allocates memory, such as that of ``SolverXPBD``, cannot be left out where nothing
-        touches. The substeps then cost their time in each step, and ``"auto"`` raises. Only ``SolverVBD`` and
-        ``SolverStyle3D`` themselves are known not to allocate, see
+        touches. The substeps then cost their time in each step, and ``"auto"`` raises. Only ``SolverVBD`` itself and,
+        on a CPU, ``SolverStyle3D`` are known not to allocate, see
         :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in
         place, and not by assignment, are not restored.
 
