@@ -106,9 +106,9 @@ class DiffsimExample(ExampleBase):
 
     def simulate(self):
         """Simulates all worlds, and computes the gradient of their loss."""
-        if self.tape is not None:
-            self.tape.zero()  # of the last iteration; or NaN, of a graph whose buffers were too small
-        self.tape = wp.Tape()
+        self.former, self.tape = self.tape, wp.Tape()
+        if self.former is not None:  # it stays, as a CUDA graph of this function clears its gradients again
+            self.former.zero()  # of the last iteration; or NaN, of a graph whose buffers were too small
         with self.tape:
             self.forward()
         self.tape.backward(self.loss)

@@ -1,6 +1,5 @@
 """The collision stage: what it returns is free of collisions, by exact detection of what is stored, and little else."""
 
-import warnings
 
 import newton
 import numpy as np
@@ -416,27 +415,6 @@ def test_captured_steps_retake_nothing_that_a_graph_completes(device):
         0,
         0,
     )
-
-
-def test_captured_steps_run_where_no_graph_can_be_made(device, monkeypatch):
-    model, runs = bullet(60.0, device=device), []
-
-    def fail(graph):
-        raise RuntimeError("Graph creation error: invalid argument")
-
-    steps = bsc.CapturedSteps(lambda: runs.append(len(runs)), bsc.SolverCCD(SOLVERS["vbd"](model)), [model.state()])
-    steps._graph = "a graph"
-    monkeypatch.setattr(wp, "capture_launch", fail)
-    with pytest.warns(UserWarning, match="without a CUDA graph, which cannot be made: Graph creation error"):
-        steps()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        steps()
-    assert (runs, steps.retaken) == ([0, 1], 0)
-    steps._graph, steps._is_made = "a graph that has run", True
-    with pytest.raises(RuntimeError, match="invalid argument"):
-        steps()
-    assert runs == [0, 1]
 
 
 @pytest.mark.parametrize("support", ["plane", "box"])

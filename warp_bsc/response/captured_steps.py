@@ -1,7 +1,6 @@
 """Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 import copy
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -33,7 +32,7 @@ class CapturedSteps:
     needs larger ones freezes all particles or loses its gradients, and the report counts it. Such a run is taken back:
     the state and the totals of the report become those before it, the function runs outside the graph, where buffers
     grow, and is captured anew. So is the first run. Other solvers have nothing to take back, and on the CPU the
-    function runs as it is. So it does, after a warning, where CUDA cannot make a graph of what was captured.
+    function runs as it is.
 
     Without a tape no step of a :class:`.solver_ccd.SolverCCD` needs this: it completes detections for which a graph is
     too small, and any graph will do. Such steps may run here as well, and none is taken back.
@@ -58,7 +57,8 @@ class CapturedSteps:
 
         Args:
             steps: Steps the solver, always in the same arrays; in a graph its launches are repeated, and nothing else
-                that it does. If it goes back through a tape, it also has to clear the gradients first.
+                that it does. If it goes back through a tape, it also has to clear the gradients of the tape before
+                first, and to keep that tape: a graph clears them again.
             solver: The solver.
             state: All states and arrays that ``steps`` both reads and changes.
 
@@ -82,8 +82,7 @@ class CapturedSteps:
         if self._layer is not None:
             restored.append(self._layer.skipped)
         self._saved = [(x, _clone(x)) for x in restored]
-        self._graph, self._is_made = None, False  # a capture is made into a graph when it is launched first
-        self._captures = self._device.is_cuda
+        self._graph = None
         self.retaken = 0
 
     @one_at_a_time
@@ -91,15 +90,16 @@ class CapturedSteps:
         """Runs the steps once. Synchronizes with the device where a run may have to be taken back.
 
         Raises:
-            RuntimeError: If another thread is running them.
+            RuntimeError: If another thread is running them; if CUDA makes no graph of them, for example because they
+                write to memory of a tape that is gone.
         """
         if self._graph is None or not self._launch():
             self._steps()
             self._capture()
 
     def _capture(self):
-        self._graph, self._is_made = None, False
-        if self._captures:
+        self._graph = None
+        if self._device.is_cuda:
             with wp.ScopedCapture(self._device) as capture:
                 self._steps()
             self._graph = capture.graph
@@ -109,15 +109,7 @@ class CapturedSteps:
         for x, saved in self._saved:
             saved.assign(x)
         lost = self._count_lost()
-        try:
-            wp.capture_launch(self._graph)
-            self._is_made = True
-        except RuntimeError as error:  # CUDA makes no graph of some captures, with adjoints of bodies for example
-            if self._is_made:
-                raise
-            warnings.warn(f"CapturedSteps run without a CUDA graph, which cannot be made: {error}", stacklevel=4)
-            self._captures = False
-            return False
+        wp.capture_launch(self._graph)
         if self._count_lost() == lost:
             return True
         for x, saved in self._saved:
