@@ -1,6 +1,5 @@
 """The collision stage: what it returns is free of collisions, by exact detection of what is stored, and little else."""
 
-
 import newton
 import numpy as np
 import pytest

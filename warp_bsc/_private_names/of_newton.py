@@ -108,6 +108,24 @@ def may_allocate(solver: SolverBase) -> bool:
     return not allocates_nothing or solver.collision_pipeline is not None
 
 
+@contextlib.contextmanager
+def iterations_shared(solver: SolverBase, substeps: int, least: int) -> Iterator[None]:
+    """Shares the iterations of a solver out to the substeps of a step, each of which gets at least a number of them.
+
+    Contract: VBD reads the attribute ``iterations`` in each step, Style3D the same attribute of ``config``.
+    """
+    holder = solver.config if isinstance(solver, SolverStyle3D) else solver
+    if not isinstance(solver, SolverVBD | SolverStyle3D):
+        yield
+        return
+    iterations = holder.iterations
+    holder.iterations = min(iterations, max(least, -(-iterations // substeps)))
+    try:
+        yield
+    finally:
+        holder.iterations = iterations
+
+
 def attributes_of(solver: SolverBase) -> dict[str, Any]:
     """Returns the attributes of a solver by name, in the dictionary that holds them.
 

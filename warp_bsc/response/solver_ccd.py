@@ -189,7 +189,7 @@ class SolverCCD(CollisionStage):
         if self.substeps is not None:
             self._inner_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            self._in_substeps = Substeps(self._step_inner, solver, self._work, choices)
+            self._in_substeps = Substeps(self._step_solver, solver, self._work, choices)
             self.report.last_substeps = self._in_substeps.substeps
 
     def _check_tape(self, tape, state_in, state_out):
@@ -204,13 +204,19 @@ class SolverCCD(CollisionStage):
 
     def _begin_step(self, state, contacts):
         if self._in_substeps is not None:
-            self._in_substeps.save(state)
+            self._in_substeps.begin(state)
         if self._inner_contacts is None:
             return contacts
         external = has_external_rigid_solver(self.solver)
         return self._inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
 
     def _step_inner(self, *arguments, **options):
+        if self._in_substeps is None:
+            self._step_solver(*arguments, **options)
+        else:
+            self._in_substeps.take_whole_step(*arguments, **options)
+
+    def _step_solver(self, *arguments, **options):
         with contextlib.ExitStack() as stack:
             if self._limited is not None:
                 stack.enter_context(without_speed_limit(self._limited))

@@ -37,6 +37,11 @@ def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) ->
 def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None:
     """Detects the contacts of the motion, as the first half of :func:`resolve`, with the same arguments and errors."""
     begin(work, recorder)
+    detect_contacts(work)
+
+
+def detect_contacts(work: Workspace) -> None:
+    """Adds constraints for the contacts of the motion that :func:`begin` has initialized."""
     if work.max_penetrations:
         work.reserve(work.max_contacts)
         detect.detect_penetrations(work, ahead=True)

@@ -90,6 +90,12 @@ SUBSTEPS = (2, 4, 8, 16, 32)
 STRAIN = wp.constant(0.01)
 """Strain by contacts that ``"auto"`` leaves to a substep: elongation of an edge of cloth beyond its length at rest, or
 change of the length of an edge in a soft body, as a share of that length."""
+SUBSTEP_ITERATIONS = 2
+"""Fewest iterations of the inner solver in a substep."""
+SUBSTEP_STRAIN = wp.constant(1.5)
+"""Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
+MAX_REPEATS = wp.constant(2)
+"""Most times that substeps are repeated in a step, with more of them or with contacts that they missed."""
 COMPRESSION = wp.constant(0.25)
 """What compression of cloth counts, as a share of the same elongation."""
 

@@ -106,7 +106,7 @@ def project(work: Workspace, tolerance: float = 1.0) -> None:
 
     The tolerance is a share of that of a whole step.
     """
-    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -116,14 +116,15 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     work.launch(start_sweeps, 1, [work.status])
-    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
+    work.sweep(1, lambda: _activate(work, 1.0), project_positions, update)
 
 
 def _activate(work, tolerance):
     work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
 
 
-def _update(work, last):
+def update(work: Workspace, last: bool) -> None:
+    """Moves vertices and bodies by the sums of what constraints did to them."""
     work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

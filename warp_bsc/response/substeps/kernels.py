@@ -4,9 +4,11 @@ import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, approach_of
 from ..schedule import Loop, Result, SolveStatus
+from ..solve.sweeps import add_delta, count_active
 from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Motion, Step, can_move
+from ..state.vectors import ZERO
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,9 +19,48 @@ _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 
 
 @wp.kernel
-def use_substeps(unfinished: wp.array[int], number: int, substeps: wp.array[int]):
-    """Writes the number of substeps of a step that collides; 0 of others."""
-    substeps[0] = number * unfinished[0]
+def begin_step(interrupted: wp.array[int], number: wp.array[int], needs_whole_step: wp.array[int]):
+    """Forgets the predicted substeps of worlds that were interrupted; says whether a world has none."""
+    world = wp.tid()
+    if interrupted[world] == 1:
+        number[world] = 0
+    if number[world] == 0:
+        needs_whole_step[0] = 1
+
+
+@wp.kernel
+def extrapolate(
+    # in
+    start: StateArrays,
+    particle_f: wp.array[wp.vec3],
+    particle_world: wp.array[int],
+    gravity: wp.array[wp.vec3],
+    dt: float,
+    number: wp.array[int],
+    # out
+    motion: Motion,
+    end: StateArrays,
+):
+    """Predicts the motion of particles by their velocities, gravity and forces, in worlds with predicted substeps."""
+    i = wp.tid()
+    if number[motion.world[i]] == 0:
+        return
+    x0 = start.particle_q[i]
+    x1 = x0
+    velocity = start.particle_qd[i]
+    if motion.inverse_mass[i] > 0.0:
+        world = particle_world[i]
+        acceleration = gravity[wp.where(world < 0, gravity.shape[0] - 1, world)]
+        if particle_f:
+            acceleration += motion.inverse_mass[i] * particle_f[i]
+        velocity += dt * acceleration
+        x1 = x0 + dt * velocity
+    finite = wp.isfinite(x1) and wp.isfinite(velocity)
+    motion.x1[i] = wp.where(finite, x1, motion.x0[i])
+    motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
+    motion.is_not_finite[i] = wp.where(finite, 0, 1)
+    end.particle_q[i] = x1
+    end.particle_qd[i] = velocity
 
 
 @wp.kernel
@@ -28,6 +69,54 @@ def find_worlds(step: Step, has_constraints: wp.array[int]):
     i = wp.tid()
     if i < step.constraints.count[0]:
         has_constraints[step.motion.world[step.constraints.vertices[i][0]]] = 1
+
+
+@wp.kernel
+def use_substeps(
+    has_constraints: wp.array[int], given: int, status: SolveStatus, number: wp.array[int], substeps: wp.array[int]
+):
+    """Writes the number of substeps of worlds with constraints, and of a step that collides; 0 of others."""
+    world = wp.tid()
+    number[world] = given * has_constraints[world]
+    if world == 0:
+        substeps[0] = given * status.loop[Loop.UNFINISHED]
+
+
+@wp.func
+def mark_choice(choices: wp.array[int], n: int, is_chosen: wp.array[int], substeps: wp.array[int]):
+    """Marks a number of substeps as one that a world takes."""
+    for i in range(choices.shape[0]):
+        if choices[i] == n:
+            is_chosen[i] = 1
+    wp.atomic_max(substeps, 0, n)
+
+
+@wp.kernel
+def use_predicted_substeps(
+    # in
+    step: Step,
+    has_constraints: wp.array[int],
+    extrapolates: bool,
+    choices: wp.array[int],
+    # in and out
+    status: SolveStatus,
+    number: wp.array[int],
+    # out
+    is_chosen: wp.array[int],
+    substeps: wp.array[int],
+    chooses: wp.array[int],
+):
+    """Marks the predicted numbers of substeps; says whether a world with constraints has none.
+
+    A world without constraints takes the whole step, if there is one.
+    """
+    world = wp.tid()
+    if has_constraints[world] == 0 and not extrapolates:
+        number[world] = 0
+    if number[world] > 0:
+        mark_choice(choices, number[world], is_chosen, substeps)
+    elif status.loop[Loop.UNFINISHED] == 1 and (has_constraints[world] == 1 or step.constraints.count[0] == 0):
+        chooses[0] = 1
 
 
 @wp.kernel
@@ -42,28 +131,75 @@ def keep_detection(step: Step, status: SolveStatus, detected: wp.array[int], is_
 
 
 @wp.kernel
-def restore_detection(detected: wp.array[int], is_fast: wp.array[int], status: SolveStatus):
-    """Counts the contacts of the step as the inner solver predicted it, and its worlds with fast or pushing contacts.
+def disable_constraints(step: Step, detected: wp.array[int], is_pending: wp.array[int]):
+    """Disables constraints that a pass through the substeps added, in worlds that do not repeat it."""
+    i = wp.tid()
+    constraints = step.constraints
+    if i < detected[0] or i >= constraints.count[0]:
+        return
+    if is_pending[step.motion.world[constraints.vertices[i][0]]] == 0:
+        constraints.separation[i] = _NEVER_VIOLATED
+
+
+@wp.kernel
+def begin_pass(step: Step, passes: wp.array[int], detected: wp.array[int]):
+    """Counts a pass through the substeps; in a second one, adds the contacts that the first one missed."""
+    if passes[0] > 0:
+        detected[0] = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    passes[0] += 1
+
+
+@wp.func
+def _reset_constraint(step: Step, i: int, multiplier: wp.vec3d):
+    """Prepares a constraint for sweeps that begin with a position multiplier, in a motion of its own."""
+    constraints = step.constraints
+    constraints.position_multiplier[i] = multiplier
+    constraints.velocity_multiplier[i] = wp.vec3d()
+    constraints.previous_multiplier[i] = multiplier
+    constraints.last_sweep[i] = NEVER_SWEPT
+    corners, weights, normal = constraints.vertices[i], constraints.weights[i], constraints.normal[i]
+    constraints.approach[i] = approach_of(step, corners, weights, normal, constraints.separation[i])
+
+
+@wp.kernel
+def keep_constraints(step: Step, detected: wp.array[int], number: wp.array[int]):
+    """Keeps the constraints of worlds with substeps beside those that a detection of their motion will add."""
+    i = wp.tid()
+    if i < detected[0]:
+        _reset_constraint(step, i, wp.vec3d())
+        if number[step.motion.world[step.constraints.vertices[i][0]]] == 0:
+            step.constraints.separation[i] = _NEVER_VIOLATED
+
+
+@wp.kernel
+def restore_detection(step: Step, detected: wp.array[int], is_fast: wp.array[int], status: SolveStatus):
+    """Counts the contacts of the step as it was predicted, and its worlds with fast or pushing contacts.
 
     Where something immovable pushes, substeps that follow it may end in contacts that do not look fast; but to divide
-    them could leave vertices in its way.
+    them could leave vertices in its way. Constraints of the substeps leave nothing to do.
     """
     world = wp.tid()
     status.is_fast[world] = wp.max(status.is_fast[world], is_fast[world])
     status.results[Result.FIRST_HITS] = detected[1]
+    if world == 0 and status.loop[Loop.ACTIVE] == 0 and step.constraints.count[0] <= detected[0]:
+        status.loop[Loop.UNFINISHED] = status.results[Result.UNDETECTED]
 
 
 @wp.kernel
 def begin_substeps(
-    has_constraints: wp.array[int],
     number: wp.array[int],
+    is_pending: wp.array[int],
     substeps: int,
+    # out
     status: SolveStatus,
     takes_substeps: wp.array[int],
+    strain: wp.array[float],
 ):
-    """Marks the worlds that have constraints and take this number of substeps."""
+    """Marks the worlds that take this number of substeps."""
     world = wp.tid()
-    takes_substeps[world] = wp.where(number[world] == substeps, has_constraints[world], 0)
+    takes_substeps[world] = wp.where(number[world] == substeps, is_pending[world], 0)
+    if takes_substeps[world] == 1:
+        strain[world] = 0.0
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
 
@@ -132,8 +268,14 @@ def start_substep(
 
 
 @wp.kernel
-def reset_constraints(step: Step, status: SolveStatus, detected: wp.array[int]):
-    """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep."""
+def reset_constraints(
+    step: Step, status: SolveStatus, detected: wp.array[int], remaining: wp.array[int], substeps: int
+):
+    """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep.
+
+    The others begin with the multipliers that they had in the substep before, and with what these do to vertices and
+    bodies: a contact at rest needs the same ones again.
+    """
     i = wp.tid()
     if i == 0:
         status.loop[Loop.ITERATION] = 1
@@ -141,16 +283,16 @@ def reset_constraints(step: Step, status: SolveStatus, detected: wp.array[int]):
     constraints = step.constraints
     if i >= constraints.count[0]:
         return
-    constraints.position_multiplier[i] = wp.vec3d()
-    constraints.velocity_multiplier[i] = wp.vec3d()
-    constraints.previous_multiplier[i] = wp.vec3d()
-    constraints.last_sweep[i] = NEVER_SWEPT
+    multiplier = constraints.position_multiplier[i]
     if i < detected[0] and constraints.kind[i] == ContactKind.PLANE:
         constraints.separation[i] = _NEVER_VIOLATED
-        return
-    corners = constraints.vertices[i]
-    weights, normal, separation = constraints.weights[i], constraints.normal[i], constraints.separation[i]
-    constraints.approach[i] = approach_of(step, corners, weights, normal, separation)
+        multiplier = wp.vec3d()
+    if remaining[0] == substeps:
+        multiplier = wp.vec3d()
+    _reset_constraint(step, i, multiplier)
+    if wp.length_sq(multiplier) > ZERO:
+        count_active(step, i)
+        add_delta(step, i, multiplier, step.motion.x1, step.vertices.particle_delta_x, step.vertices.bodies.delta_x)
 
 
 @wp.kernel

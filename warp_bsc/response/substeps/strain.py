@@ -6,7 +6,8 @@ import warp as wp
 
 from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
-from ..tuning import COMPRESSION, STRAIN
+from ..tuning import COMPRESSION, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
+from .kernels import mark_choice
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,30 +40,101 @@ def measure_strain(
         wp.atomic_max(strain, motion.world[a], change / lengths[i])
 
 
+@wp.func
+def _choice(choices: wp.array[int], predicted: float) -> int:
+    """Returns the smallest number of substeps that is not less than the predicted one; 0 for one step."""
+    if not predicted > 1.0:
+        return 0
+    choice = int(0)
+    while choice < choices.shape[0] - 1 and float(choices[choice]) < predicted:
+        choice += 1
+    return choices[choice]
+
+
 @wp.kernel
 def choose_substeps(
     # in
     strain: wp.array[float],
+    has_constraints: wp.array[int],
     choices: wp.array[int],
     # in and out
     status: SolveStatus,
-    # out
     number: wp.array[int],
+    # out
     is_chosen: wp.array[int],
     substeps: wp.array[int],
+    largest: wp.array[float],
 ):
-    """Chooses the number of substeps of each world, 0 where contacts strain little; ``substeps`` is the largest."""
+    """Chooses the substeps of each world that has none, 0 where contacts strain little; ``substeps`` is the largest."""
     world = wp.tid()
     status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
-    predicted = strain[world] / STRAIN
-    number[world] = 0
-    if predicted > 1.0:
-        choice = int(0)
-        while choice < choices.shape[0] - 1 and float(choices[choice]) < predicted:
-            choice += 1
-        number[world] = choices[choice]
-        is_chosen[choice] = 1
-        wp.atomic_max(substeps, 0, choices[choice])
+    if number[world] == 0 and has_constraints[world] == 1:
+        n = _choice(choices, strain[world] / STRAIN)
+        number[world] = n
+        if n > 0:
+            mark_choice(choices, n, is_chosen, substeps)
+        else:
+            wp.atomic_max(largest, 0, strain[world])
+
+
+@wp.func
+def _predicted(n: int, strain: float) -> float:
+    """Returns how many substeps a step should have had that was taken in ``n``, with this strain in one of them."""
+    return float(n) * strain / (SUBSTEP_STRAIN * STRAIN)
+
+
+@wp.kernel
+def review_substeps(
+    # in
+    strain: wp.array[float],
+    final_strain: wp.array[float],
+    choices: wp.array[int],
+    passes: wp.array[int],
+    # in and out
+    number: wp.array[int],
+    # out
+    is_pending: wp.array[int],
+    is_chosen: wp.array[int],
+    substeps: wp.array[int],
+    repeats: wp.array[int],
+    largest: wp.array[float],
+):
+    """Repeats the substeps of worlds whose strain asks for twice as many; of others, predicts those of the next step.
+
+    So it does where contacts that the substeps did not know strain an element after them: they know these then.
+    """
+    world = wp.tid()
+    n = number[world]
+    is_pending[world] = 0
+    if n == 0:
+        return
+    predicted = float(n) * strain[world] / (SUBSTEP_STRAIN * STRAIN)
+    missed = final_strain[world] / STRAIN
+    too_few = predicted > 2.0 * float(n) and n < choices[choices.shape[0] - 1]
+    if passes[0] <= MAX_REPEATS and (too_few or missed > 2.0):
+        number[world] = wp.max(n, _choice(choices, predicted))
+        is_pending[world] = 1
+        repeats[0] = 1
+        mark_choice(choices, number[world], is_chosen, substeps)
+    else:
+        wp.atomic_max(largest, 0, wp.max(strain[world], final_strain[world]))
+
+
+@wp.kernel
+def predict_substeps(
+    # in
+    strain: wp.array[float],
+    final_strain: wp.array[float],
+    choices: wp.array[int],
+    # in and out
+    number: wp.array[int],
+):
+    """Predicts the substeps of the next step in each world that took some, by the strain of this step."""
+    world = wp.tid()
+    n = number[world]
+    if n > 0:
+        predicted = float(n) * strain[world] / SUBSTEP_STRAIN
+        number[world] = _choice(choices, wp.max(predicted, final_strain[world]) / STRAIN)
 
 
 def edges_at_rest(model: newton.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -25,16 +25,16 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase
 
-from ..._private_names.of_newton import attributes_of, body_q_prev, may_allocate
+from ..._private_names.of_newton import attributes_of, body_q_prev, iterations_shared, may_allocate
 from ..contacts.detect import detect_penetrations
-from ..schedule import Loop
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.motion import ModelMotion, arrays_of
 from ..state.workspace import Workspace
-from ..step import add_proximities, find_contacts, resolve_contacts
+from ..step import add_proximities, begin, detect_contacts, find_contacts, resolve_contacts
+from ..tuning import SUBSTEP_ITERATIONS
 from . import kernels
-from .strain import choose_substeps, edges_at_rest, measure_strain
+from .strain import choose_substeps, edges_at_rest, measure_strain, predict_substeps, review_substeps
 
 
 class _Step(NamedTuple):
@@ -97,8 +97,11 @@ class Substeps:
         self._start, self._in, self._out = model.state(), model.state(), model.state()
         self._copies: dict[str, wp.array] = {}  # of arrays of the inner solver
         self.substeps = wp.zeros(1, dtype=int, device=device)
-        self._number = wp.full(worlds, self._choices[0], dtype=int, device=device)  # of substeps, by world
+        self._number = wp.zeros(worlds, dtype=int, device=device)  # of substeps, by world
+        self._needs_whole_step = wp.zeros(1, dtype=int, device=device)
         self._has_constraints = wp.zeros(worlds, dtype=int, device=device)
+        self._strain = wp.zeros(worlds, dtype=float, device=device)
+        self._is_pending = wp.zeros(worlds, dtype=int, device=device)  # 1 while a world has substeps to take
         self._takes_substeps = wp.zeros(worlds, dtype=int, device=device)
         self._is_fast = wp.zeros(worlds, dtype=int, device=device)  # as in SolveStatus, of the predicted motion
         self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
@@ -107,15 +110,30 @@ class Substeps:
             edges, lengths, is_solid = edges_at_rest(model)
             columns = (edges, wp.vec2i), (lengths, float), (is_solid, bool)
             self._edges = [wp.array(values, dtype=dtype, device=device) for values, dtype in columns]
-            self._strain = wp.zeros(worlds, dtype=float, device=device)
+            self._final_strain = wp.zeros(worlds, dtype=float, device=device)
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
-            self._unfinished = wp.zeros(1, dtype=int, device=device)
+            self._passes = wp.zeros(1, dtype=int, device=device)
+            self._repeats = wp.zeros(1, dtype=int, device=device)
+            self._must_choose = wp.zeros(1, dtype=int, device=device)
+            self.strain = wp.zeros(1, dtype=float, device=device)
+        self._extrapolates = self._chooses and not model.body_count and not self._may_allocate
         self._arrays_of_solver()
 
-    def save(self, state: newton.State) -> None:
+    def begin(self, state: newton.State) -> None:
         """Copies the state at the start of the step, before the inner solver changes it."""
         self._start.assign(state)
+        if self._chooses:
+            self._needs_whole_step.zero_()
+            inputs = [self._motion.vertices.interrupted, self._number]
+            self._work.launch(kernels.begin_step, self._work.worlds, inputs, [self._needs_whole_step])
+
+    def take_whole_step(self, *arguments, **options) -> None:
+        """Steps the inner solver, with its arguments, unless all worlds have predicted substeps, and need no more."""
+        if self._extrapolates and not options:
+            wp.capture_if(self._needs_whole_step, lambda: self._step(*arguments))
+        else:
+            self._step(*arguments, **options)
 
     def _arrays_of_solver(self):
         """Returns the arrays of the inner solver, each with one of its size, allocated here where memory can be."""
@@ -147,40 +165,53 @@ class Substeps:
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
         work.motion = self._motion  # also after an error in a substep
+        if self._chooses and in_graph and self._may_allocate:
+            solver = type(self._solver).__name__
+            raise NotImplementedError(
+                f"substeps='auto' cannot be captured with {solver}, whose steps may allocate memory; give a number"
+            )
+        if self._extrapolates:
+            model, start = work.mesh.model, self._start
+            inputs = [arrays_of(start), start.particle_f, model.particle_world, model.gravity, dt, self._number]
+            outputs = [self._motion.vertices, arrays_of(state)]
+            work.launch(kernels.extrapolate, model.particle_count, inputs, outputs)
         find_contacts(work)
+        self._has_constraints.zero_()
+        work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
         if self._chooses:
-            if in_graph and self._may_allocate:
-                solver = type(self._solver).__name__
-                raise NotImplementedError(
-                    f"substeps='auto' cannot be captured with {solver}, whose steps may allocate memory; give a number"
-                )
-            self._resolve_and_choose(dt)
+            self._choose(dt)
         else:
-            work.launch(kernels.use_substeps, 1, [work.loop[Loop.UNFINISHED], self._choices[0]], [self.substeps])
+            inputs = [self._has_constraints, self._choices[0], work.status]
+            work.launch(kernels.use_substeps, work.worlds, inputs, [self._number, self.substeps])
         step = _Step(state, control, contacts, dt, self._arrays_of_solver())
         if in_graph and self._may_allocate:
             self._take_substeps(step)
         else:
             wp.capture_if(self.substeps, self._take_substeps, step=step)
-        wp.capture_if(self.substeps, self._finish, dt=dt)
+
+    def _choose(self, dt):
+        """Chooses the substeps of each world: the predicted ones, or those that follow from a resolved whole step."""
+        work = self._work
+        for array in (self.substeps, self._is_chosen, self._must_choose, self._strain, self._final_strain, self.strain):
+            array.zero_()
+        inputs = [work.step, self._has_constraints, self._extrapolates, self._device_choices, work.status, self._number]
+        outputs = [self._is_chosen, self.substeps, self._must_choose]
+        work.launch(kernels.use_predicted_substeps, work.worlds, inputs, outputs)
+        wp.capture_if(self._must_choose, self._resolve_and_choose, dt=dt)
 
     def _resolve_and_choose(self, dt):
-        """Resolves the motion, chooses the substeps of each world, and if there are any, detects its contacts again."""
+        """Resolves the motion, chooses substeps by its strain, and if there are any, detects its contacts again."""
         work = self._work
-        wp.copy(self._unfinished, work.loop[Loop.UNFINISHED])
-        self.substeps.zero_()
         resolve_contacts(work, dt)
-        wp.capture_if(self._unfinished, self._choose)
+        self._measure_strain(self._motion, self._strain)
+        inputs = [self._strain, self._has_constraints, self._device_choices, work.status, self._number]
+        outputs = [self._is_chosen, self.substeps, self.strain]
+        work.launch(choose_substeps, work.worlds, inputs, outputs)
         wp.capture_if(self.substeps, self._find_contacts_again)
 
-    def _choose(self):
-        work, edges = self._work, self._edges
-        self._strain.zero_()
-        self._is_chosen.zero_()
-        inputs = [self._motion.vertices, work.vertices.x1, *edges]
-        work.launch(measure_strain, len(edges[0]), inputs, [self._strain])
-        outputs = [work.status, self._number, self._is_chosen, self.substeps]
-        work.launch(choose_substeps, work.worlds, [self._strain, self._device_choices], outputs)
+    def _measure_strain(self, motion, strain):
+        inputs = [motion.vertices, self._work.vertices.x1, *self._edges]
+        self._work.launch(measure_strain, len(self._edges[0]), inputs, [strain])
 
     def _find_contacts_again(self):
         work = self._work
@@ -191,24 +222,42 @@ class Substeps:
         """Repeats the step in substeps, and writes the end to the predicted motion and to the state."""
         work = self._work
         add_proximities(work)
-        self._has_constraints.zero_()
-        work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
         inputs = [work.step, work.status, self._detected, self._is_fast]
         work.launch(kernels.keep_detection, work.worlds, inputs)
         for array, saved in step.arrays:
             wp.copy(saved, array)
+        self._is_pending.fill_(1)
+        if self._chooses:
+            self._passes.zero_()
+            self._repeats.fill_(1)
+            wp.capture_while(self._repeats, self._take_chosen_numbers, step=step)
+            inputs = [self._strain, self._final_strain, self._device_choices]
+            work.launch(predict_substeps, work.worlds, inputs, [self._number])
+        else:
+            self._take_number_of_substeps(self._choices[0], step)
+            self._finish(step.dt)
+
+    def _take_chosen_numbers(self, step):
+        """Takes the substeps of all worlds that have still to, and decides which worlds repeat theirs."""
+        work = self._work
+        work.launch_over_constraints(kernels.disable_constraints, self._detected, self._is_pending)
+        work.launch(kernels.begin_pass, 1, [work.step, self._passes, self._detected])
         for i, substeps in enumerate(self._choices):
-            if self._chooses:
-                wp.capture_if(self._is_chosen[i : i + 1], self._take_number_of_substeps, substeps=substeps, step=step)
-            else:
-                self._take_number_of_substeps(substeps, step)
+            wp.capture_if(self._is_chosen[i : i + 1], self._take_number_of_substeps, substeps=substeps, step=step)
+        self._finish(step.dt)
+        for array in (self._final_strain, self._is_chosen, self._repeats):
+            array.zero_()
+        self._measure_strain(self._motion, self._final_strain)
+        inputs = [self._strain, self._final_strain, self._device_choices, self._passes, self._number]
+        outputs = [self._is_pending, self._is_chosen, self.substeps, self._repeats, self.strain]
+        work.launch(review_substeps, work.worlds, inputs, outputs)
 
     def _take_number_of_substeps(self, substeps, step):
         """Repeats the step in worlds with this number of substeps."""
         work, mesh, start = self._work, self._mesh, self._in
         self._remaining.fill_(substeps)
-        inputs = [self._has_constraints, self._number, substeps, work.status]
-        work.launch(kernels.begin_substeps, work.worlds, inputs, [self._takes_substeps])
+        outputs = [work.status, self._takes_substeps, self._strain]
+        work.launch(kernels.begin_substeps, work.worlds, [self._number, self._is_pending, substeps], outputs)
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
@@ -216,11 +265,12 @@ class Substeps:
         poses = body_q_prev(self._solver) if self._moves_bodies else None
         if poses is not None:
             wp.copy(poses, self._start.body_q)
-        if mesh.device.is_capturing and self._may_allocate:
-            for _ in range(substeps):
-                self._take_substep(substeps, step)
-        else:
-            wp.capture_while(self._remaining, self._take_substep, substeps=substeps, step=step)
+        with iterations_shared(self._solver, substeps, SUBSTEP_ITERATIONS):
+            if mesh.device.is_capturing and self._may_allocate:
+                for _ in range(substeps):
+                    self._take_substep(substeps, step)
+            else:
+                wp.capture_while(self._remaining, self._take_substep, substeps=substeps, step=step)
         attributes.update(kept)
         for array, saved in step.arrays:
             wp.copy(array, saved)
@@ -252,8 +302,12 @@ class Substeps:
         if work.max_penetrations:
             work.reserve(work.max_penetrations)
             detect_penetrations(work, ahead=True)
-        work.launch_over_constraints(kernels.reset_constraints, work.status, self._detected)
+        inputs = [work.status, self._detected, self._remaining, substeps]
+        work.launch_over_constraints(kernels.reset_constraints, *inputs)
+        positions.update(work, last=True)
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
+        if self._chooses:
+            self._measure_strain(substep, self._strain)
         velocities.project(work, substep_dt)
         start.assign(self._start)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
@@ -261,8 +315,12 @@ class Substeps:
         work.launch(kernels.end_substep, max(mesh.vertex_count, bodies), inputs)
 
     def _finish(self, dt):
-        """Detects and resolves the contacts of the motion that the substeps made."""
+        """Detects and resolves the contacts of the motion that the substeps made, beside their own constraints."""
         work = self._work
-        find_contacts(work)
-        work.launch(kernels.restore_detection, work.worlds, [self._detected, self._is_fast], [work.status])
+        begin(work)
+        wp.copy(work.constraints.count, self._detected, count=1)
+        work.launch_over_constraints(kernels.keep_constraints, self._detected, self._number)
+        detect_contacts(work)
+        inputs = [work.step, self._detected, self._is_fast, work.status]
+        work.launch(kernels.restore_detection, work.worlds, inputs)
         resolve_contacts(work, dt)
