@@ -129,7 +129,8 @@ class PaperScene(ExampleBase):
         builder.color()
         model = builder.finalize()
         solver = SolverDrivenVBD(model, self.motion, self.motion_inputs, self.carried, iterations=self.iterations)
-        self.start(model, solver, self.camera, clocks=[solver.time])
+        # as recorded: the steps of a frame are many, and each is resolved as a whole
+        self.start(model, solver, self.camera, clocks=[solver.time], substeps=None)
 
     def count_substeps(self, triangles):
         """Returns the steps per frame of a mesh of about ``triangles`` triangles, an even number.

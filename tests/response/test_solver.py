@@ -302,9 +302,13 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
     ends = []
     for value in (0.0, 0.7):
         friction = wp.zeros(model.particle_count, dtype=float, device=device)
-        solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5)
+        solver = bsc.SolverCCD(
+            newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5, substeps=None
+        )
         friction.fill_(value)  # after the constructor has checked it
-        number = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5)
+        number = bsc.SolverCCD(
+            newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5, substeps=None
+        )
         for stage in (solver, number):
             rollout = Rollout(model, stage)
             for _ in range(8):

@@ -141,7 +141,7 @@ class Stress:
         self._worlds = worlds
         self._model = builder.finalize(device=device)
         self._inner = Given(self._model)
-        solver = bsc.SolverCCD(self._inner, min_distance=scene.min_distance)
+        solver = bsc.SolverCCD(self._inner, min_distance=scene.min_distance, substeps=None)
         distance = scene.min_distance
         self._rollout = (
             Rollout(self._model, solver) if distance is None else DistanceRollout(self._model, solver, distance)

@@ -114,8 +114,11 @@ def iterations_shared(solver: SolverBase, substeps: int, least: int) -> Iterator
 
     Contract: VBD reads the attribute ``iterations`` in each step, Style3D the same attribute of ``config``.
     """
-    holder = solver.config if isinstance(solver, SolverStyle3D) else solver
-    if not isinstance(solver, SolverVBD | SolverStyle3D):
+    if isinstance(solver, SolverStyle3D):
+        holder = solver.config
+    elif isinstance(solver, SolverVBD):
+        holder = solver
+    else:
         yield
         return
     iterations = holder.iterations

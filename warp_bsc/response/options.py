@@ -57,7 +57,7 @@ class StageOptions:
         separation=None,
         friction=None,
         restitution=None,
-        substeps=None,
+        substeps="auto",
         bodies="pushed",
         min_distance=None,
         particle_radius=None,
@@ -70,7 +70,7 @@ class StageOptions:
             separation = checked_distance(separation, "separation", zero=False)
             checked_number(separation, "separation", 0.0, MAX_FLOAT)
         substeps = checked_substeps(substeps)
-        if substeps is not None and model.requires_grad:
+        if isinstance(substeps, int) and model.requires_grad:
             raise NotImplementedError("substeps: steps in substeps carry no gradients; omit substeps, or requires_grad")
         return cls(
             separation=separation,

@@ -1,6 +1,7 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
 import functools
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from .inside import Inside, InsideFinder
 from .schedule import Result, views_of
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
+from .tuning import MAX_STRAIN
 
 
 @wp.struct
@@ -26,6 +28,7 @@ class StepTotals:
     not_finite_steps: wp.array[wp.int64]
     remaining: wp.array[wp.int64]
     excluded: wp.array[wp.int64]
+    strained_steps: wp.array[wp.int64]
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
 
@@ -45,6 +48,7 @@ class Totals:
         not_finite_steps: Steps with positions or velocities of particles that were not finite.
         remaining: Sum of :attr:`SolverReport.remaining`: contacts that were passed, in steps not certified.
         excluded: Sum of :attr:`SolverReport.excluded`; a pair counts in each step in which it has a contact.
+        strained_steps: Steps in which :attr:`SolverReport.strain` was more than 0.2.
     """
 
     steps: int
@@ -56,6 +60,7 @@ class Totals:
     not_finite_steps: int
     remaining: int
     excluded: int
+    strained_steps: int
 
 
 @dataclass(frozen=True)
@@ -87,17 +92,42 @@ class SolverReport:
 
     Attributes:
         speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
+        substeps_omitted: Why ``substeps="auto"`` takes no substeps here; None if it can, or was not given.
     """
 
     def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._motion, self._work, self._responds = work.motion, work, responds
         self.speed_limit_lifted = False
+        self.substeps_omitted: str | None = None
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
+        self.last_strain = wp.zeros(1, dtype=float, device=work.device)
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
+        self._strained = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)  # steps, on the host
+        self._has_warned = False
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
+
+    def copy_strained(self) -> None:
+        """Copies the number of strained steps to the host, without waiting for the device, also in a CUDA graph."""
+        wp.copy(self._strained, self.device_totals.strained_steps)
+
+    def warn_if_strained(self) -> None:
+        """Warns once after a step whose :attr:`strain` is more than 0.2, as far as the host knows; does not wait."""
+        if self._has_warned or not self._strained.numpy()[0]:
+            return
+        self._has_warned = True
+        advice = "take shorter steps"
+        if self.substeps_omitted is not None:
+            advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
+        elif not self.totals.substepped_steps:
+            advice += ", or pass substeps='auto'"
+        limit = float(MAX_STRAIN)
+        warnings.warn(
+            f"contacts strained an edge by more than {limit:.0%} in a step, as its solver does not see them: {advice}",
+            stacklevel=5,
+        )
 
     @property
     def certified(self) -> bool:
@@ -109,6 +139,7 @@ class SolverReport:
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.
         """
+        self.warn_if_strained()
         return bool(_read(self._work.results[Result.CERTIFIED]))
 
     @property
@@ -269,6 +300,16 @@ class SolverReport:
         return _read(self.last_substeps)
 
     @property
+    def strain(self) -> float:
+        """Largest strain of an edge by the contacts of the last step, beyond what the inner solver predicted.
+
+        That is the elongation of an edge of a triangle or a spring beyond its length at rest, or a quarter of its
+        compression, and the change of length of an edge in a soft body, as a share of its length at rest. Of a step in
+        substeps, it is that of a substep.
+        """
+        return float(self.last_strain.numpy()[0])
+
+    @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
         return Totals(*self._read_totals()[:-2])
@@ -292,6 +333,10 @@ class SolverReport:
         )
         if totals.substepped_steps:
             line += f", {totals.substepped_steps} in substeps"
+        if self.substeps_omitted is not None and totals.strained_steps:
+            line += f", none in substeps ({self.substeps_omitted})"
+        if totals.strained_steps:
+            line += f", {totals.strained_steps} in which contacts strained an edge by more than {float(MAX_STRAIN):.0%}"
         if self.speed_limit_lifted:
             line += ", without VBD's speed limit"
         if self.crossings:

@@ -15,14 +15,15 @@ from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
-from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
+from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
 from .stage import CollisionStage
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
-from .substeps.substeps import Substeps
+from .substeps.strain import StrainMeter
+from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
 from .write_back import count_record, write_back
 
@@ -90,7 +91,7 @@ class SolverCCD(CollisionStage):
         separation: float | None = None,
         friction: float | wp.array[float] | None = None,
         restitution: float | wp.array[float] | None = None,
-        substeps: int | Literal["auto"] | None = None,
+        substeps: int | Literal["auto"] | None = "auto",
         bodies: Literal["pushed", "separated", "left"] = "pushed",
         min_distance: float | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
@@ -171,7 +172,7 @@ class SolverCCD(CollisionStage):
         if options.keeps_distances:
             mesh.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
-        if self.substeps is not None and inner is not solver:
+        if isinstance(self.substeps, int) and inner is not solver:
             raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
         moves, separates = options.moves_bodies(mesh, inner), options.bodies == "separated"
         coefficients = friction_of(mesh, self.friction)
@@ -185,12 +186,14 @@ class SolverCCD(CollisionStage):
         self._limited = inner if options.lift_speed_limit and has_speed_limit(inner) else None
         self.report.speed_limit_lifted = self._limited is not None
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self._in_substeps = None
-        if self.substeps is not None:
-            self._inner_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
+        self._in_substeps, self._omitted, self._meter = None, None, StrainMeter(self._work)
+        if self.substeps == "auto":
+            self._omitted = self.report.substeps_omitted = reason_to_omit_substeps(solver)
+        if self.substeps is not None and self._omitted is None:
+            self._shared_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            self._in_substeps = Substeps(self._step_solver, solver, self._work, choices)
-            self.report.last_substeps = self._in_substeps.substeps
+            self._in_substeps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
+            self.report.last_substeps, self.report.last_strain = self._in_substeps.substeps, self._in_substeps.strain
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -203,15 +206,28 @@ class SolverCCD(CollisionStage):
             )
 
     def _begin_step(self, state, contacts):
-        if self._in_substeps is not None:
-            self._in_substeps.begin(state)
-        if self._inner_contacts is None:
+        self._inner_contacts = None
+        if not self._takes_substeps():
             return contacts
+        self._in_substeps.begin(state)
+        self._inner_contacts = self._shared_contacts
         external = has_external_rigid_solver(self.solver)
         return self._inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
 
+    def _takes_substeps(self):
+        """Returns whether the step that begins may take substeps; the report says why not."""
+        inner, self.report.substeps_omitted = self._in_substeps, self._omitted
+        if inner is None:
+            return False
+        if self.substeps == "auto":
+            if self._coupled is not None:
+                self.report.substeps_omitted = "a coupled solver steps the stage"
+            elif self.mesh.device.is_capturing and inner.may_allocate:
+                self.report.substeps_omitted = f"{type(self.solver).__name__} may allocate memory, in a graph"
+        return self.report.substeps_omitted is None
+
     def _step_inner(self, *arguments, **options):
-        if self._in_substeps is None:
+        if self._inner_contacts is None:
             self._step_solver(*arguments, **options)
         else:
             self._in_substeps.take_whole_step(*arguments, **options)
@@ -228,7 +244,6 @@ class SolverCCD(CollisionStage):
         device, end = self.mesh.device, arrays_of(state_out)
         if self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
-        if self._in_substeps is not None:
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
             run_on_host(lambda: self._resolve(end, dt, solve), device)
         elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
@@ -277,6 +292,10 @@ class SolverCCD(CollisionStage):
                 self._motion.friction.read()
             self._motion.set_end(end, dt)
             solve()
+            if self._inner_contacts is None:
+                self.report.last_strain.zero_()
+                measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
+                wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
             self._write_end(end)
 
     def _write_end(self, end):

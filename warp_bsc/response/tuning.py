@@ -94,8 +94,16 @@ SUBSTEP_ITERATIONS = 2
 """Fewest iterations of the inner solver in a substep."""
 SUBSTEP_STRAIN = wp.constant(1.5)
 """Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
+KEPT = wp.constant(0.25)
+CALM_STEPS, MAX_CALM_STEPS = wp.constant(16), wp.constant(1024)
+"""Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, at
+first and at most."""
+FREE_STEPS = wp.constant(4)
+"""Steps with little strain that count as much as one with none: nothing touches, or it does not push."""
 MAX_REPEATS = wp.constant(2)
 """Most times that substeps are repeated in a step, with more of them or with contacts that they missed."""
+MAX_STRAIN = wp.constant(0.2)
+"""Largest strain by contacts of which the stage does not warn."""
 COMPRESSION = wp.constant(0.25)
 """What compression of cloth counts, as a share of the same elongation."""
 

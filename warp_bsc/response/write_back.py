@@ -7,6 +7,7 @@ from .schedule import Loop, Result, SolveStatus
 from .state.motion import StateArrays
 from .state.record import RecordCounts
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
+from .tuning import MAX_STRAIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,7 +67,7 @@ def finish_inspection(outcome: wp.array[int], particle_count: int, status: Solve
 
 
 @wp.kernel
-def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals):
+def count_step(status: SolveStatus, substeps: wp.array[int], strain: wp.array[float], totals: StepTotals):
     """Adds a step to the totals."""
     results = status.results
     # a certified motion of elements that did not cross makes no crossings
@@ -81,6 +82,8 @@ def count_step(status: SolveStatus, substeps: wp.array[int], totals: StepTotals)
     totals.not_finite_steps[0] += wp.int64(wp.min(results[Result.NOT_FINITE], 1))
     totals.remaining[0] += wp.int64(results[Result.REMAINING])
     totals.excluded[0] += wp.int64(results[Result.EXCLUDED])
+    if strain[0] > MAX_STRAIN:
+        totals.strained_steps[0] += wp.int64(1)
 
 
 @wp.kernel

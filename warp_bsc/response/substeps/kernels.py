@@ -9,6 +9,7 @@ from ..state.motion import StateArrays, moves_with_body, predicted_position, pre
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Motion, Step, can_move
 from ..state.vectors import ZERO
+from ..tuning import CALM_STEPS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,11 +20,21 @@ _NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
 
 
 @wp.kernel
-def begin_step(interrupted: wp.array[int], number: wp.array[int], needs_whole_step: wp.array[int]):
+def begin_step(
+    interrupted: wp.array[int],
+    # in and out
+    number: wp.array[int],
+    calm: wp.array[int],
+    patience: wp.array[int],
+    # out
+    needs_whole_step: wp.array[int],
+):
     """Forgets the predicted substeps of worlds that were interrupted; says whether a world has none."""
     world = wp.tid()
     if interrupted[world] == 1:
         number[world] = 0
+        calm[world] = 0
+        patience[world] = CALM_STEPS
     if number[world] == 0:
         needs_whole_step[0] = 1
 
@@ -199,7 +210,7 @@ def begin_substeps(
     world = wp.tid()
     takes_substeps[world] = wp.where(number[world] == substeps, is_pending[world], 0)
     if takes_substeps[world] == 1:
-        strain[world] = 0.0
+        strain[wp.min(world, strain.shape[0] - 1)] = 0.0
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
 

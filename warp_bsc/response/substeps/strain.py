@@ -6,7 +6,8 @@ import warp as wp
 
 from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
-from ..tuning import COMPRESSION, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
+from ..state.workspace import Workspace
+from ..tuning import COMPRESSION, FREE_STEPS, KEPT, MAX_CALM_STEPS, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
 from .kernels import mark_choice
 
 wp.set_module_options({"enable_backward": False})
@@ -23,7 +24,7 @@ def measure_strain(
     # out
     strain: wp.array[float],
 ):
-    """Finds the largest strain of an edge, in each world, between predicted positions and ``x1``.
+    """Finds the largest strain of an edge between predicted positions and ``x1``, in each world, or in all.
 
     Cloth that is compressed buckles, and resists less than cloth that is stretched: a quarter of its compression
     counts.
@@ -37,7 +38,7 @@ def measure_strain(
     if is_solid[i]:
         change = wp.abs(length - predicted)
     if change > 0.0:
-        wp.atomic_max(strain, motion.world[a], change / lengths[i])
+        wp.atomic_max(strain, wp.min(motion.world[a], strain.shape[0] - 1), change / lengths[i])
 
 
 @wp.func
@@ -51,6 +52,14 @@ def _choice(choices: wp.array[int], predicted: float) -> int:
     return choices[choice]
 
 
+@wp.func
+def _lose_calm(calm: wp.array[int], patience: wp.array[int], world: int):
+    """Doubles the calm steps that a world needs for fewer substeps, if it has soon needed more again."""
+    if calm[world] < 0:
+        patience[world] = wp.min(2 * patience[world], MAX_CALM_STEPS)
+    calm[world] = 0
+
+
 @wp.kernel
 def choose_substeps(
     # in
@@ -60,6 +69,8 @@ def choose_substeps(
     # in and out
     status: SolveStatus,
     number: wp.array[int],
+    calm: wp.array[int],
+    patience: wp.array[int],
     # out
     is_chosen: wp.array[int],
     substeps: wp.array[int],
@@ -73,6 +84,7 @@ def choose_substeps(
         number[world] = n
         if n > 0:
             mark_choice(choices, n, is_chosen, substeps)
+            _lose_calm(calm, patience, world)
         else:
             wp.atomic_max(largest, 0, strain[world])
 
@@ -128,17 +140,51 @@ def predict_substeps(
     choices: wp.array[int],
     # in and out
     number: wp.array[int],
+    calm: wp.array[int],
+    patience: wp.array[int],
 ):
-    """Predicts the substeps of the next step in each world that took some, by the strain of this step."""
+    """Predicts the substeps of the next step in each world that took some, by the strain of this step.
+
+    They become fewer slowly, half as many once a number of steps needed less than a quarter of them: with another
+    number, elements come to rest elsewhere, and the difference sets them in motion.
+    """
     world = wp.tid()
     n = number[world]
     if n > 0:
-        predicted = float(n) * strain[world] / SUBSTEP_STRAIN
-        number[world] = _choice(choices, wp.max(predicted, final_strain[world]) / STRAIN)
+        predicted = wp.max(float(n) * strain[world] / SUBSTEP_STRAIN, final_strain[world]) / STRAIN
+        if predicted > float(n):
+            number[world] = _choice(choices, predicted)
+            _lose_calm(calm, patience, world)
+        elif predicted >= KEPT * float(n):
+            calm[world] = wp.min(calm[world] + 1, 0)
+        elif calm[world] < patience[world]:
+            calm[world] += wp.where(predicted > 0.0, 1, FREE_STEPS)
+        else:
+            number[world] = _choice(choices, 0.5 * float(n))
+            calm[world] = -patience[world]
+
+
+class StrainMeter:
+    """Measures how much contacts strain the triangles, tetrahedra and springs of a model."""
+
+    def __init__(self, work: Workspace):
+        """Copies the edges of a model and their lengths at rest to the device."""
+        self._work = work
+        columns = zip(edges_at_rest(work.mesh.model), (wp.vec2i, float, bool), strict=True)
+        self._edges = [wp.array(values, dtype=dtype, device=work.device) for values, dtype in columns]
+
+    def measure(self, motion: Motion, strain: wp.array[float]) -> None:
+        """Increases ``strain`` to that between predicted positions and positions as they are, of each world or of all.
+
+        Args:
+            motion: The motion, as the inner solver predicted it.
+            strain: Shape [worlds] or [1].
+        """
+        self._work.launch(measure_strain, len(self._edges[0]), [motion, self._work.vertices.x1, *self._edges], [strain])
 
 
 def edges_at_rest(model: newton.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns edges of triangles and tetrahedra, their lengths at rest [m], and which are of tetrahedra."""
+    """Returns edges of triangles, springs and tetrahedra, their lengths at rest [m], and which are of tetrahedra."""
     kinds = []
     for indices, poses, n in ((model.tri_indices, model.tri_poses, 3), (model.tet_indices, model.tet_poses, 4)):
         elements = np.zeros((0, n), dtype=int) if indices is None else indices.numpy().reshape(-1, n)
@@ -149,8 +195,13 @@ def edges_at_rest(model: newton.Model) -> tuple[np.ndarray, np.ndarray, np.ndarr
         a, b = np.triu_indices(n, k=1)
         edges = np.sort(elements[valid][:, np.stack([a, b], axis=1)].reshape(-1, 2), axis=1)
         kinds.append((edges, np.linalg.norm(x[:, :, a] - x[:, :, b], axis=1).ravel()))
+    if model.spring_count:
+        assert model.spring_indices is not None and model.spring_rest_length is not None
+        rest = model.spring_rest_length.numpy().astype(np.float64)
+        springs = np.sort(model.spring_indices.numpy().reshape(-1, 2), axis=1)
+        kinds.insert(1, (springs[rest > 0.0], rest[rest > 0.0]))
     edges, of_edge = np.unique(np.concatenate([edges for edges, _ in kinds]), axis=0, return_inverse=True)
     lengths, is_solid = np.zeros(len(edges)), np.zeros(len(edges), dtype=bool)
     np.maximum.at(lengths, of_edge.ravel(), np.concatenate([lengths for _, lengths in kinds]))
-    is_solid[of_edge.ravel()[len(kinds[0][0]) :]] = True
+    is_solid[of_edge.ravel()[len(of_edge.ravel()) - len(kinds[-1][0]) :]] = True
     return edges, lengths, is_solid

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import newton
 import warp as wp
-from newton.solvers import SolverBase
+from newton.solvers import SolverBase, SolverSemiImplicit
 
 from ..._private_names.of_newton import attributes_of, body_q_prev, iterations_shared, may_allocate
 from ..contacts.detect import detect_penetrations
@@ -32,9 +32,9 @@ from ..solve.bodies import begin_bodies
 from ..state.motion import ModelMotion, arrays_of
 from ..state.workspace import Workspace
 from ..step import add_proximities, begin, detect_contacts, find_contacts, resolve_contacts
-from ..tuning import SUBSTEP_ITERATIONS
+from ..tuning import CALM_STEPS, SUBSTEP_ITERATIONS
 from . import kernels
-from .strain import choose_substeps, edges_at_rest, measure_strain, predict_substeps, review_substeps
+from .strain import StrainMeter, choose_substeps, predict_substeps, review_substeps
 
 
 class _Step(NamedTuple):
@@ -73,25 +73,34 @@ class Substeps:
         that Style3D finds between cloth and cloth are disabled.
 
     Attributes:
-        substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not repeated.
+        substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken in substeps.
+        strain: Largest strain by contacts of the last step, or of one of its substeps, on the device.
     """
 
-    def __init__(self, step: Callable[..., None], solver: SolverBase, work: Workspace, substeps: Sequence[int]):
+    def __init__(
+        self,
+        step: Callable[..., None],
+        solver: SolverBase,
+        work: Workspace,
+        meter: StrainMeter,
+        substeps: Sequence[int],
+    ):
         """Allocates buffers.
 
         Args:
             step: Steps the inner solver, with the arguments of its ``step``.
             solver: The inner solver.
             work: The workspace, with the motion of the whole step.
+            meter: Measures strain.
             substeps: Numbers to choose from, each at least 2, sorted; one alone is taken by every step that collides.
 
         Raises:
             RuntimeError: If the state of the inner solver cannot be restored, see :mod:`warp_bsc._private_names`.
         """
         self._choices, self._chooses = substeps, len(substeps) > 1
-        self._step, self._solver = step, solver
+        self._step, self._solver, self._meter = step, solver, meter
         self._mesh, self._motion, self._work = work.mesh, work.motion, work
-        self._moves_bodies, self._may_allocate = work.motion.moves_bodies, may_allocate(solver)
+        self._moves_bodies, self.may_allocate = work.motion.moves_bodies, may_allocate(solver)
         self._substep = ModelMotion(work.mesh, work.motion.friction, moves_bodies=self._moves_bodies)
         model, device, worlds = work.mesh.model, work.device, work.worlds
         self._start, self._in, self._out = model.state(), model.state(), model.state()
@@ -100,24 +109,25 @@ class Substeps:
         self._number = wp.zeros(worlds, dtype=int, device=device)  # of substeps, by world
         self._needs_whole_step = wp.zeros(1, dtype=int, device=device)
         self._has_constraints = wp.zeros(worlds, dtype=int, device=device)
-        self._strain = wp.zeros(worlds, dtype=float, device=device)
+        self.strain = self._strain = wp.zeros(1, dtype=float, device=device)
         self._is_pending = wp.zeros(worlds, dtype=int, device=device)  # 1 while a world has substeps to take
         self._takes_substeps = wp.zeros(worlds, dtype=int, device=device)
         self._is_fast = wp.zeros(worlds, dtype=int, device=device)  # as in SolveStatus, of the predicted motion
         self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
         self._remaining = wp.zeros(1, dtype=int, device=device)  # substeps
         if self._chooses:
-            edges, lengths, is_solid = edges_at_rest(model)
-            columns = (edges, wp.vec2i), (lengths, float), (is_solid, bool)
-            self._edges = [wp.array(values, dtype=dtype, device=device) for values, dtype in columns]
-            self._final_strain = wp.zeros(worlds, dtype=float, device=device)
+            self._strain, self._final_strain = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
+            self._calm = wp.zeros(worlds, dtype=int, device=device)  # steps with fewer
+            self._patience = wp.full(worlds, int(CALM_STEPS), dtype=int, device=device)
+            self._motion.carried += [self._number, self._calm, self._patience]
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
             self._passes = wp.zeros(1, dtype=int, device=device)
             self._repeats = wp.zeros(1, dtype=int, device=device)
             self._must_choose = wp.zeros(1, dtype=int, device=device)
-            self.strain = wp.zeros(1, dtype=float, device=device)
-        self._extrapolates = self._chooses and not model.body_count and not self._may_allocate
+        # a program may move bodies, or what it likes, within a step of the inner solver that is not Newton's own
+        moves_alone = not model.body_count and not self.may_allocate and "step" not in attributes_of(solver)
+        self._extrapolates = self._chooses and moves_alone
         self._arrays_of_solver()
 
     def begin(self, state: newton.State) -> None:
@@ -125,7 +135,7 @@ class Substeps:
         self._start.assign(state)
         if self._chooses:
             self._needs_whole_step.zero_()
-            inputs = [self._motion.vertices.interrupted, self._number]
+            inputs = [self._motion.vertices.interrupted, self._number, self._calm, self._patience]
             self._work.launch(kernels.begin_step, self._work.worlds, inputs, [self._needs_whole_step])
 
     def take_whole_step(self, *arguments, **options) -> None:
@@ -159,22 +169,15 @@ class Substeps:
             contacts: As for the inner solver.
             dt: Length of the step [s].
 
-        Raises:
-            NotImplementedError: If the number of substeps is to be chosen in a CUDA graph, and the inner solver may
-                allocate memory.
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
         work.motion = self._motion  # also after an error in a substep
-        if self._chooses and in_graph and self._may_allocate:
-            solver = type(self._solver).__name__
-            raise NotImplementedError(
-                f"substeps='auto' cannot be captured with {solver}, whose steps may allocate memory; give a number"
-            )
         if self._extrapolates:
             model, start = work.mesh.model, self._start
             inputs = [arrays_of(start), start.particle_f, model.particle_world, model.gravity, dt, self._number]
             outputs = [self._motion.vertices, arrays_of(state)]
             work.launch(kernels.extrapolate, model.particle_count, inputs, outputs)
+        self.strain.zero_()
         find_contacts(work)
         self._has_constraints.zero_()
         work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
@@ -184,7 +187,7 @@ class Substeps:
             inputs = [self._has_constraints, self._choices[0], work.status]
             work.launch(kernels.use_substeps, work.worlds, inputs, [self._number, self.substeps])
         step = _Step(state, control, contacts, dt, self._arrays_of_solver())
-        if in_graph and self._may_allocate:
+        if in_graph and self.may_allocate:
             self._take_substeps(step)
         else:
             wp.capture_if(self.substeps, self._take_substeps, step=step)
@@ -192,7 +195,7 @@ class Substeps:
     def _choose(self, dt):
         """Chooses the substeps of each world: the predicted ones, or those that follow from a resolved whole step."""
         work = self._work
-        for array in (self.substeps, self._is_chosen, self._must_choose, self._strain, self._final_strain, self.strain):
+        for array in (self.substeps, self._is_chosen, self._must_choose, self._strain, self._final_strain):
             array.zero_()
         inputs = [work.step, self._has_constraints, self._extrapolates, self._device_choices, work.status, self._number]
         outputs = [self._is_chosen, self.substeps, self._must_choose]
@@ -203,15 +206,12 @@ class Substeps:
         """Resolves the motion, chooses substeps by its strain, and if there are any, detects its contacts again."""
         work = self._work
         resolve_contacts(work, dt)
-        self._measure_strain(self._motion, self._strain)
-        inputs = [self._strain, self._has_constraints, self._device_choices, work.status, self._number]
+        self._meter.measure(self._motion.vertices, self._strain)
+        inputs = [self._strain, self._has_constraints, self._device_choices, work.status]
+        inputs += [self._number, self._calm, self._patience]
         outputs = [self._is_chosen, self.substeps, self.strain]
         work.launch(choose_substeps, work.worlds, inputs, outputs)
         wp.capture_if(self.substeps, self._find_contacts_again)
-
-    def _measure_strain(self, motion, strain):
-        inputs = [motion.vertices, self._work.vertices.x1, *self._edges]
-        self._work.launch(measure_strain, len(self._edges[0]), inputs, [strain])
 
     def _find_contacts_again(self):
         work = self._work
@@ -232,10 +232,11 @@ class Substeps:
             self._repeats.fill_(1)
             wp.capture_while(self._repeats, self._take_chosen_numbers, step=step)
             inputs = [self._strain, self._final_strain, self._device_choices]
-            work.launch(predict_substeps, work.worlds, inputs, [self._number])
+            work.launch(predict_substeps, work.worlds, inputs, [self._number, self._calm, self._patience])
         else:
             self._take_number_of_substeps(self._choices[0], step)
             self._finish(step.dt)
+            self._meter.measure(self._motion.vertices, self.strain)
 
     def _take_chosen_numbers(self, step):
         """Takes the substeps of all worlds that have still to, and decides which worlds repeat theirs."""
@@ -247,7 +248,7 @@ class Substeps:
         self._finish(step.dt)
         for array in (self._final_strain, self._is_chosen, self._repeats):
             array.zero_()
-        self._measure_strain(self._motion, self._final_strain)
+        self._meter.measure(self._motion.vertices, self._final_strain)
         inputs = [self._strain, self._final_strain, self._device_choices, self._passes, self._number]
         outputs = [self._is_pending, self._is_chosen, self.substeps, self._repeats, self.strain]
         work.launch(review_substeps, work.worlds, inputs, outputs)
@@ -266,7 +267,7 @@ class Substeps:
         if poses is not None:
             wp.copy(poses, self._start.body_q)
         with iterations_shared(self._solver, substeps, SUBSTEP_ITERATIONS):
-            if mesh.device.is_capturing and self._may_allocate:
+            if mesh.device.is_capturing and self.may_allocate:
                 for _ in range(substeps):
                     self._take_substep(substeps, step)
             else:
@@ -306,8 +307,7 @@ class Substeps:
         work.launch_over_constraints(kernels.reset_constraints, *inputs)
         positions.update(work, last=True)
         positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
-        if self._chooses:
-            self._measure_strain(substep, self._strain)
+        self._meter.measure(substep.vertices, self._strain)
         velocities.project(work, substep_dt)
         start.assign(self._start)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
@@ -324,3 +324,24 @@ class Substeps:
         inputs = [work.step, self._detected, self._is_fast, work.status]
         work.launch(kernels.restore_detection, work.worlds, inputs)
         resolve_contacts(work, dt)
+
+
+def reason_to_omit_substeps(solver: SolverBase) -> str | None:
+    """Returns why ``"auto"`` takes no substeps behind a solver; None if it can."""
+    if solver.model.requires_grad:
+        return "the model requires gradients"
+    if isinstance(solver, SolverSemiImplicit):
+        return "SolverSemiImplicit is explicit, its steps are small"
+    try:
+        attributes = attributes_of(solver).values()
+    except RuntimeError as error:
+        return str(error)
+    if any(map(_holds_solver, attributes)):
+        return f"{type(solver).__name__} steps other solvers, whose state cannot be restored"
+    return None
+
+
+def _holds_solver(value):
+    """Returns whether a value is a solver, or a collection of solvers or of entries with one."""
+    values = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else [value]
+    return any(isinstance(x, SolverBase) or isinstance(getattr(x, "solver", None), SolverBase) for x in values)
