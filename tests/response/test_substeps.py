@@ -1,5 +1,7 @@
 """Coupled steps: the inner solver takes substeps against the contacts, and nothing else of a step changes."""
 
+import warnings
+
 import newton
 import numpy as np
 import pytest
@@ -452,9 +454,13 @@ def test_a_solver_that_allocates_is_captured_too(device):
     assert rollout.solver.report.totals.steps == 7 and rollout.solver.report.totals.substepped_steps > 1
     assert rollout.solver.report.totals.uncertified_steps == 0
     if device.is_cuda:  # a graph of the CPU knows what to leave out
-        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps="auto")
-        with pytest.raises(NotImplementedError, match="captured with SolverXPBD"), wp.ScopedCapture(device):
+        chooses = bsc.SolverCCD(SOLVERS["xpbd"](model))
+        chooses.step(start, end, rollout.control, None, DT)
+        assert chooses.report.substeps_omitted is None
+        with wp.ScopedCapture(device) as capture:
             chooses.step(start, end, rollout.control, None, DT)
+        wp.capture_launch(capture.graph)
+        assert "may allocate memory" in chooses.report.substeps_omitted and chooses.report.substeps == 0
 
 
 def test_what_cannot_take_substeps_is_refused(device):
@@ -561,3 +567,47 @@ def test_friction_holds_and_slides_as_without_substeps(device):
         slid = (rollout.positions.mean(axis=0) - start) @ down
         expected = 0.5 * 9.81 * max(0.0, np.sin(angle) - friction * np.cos(angle)) * time**2
         assert abs(slid - expected) < 0.03 * expected + 1.5e-3
+
+
+def test_the_report_says_where_auto_takes_none(device):
+    """The default takes substeps behind solvers that can be restored, and none elsewhere."""
+    model, builder = bullet(20.0, device=device), newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
+    differentiable = builder.finalize(device=device, requires_grad=True)
+
+    class Outer(newton.solvers.SolverBase):
+        def __init__(self, inner):
+            super().__init__(inner.model)
+            self.entries = [inner]
+
+    for inner, expected in (
+        (SOLVERS["vbd"](model), None),
+        (SOLVERS["xpbd"](model), None),
+        (SOLVERS["semi_implicit"](model), "explicit"),
+        (SOLVERS["semi_implicit"](differentiable), "requires gradients"),
+        (Outer(SOLVERS["vbd"](model)), "Outer steps other solvers"),
+    ):
+        omitted = bsc.SolverCCD(inner).report.substeps_omitted
+        assert omitted is None if expected is None else expected in omitted
+
+
+def test_strain_is_reported_and_warned_of_once(device):
+    """A patch at 20 m/s stretches a sheet far in a step as a whole; substeps do not, and nobody warns of them."""
+    for substeps in (None, "auto"):
+        model = bullet(20.0, device=device)
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            strains = []
+            for _ in range(8):
+                rollout.step()
+                strains.append(rollout.solver.report.strain)
+                assert rollout.solver.report.certified
+        of_strain = [str(warning.message) for warning in caught if "strained an edge" in str(warning.message)]
+        strained = rollout.solver.report.totals.strained_steps
+        assert strained == np.count_nonzero(np.array(strains) > 0.2)
+        assert len(of_strain) == min(strained, 1)
+        if substeps is None:
+            assert strained > 0 and "substeps='auto'" in of_strain[0]
+        else:
+            assert max(strains) < 0.2

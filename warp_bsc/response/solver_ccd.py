@@ -70,8 +70,8 @@ class SolverCCD(CollisionStage):
     put a new one behind a solver of the same model.
 
     Limitations:
-        The stage follows the inner solver, which does not see the contacts: steps must be taken in ``substeps``, or be
-        short against the time of sound through an element.
+        The stage follows the inner solver, which does not see the contacts. Without ``substeps``, steps must be short
+        against the time of sound through an element. A step that begins in substeps takes them also if nothing touches.
 
     Attributes:
         solver: The inner solver, or the contact layer around it.
@@ -110,11 +110,14 @@ class SolverCCD(CollisionStage):
                 shapes, as with ``requires_grad``. Negative values count as 0.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
-            substeps: Substeps in which the inner solver repeats a step that collides, 2 to 1024, so that it reacts to
-                the contacts, see :mod:`.substeps.substeps`; None for none. With ``"auto"``, a step whose contacts
-                strain cloth or soft bodies by more than 1% is repeated in up to 32 substeps. The stage then resolves
-                contacts of particles with shapes alone, also if ``contacts`` are passed to :meth:`step`: cloth rests at
-                the shape, or with ``particle_radius`` at that distance.
+            substeps: Substeps of the inner solver in a step that collides, so that it reacts to the contacts, see
+                :mod:`.substeps.substeps`: ``"auto"``, 2 to 1024, or None for none. With ``"auto"``, a step whose
+                contacts strain cloth, soft bodies or springs by more than 1% is taken in 2 to 32 substeps, and the next
+                ones are while they need it. It takes none where gradients are asked for, in coupled solvers, and in
+                CUDA graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. In steps that may
+                have substeps, the stage resolves contacts of particles with shapes alone, also if ``contacts`` are
+                passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that distance. If
+                contacts strain an edge by more than 20% in a step, or a substep, the stage warns once.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
@@ -148,7 +151,7 @@ class SolverCCD(CollisionStage):
             TypeError: If an argument has another type.
             ValueError: If a number, or the friction of a shape that collides with particles, is out of range.
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`, or
-                if ``substeps`` are given with ``requires_grad`` or behind a contact layer.
+                if a number of ``substeps`` is given with ``requires_grad`` or behind a contact layer.
         """
         super().__init__(solver)
         options = StageOptions.of(
@@ -222,7 +225,7 @@ class SolverCCD(CollisionStage):
         if self.substeps == "auto":
             if self._coupled is not None:
                 self.report.substeps_omitted = "a coupled solver steps the stage"
-            elif self.mesh.device.is_capturing and inner.may_allocate:
+            elif self.mesh.device.is_cuda and self.mesh.device.is_capturing and inner.may_allocate:
                 self.report.substeps_omitted = f"{type(self.solver).__name__} may allocate memory, in a graph"
         return self.report.substeps_omitted is None
 

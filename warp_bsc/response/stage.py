@@ -64,8 +64,8 @@ class CollisionStage(CouplingHooks):
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver. With ``substeps``, it gets only those that the stage does not resolve,
-                see :mod:`.substeps.inner_contacts`.
+            contacts: As for the inner solver. In steps that may have substeps, it gets only those that the stage does
+                not resolve, see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
             options: As for the inner solver.
 
@@ -73,9 +73,7 @@ class CollisionStage(CouplingHooks):
             TypeError: If ``dt`` is no number.
             ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
                 ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance, or if
-                ``substeps="auto"`` is captured in a CUDA graph behind a solver that may allocate memory, such as
-                ``SolverXPBD``.
+            NotImplementedError: If a tape records gradients of a response that keeps a distance.
             RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
                 recorded no step outside one before.
         """

@@ -5,10 +5,16 @@ therefore begins with positions and velocities that include the contacts, and pu
 step only. The stretch between solver and contacts falls with the length of the substep. Contacts are detected once,
 before the substeps; the motion of the whole step is detected and certified after them.
 
-With ``"auto"``, a step is resolved without substeps first. Only if contacts strain an element by more than ``STRAIN``
-against the prediction of the inner solver, it is repeated, in the smallest number of ``SUBSTEPS`` that brings the
-strain below, if that is in proportion to the length of a substep. The number follows from the step alone, not from
-those before.
+With ``"auto"``, a world takes whole steps first. If contacts strain an element by more than ``STRAIN`` against the
+prediction of the inner solver, the step is repeated, in the smallest number of ``SUBSTEPS`` that brings the strain
+below, if that is in proportion to the length of a substep. The next step begins in substeps, as many as the strain of
+these asks for; without bodies, behind a solver that only moves particles, it takes no whole step before them, and the
+contacts are those of particles that fly on. If substeps turn out to be too few, or if contacts that they did not know
+strain an element after them, the step is repeated with more, or with these contacts too.
+
+Substeps share the iterations of VBD and Style3D, each with at least ``SUBSTEP_ITERATIONS``: many substeps of few
+iterations converge better than few of many (Macklin et al. 2019). A substep begins with the position multipliers of the
+one before.
 
 Contacts that a program passes on are shared out before the step, see :mod:`.substeps.inner_contacts`: whole steps and
 substeps get the same ones. Those between bodies were found at the start of the step, and remain for all substeps.
@@ -55,15 +61,15 @@ class Substeps:
     the inner solver are restored after the substeps, so that histories and clocks advance once a step. Options of a
     step, such as observables, are those of the whole step.
 
-    The inner solver determines what a substep is. VBD and Style3D make all their iterations in each, on the forces of a
-    shorter step. XPBD does the same, its multipliers start anew in each substep, with the compliance of its length: it
+    The inner solver determines what a substep is. VBD and Style3D solve the forces of a shorter step. XPBD makes all its
+    iterations in each, its multipliers start anew in each substep, with the compliance of its length: it
     is XPBD in small steps, which stays stable where long ones diverge. An explicit solver (``SolverSemiImplicit``)
     needs no substeps: it is stable only at steps in which contacts strain elements little. A given number of substeps
     is taken all the same, and ``"auto"`` takes none.
 
     Limitations:
         In a CUDA graph, a step that allocates memory, such as that of ``SolverXPBD``, cannot be left out where nothing
-        touches. The substeps then cost their time in each step, and ``"auto"`` raises. Only ``SolverVBD`` itself and,
+        touches. The substeps then cost their time in each step, and ``"auto"`` takes none. Only ``SolverVBD`` itself and,
         on a CPU, ``SolverStyle3D`` are known not to allocate, see
         :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in
         place, and not by assignment, are not restored.
