@@ -260,10 +260,16 @@ def decide(
     loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
 
 
-@wp.kernel
-def start_sweeps(status: SolveStatus):
+@wp.func
+def begin_sweeps(status: SolveStatus):
     """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
     loop = status.loop
     loop[Loop.SWEEP] = 0
     loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)
     loop[Loop.PROJECTING] = 0
+
+
+@wp.kernel
+def start_sweeps(status: SolveStatus):
+    """Launches :func:`begin_sweeps`."""
+    begin_sweeps(status)

@@ -122,5 +122,7 @@ ITERATIONS_RESERVED = 3
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
 MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
+BLOCK, MAX_PARTICLES_OF_BLOCK = 256, 4096
+"""Threads of the block that makes all sweeps of a small scene on a GPU, and its most particles."""
 BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""

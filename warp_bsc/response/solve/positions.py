@@ -3,7 +3,18 @@
 import warp as wp
 
 from ..contacts.constraints import gap, min_distance_of, moves_body
-from ..schedule import Loop, SolveStatus, is_dividing, is_projecting, is_reversible, start_sweeps
+from ..schedule import (
+    MAX_SWEEPS,
+    SWEEPS_PER_BATCH,
+    Loop,
+    SolveStatus,
+    begin_sweeps,
+    is_dividing,
+    is_projecting,
+    is_reversible,
+    start_sweeps,
+)
+from ..state.block import synchronize_block
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import PROJECTED, ContactKind, Pace, Step
@@ -16,18 +27,15 @@ from .bodies import move_bodies, place_vertices
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64):
-    """Fills the active set for positions: constraints that are violated, and those that may pull something back.
+@wp.func
+def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, i: int):
+    """Adds a constraint to the active set for positions, if it is violated, or may pull something back.
 
     Constraints met within the tolerance cost nothing, and move nothing. Nor do edges at rest near each other where
     planes divide them afterwards, unless they are too near: a stack has four times as many as of vertices and faces,
     which hold it as well.
     """
-    i = wp.tid()
     motion, constraints = step.motion, step.constraints
-    if i >= constraints.count[0]:
-        return
     corners = constraints.vertices[i]
     world = motion.world[corners[0]]
     resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
@@ -63,12 +71,17 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
 
 
 @wp.kernel
-def project_positions(step: Step, status: SolveStatus, record: StepRecord):
-    """Updates the position multipliers of the active set, in one Jacobi sweep."""
-    place = wp.tid()
+def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64):
+    """Fills the active set for positions."""
+    i = wp.tid()
+    if i < step.constraints.count[0]:
+        _activate_constraint(step, status, tolerance, i)
+
+
+@wp.func
+def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, place: int):
+    """Updates the position multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
-    if wp.int64(place) >= constraints.active_count[0]:
-        return
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
     momentum = sweeps.momentum_of(step, status, i, status.slow_position_sweeps)
@@ -82,6 +95,14 @@ def project_positions(step: Step, status: SolveStatus, record: StepRecord):
     sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
+@wp.kernel
+def project_positions(step: Step, status: SolveStatus, record: StepRecord):
+    """Updates the position multipliers of the active set, in one Jacobi sweep."""
+    place = wp.tid()
+    if wp.int64(place) < step.constraints.active_count[0]:
+        _project_constraint(step, status, record, place)
+
+
 @wp.func
 def move_vertex(step: Step, vertex: int) -> bool:
     """Moves a vertex by the sum of its changes by constraints, if it can be moved; returns whether it can."""
@@ -91,22 +112,83 @@ def move_vertex(step: Step, vertex: int) -> bool:
     return moves
 
 
-@wp.kernel
-def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: bool):
-    """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
-    vertex = wp.tid()
+@wp.func
+def _update_vertex(step: Step, status: SolveStatus, record: StepRecord, last: bool, vertex: int):
+    """Moves a vertex by the sum of what its constraints did to it; the first one finishes the sweep."""
     vertices = step.vertices
     if sweeps.finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
         vertices.changed[vertex] = 1
         vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
 
 
-def project(work: Workspace, tolerance: float = 1.0) -> None:
+@wp.kernel
+def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: bool):
+    """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
+    _update_vertex(step, status, record, last, wp.tid())
+
+
+@wp.kernel(module="unique")
+def _sweep(
+    step: Step,
+    status: SolveStatus,
+    record: StepRecord,
+    particle_count: int,
+    tolerance: wp.float64,
+    begins_moved: bool,
+    batches: int,
+    sweeps_per_batch: int,
+    threads: int,
+):
+    """Makes batches of sweeps in one launch, by a block of threads; each one needs the positions of the one before.
+
+    With ``begins_moved``, multipliers have moved vertices before the first sweep.
+    """
+    thread = wp.tid()
+    if begins_moved:
+        for vertex in range(thread, particle_count, threads):
+            _update_vertex(step, status, record, True, vertex)
+    synchronize_block()
+    if thread == 0:
+        begin_sweeps(status)
+    synchronize_block()
+    more = status.loop[Loop.MORE_SWEEPS]
+    batch = int(0)
+    while more == 1 and batch < batches:
+        for i in range(thread, wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
+            _activate_constraint(step, status, tolerance, i)
+        synchronize_block()
+        count = int(step.constraints.active_count[0])
+        for sweep in range(sweeps_per_batch):
+            for place in range(thread, count, threads):
+                _project_constraint(step, status, record, place)
+            synchronize_block()
+            for vertex in range(thread, particle_count, threads):
+                _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
+            synchronize_block()
+        more = status.loop[Loop.MORE_SWEEPS]
+        batch += 1
+        synchronize_block()
+
+
+def project(work: Workspace, tolerance: float = 1.0, *, begins_moved: bool = False) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met.
 
-    The tolerance is a share of that of a whole step.
+    Args:
+        work: The workspace.
+        tolerance: Share of the tolerance of a whole step.
+        begins_moved: Whether the constraints begin with multipliers, whose sums have still to move vertices and bodies.
     """
-    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, update)
+    if work.sweeps_in_one_launch:
+        _launch_sweeps(work, tolerance, begins_moved, int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH), int(SWEEPS_PER_BATCH))
+        return
+    if begins_moved:
+        _update(work, last=True)
+    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
+
+
+def _launch_sweeps(work, tolerance, begins_moved, batches, sweeps_per_batch):
+    inputs = [work.step, work.status, work.record, max(1, work.particle_count), tolerance * work.tolerance]
+    work.launch_block(_sweep, [*inputs, begins_moved, batches, sweeps_per_batch])
 
 
 def leave_planes(work: Workspace) -> None:
@@ -115,16 +197,18 @@ def leave_planes(work: Workspace) -> None:
 
 
 def _leave_planes(work):
+    if work.sweeps_in_one_launch:
+        _launch_sweeps(work, 1.0, False, 1, 1)
+        return
     work.launch(start_sweeps, 1, [work.status])
-    work.sweep(1, lambda: _activate(work, 1.0), project_positions, update)
+    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
 
 
 def _activate(work, tolerance):
     work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
 
 
-def update(work: Workspace, last: bool) -> None:
-    """Moves vertices and bodies by the sums of what constraints did to them."""
+def _update(work, last):
     work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

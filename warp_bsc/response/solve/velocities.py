@@ -3,7 +3,8 @@
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..schedule import Loop, SolveStatus
+from ..schedule import SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
+from ..state.block import synchronize_block
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
@@ -17,16 +18,13 @@ from .bodies import activate_bodies, change_body_velocities, move_to_end, set_ve
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def initialize_velocity_multipliers(step: Step, dt: wp.float64):
-    """Initializes the velocity multipliers of all constraints that pushed, as if contacts had acted at their times.
+@wp.func
+def _initialize_multiplier(step: Step, dt: wp.float64, i: int):
+    """Initializes the velocity multiplier of a constraint, if it pushed, as if the contact had acted at its time.
 
     This conserves angular momentum, because the two sides of a contact meet in one point at that time only.
     """
-    i = wp.tid()
     vertices, constraints = step.vertices, step.constraints
-    if i >= constraints.count[0]:
-        return
     if has_pushed(step, i):
         impulse = sweeps.initial_velocity_multiplier(step, i, dt)
         constraints.velocity_multiplier[i] = impulse
@@ -40,12 +38,17 @@ def initialize_velocity_multipliers(step: Step, dt: wp.float64):
 
 
 @wp.kernel
-def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64):
-    """Fills the active set for velocities: constraints that pushed, whose contact points are still near each other."""
+def initialize_velocity_multipliers(step: Step, dt: wp.float64):
+    """Initializes the velocity multipliers of all constraints."""
     i = wp.tid()
+    if i < step.constraints.count[0]:
+        _initialize_multiplier(step, dt, i)
+
+
+@wp.func
+def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64, i: int):
+    """Adds a constraint to the active set, if it pushed, and its contact points are still near each other."""
     constraints = step.constraints
-    if i >= constraints.count[0]:
-        return
     if status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
         return
     multiplier = constraints.velocity_multiplier[i]
@@ -65,12 +68,17 @@ def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp
 
 
 @wp.kernel
-def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
-    """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
-    place = wp.tid()
+def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64):
+    """Fills the active set for velocities."""
+    i = wp.tid()
+    if i < step.constraints.count[0]:
+        _activate_constraint(step, status, tolerance, dt, i)
+
+
+@wp.func
+def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, place: int):
+    """Updates the velocity multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
-    if wp.int64(place) >= constraints.active_count[0]:
-        return
     i = constraints.active_set[place]
     momentum = sweeps.momentum_of(step, status, i, status.slow_velocity_sweeps)
     multiplier = sweeps.velocity_multiplier_after(step, i)
@@ -78,6 +86,14 @@ def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
     new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
     constraints.velocity_multiplier[i] = new
     sweeps.add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
+
+
+@wp.kernel
+def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
+    """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
+    place = wp.tid()
+    if wp.int64(place) < step.constraints.active_count[0]:
+        _project_constraint(step, status, record, place)
 
 
 @wp.func
@@ -90,12 +106,56 @@ def change_velocity(step: Step, vertex: int) -> bool:
     return is_free
 
 
+@wp.func
+def _update_vertex(step: Step, status: SolveStatus, record: StepRecord, last: bool, vertex: int):
+    """Changes the velocity of a vertex that was not truncated; the first one finishes the sweep."""
+    if sweeps.finish_sweep(step, status, record, last, vertex):
+        change_velocity(step, vertex)
+
+
 @wp.kernel
 def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
-    vertex = wp.tid()
-    if sweeps.finish_sweep(step, status, record, last, vertex):
-        change_velocity(step, vertex)
+    _update_vertex(step, status, record, last, wp.tid())
+
+
+@wp.kernel(module="unique")
+def _sweep(
+    step: Step,
+    status: SolveStatus,
+    record: StepRecord,
+    particle_count: int,
+    tolerance: wp.float64,
+    dt: wp.float64,
+    threads: int,
+):
+    """Initializes multipliers and makes all sweeps in one launch, like that of :mod:`.positions`."""
+    thread = wp.tid()
+    constraints = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    for i in range(thread, constraints, threads):
+        _initialize_multiplier(step, dt, i)
+    synchronize_block()
+    for vertex in range(thread, particle_count, threads):
+        _update_vertex(step, status, record, True, vertex)
+    synchronize_block()
+    if thread == 0:
+        begin_sweeps(status)
+    synchronize_block()
+    more = status.loop[Loop.MORE_SWEEPS]
+    while more == 1:
+        for i in range(thread, constraints, threads):
+            _activate_constraint(step, status, tolerance, dt, i)
+        synchronize_block()
+        count = int(step.constraints.active_count[0])
+        for sweep in range(SWEEPS_PER_BATCH):
+            for place in range(thread, count, threads):
+                _project_constraint(step, status, record, place)
+            synchronize_block()
+            for vertex in range(thread, particle_count, threads):
+                _update_vertex(step, status, record, sweep == SWEEPS_PER_BATCH - 1, vertex)
+            synchronize_block()
+        more = status.loop[Loop.MORE_SWEEPS]
+        synchronize_block()
 
 
 def project(work: Workspace, dt: float) -> None:
@@ -103,10 +163,14 @@ def project(work: Workspace, dt: float) -> None:
 
     Then restores angular momentum.
     """
-    work.launch_over_bodies(move_to_end)
-    work.launch_over_constraints(initialize_velocity_multipliers, dt)
-    _update(work, last=True)
-    work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
+    if work.sweeps_in_one_launch:
+        inputs = [work.step, work.status, work.record, max(1, work.particle_count), work.tolerance, dt]
+        work.launch_block(_sweep, inputs)
+    else:
+        work.launch_over_bodies(move_to_end)
+        work.launch_over_constraints(initialize_velocity_multipliers, dt)
+        _update(work, last=True)
+        work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 

@@ -18,7 +18,16 @@ from ..schedule import (
     single_elements,
     start_sweeps,
 )
-from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
+from ..tuning import (
+    BLOCK,
+    BLOCKS,
+    DIVIDING_PLANES,
+    ITERATIONS_RESERVED,
+    MAX_PARTICLES_OF_BLOCK,
+    MIN_ENTRIES,
+    PAIRS_PER_FACE,
+    TOLERANCE,
+)
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -262,6 +271,20 @@ class Workspace:
         """Launches a kernel over the vertices of shapes, if bodies can be moved."""
         if self.body_count:
             self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
+
+    @property
+    def sweeps_in_one_launch(self) -> bool:
+        """Whether one block of threads makes all sweeps: of a GPU, if there are few particles; on a CPU, one thread.
+
+        To launch the sweeps of a small scene takes longer than they do.
+        """
+        is_small = self.device.is_cpu or self.particle_count <= MAX_PARTICLES_OF_BLOCK
+        return is_small and not self.body_count and self.recorder is None
+
+    def launch_block(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        """Launches a kernel on one block of threads, whose number is its last input."""
+        threads = 1 if self.device.is_cpu else BLOCK
+        wp.launch(kernel, threads, inputs=[*inputs, threads], device=self.device, block_dim=threads)
 
     def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.

@@ -61,16 +61,16 @@ class Substeps:
     the inner solver are restored after the substeps, so that histories and clocks advance once a step. Options of a
     step, such as observables, are those of the whole step.
 
-    The inner solver determines what a substep is. VBD and Style3D solve the forces of a shorter step. XPBD makes all its
-    iterations in each, its multipliers start anew in each substep, with the compliance of its length: it
-    is XPBD in small steps, which stays stable where long ones diverge. An explicit solver (``SolverSemiImplicit``)
+    The inner solver determines what a substep is. VBD and Style3D solve the forces of a shorter step. XPBD makes all
+    its iterations in each, and its multipliers start anew, with the compliance of its length: it is XPBD in small
+    steps, which stays stable where long ones diverge. An explicit solver (``SolverSemiImplicit``)
     needs no substeps: it is stable only at steps in which contacts strain elements little. A given number of substeps
     is taken all the same, and ``"auto"`` takes none.
 
     Limitations:
         In a CUDA graph, a step that allocates memory, such as that of ``SolverXPBD``, cannot be left out where nothing
-        touches. The substeps then cost their time in each step, and ``"auto"`` takes none. Only ``SolverVBD`` itself and,
-        on a CPU, ``SolverStyle3D`` are known not to allocate, see
+        touches. The substeps then cost their time in each step, and ``"auto"`` takes none. Only ``SolverVBD``
+        itself and, on a CPU, ``SolverStyle3D`` are known not to allocate, see
         :func:`warp_bsc._private_names.of_newton.may_allocate`. Python attributes that the inner solver changes in
         place, and not by assignment, are not restored.
 
@@ -311,8 +311,7 @@ class Substeps:
             detect_penetrations(work, ahead=True)
         inputs = [work.status, self._detected, self._remaining, substeps]
         work.launch_over_constraints(kernels.reset_constraints, *inputs)
-        positions.update(work, last=True)
-        positions.project(work, tolerance=1.0 / substeps)  # creep adds up over substeps
+        positions.project(work, 1.0 / substeps, begins_moved=True)  # creep adds up over substeps
         self._meter.measure(substep.vertices, self._strain)
         velocities.project(work, substep_dt)
         start.assign(self._start)
