@@ -94,6 +94,8 @@ SUBSTEP_ITERATIONS = 2
 """Fewest iterations of the inner solver in a substep."""
 SUBSTEP_STRAIN = wp.constant(1.5)
 """Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
+MAX_MISSED = wp.constant(20.0)
+"""Most strain after the substeps, as a multiple of that left to one, with which they are repeated."""
 KEPT = wp.constant(0.25)
 CALM_STEPS, MAX_CALM_STEPS = wp.constant(16), wp.constant(1024)
 """Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, at
@@ -122,7 +124,5 @@ ITERATIONS_RESERVED = 3
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
 MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
-BLOCK, MAX_PARTICLES_OF_BLOCK = 256, 4096
-"""Threads of the block that makes all sweeps of a small scene on a GPU, and its most particles."""
 BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""

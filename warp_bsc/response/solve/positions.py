@@ -14,7 +14,6 @@ from ..schedule import (
     is_reversible,
     start_sweeps,
 )
-from ..state.block import synchronize_block
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import PROJECTED, ContactKind, Pace, Step
@@ -137,37 +136,26 @@ def _sweep(
     begins_moved: bool,
     batches: int,
     sweeps_per_batch: int,
-    threads: int,
 ):
-    """Makes batches of sweeps in one launch, by a block of threads; each one needs the positions of the one before.
+    """Makes batches of sweeps, on one thread.
 
     With ``begins_moved``, multipliers have moved vertices before the first sweep.
     """
-    thread = wp.tid()
     if begins_moved:
-        for vertex in range(thread, particle_count, threads):
+        for vertex in range(particle_count):
             _update_vertex(step, status, record, True, vertex)
-    synchronize_block()
-    if thread == 0:
-        begin_sweeps(status)
-    synchronize_block()
-    more = status.loop[Loop.MORE_SWEEPS]
+    begin_sweeps(status)
     batch = int(0)
-    while more == 1 and batch < batches:
-        for i in range(thread, wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
+    while status.loop[Loop.MORE_SWEEPS] == 1 and batch < batches:
+        for i in range(step.constraints.count[0]):
             _activate_constraint(step, status, tolerance, i)
-        synchronize_block()
         count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
-            for place in range(thread, count, threads):
+            for place in range(count):
                 _project_constraint(step, status, record, place)
-            synchronize_block()
-            for vertex in range(thread, particle_count, threads):
+            for vertex in range(particle_count):
                 _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
-            synchronize_block()
-        more = status.loop[Loop.MORE_SWEEPS]
         batch += 1
-        synchronize_block()
 
 
 def project(work: Workspace, tolerance: float = 1.0, *, begins_moved: bool = False) -> None:
@@ -188,7 +176,7 @@ def project(work: Workspace, tolerance: float = 1.0, *, begins_moved: bool = Fal
 
 def _launch_sweeps(work, tolerance, begins_moved, batches, sweeps_per_batch):
     inputs = [work.step, work.status, work.record, max(1, work.particle_count), tolerance * work.tolerance]
-    work.launch_block(_sweep, [*inputs, begins_moved, batches, sweeps_per_batch])
+    work.launch(_sweep, 1, [*inputs, begins_moved, batches, sweeps_per_batch])
 
 
 def leave_planes(work: Workspace) -> None:

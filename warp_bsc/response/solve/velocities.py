@@ -4,7 +4,6 @@ import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
 from ..schedule import SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
-from ..state.block import synchronize_block
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
@@ -127,35 +126,23 @@ def _sweep(
     particle_count: int,
     tolerance: wp.float64,
     dt: wp.float64,
-    threads: int,
+    sweeps_per_batch: int,
 ):
-    """Initializes multipliers and makes all sweeps in one launch, like that of :mod:`.positions`."""
-    thread = wp.tid()
-    constraints = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
-    for i in range(thread, constraints, threads):
+    """Initializes multipliers and makes all sweeps, on one thread."""
+    for i in range(step.constraints.count[0]):
         _initialize_multiplier(step, dt, i)
-    synchronize_block()
-    for vertex in range(thread, particle_count, threads):
+    for vertex in range(particle_count):
         _update_vertex(step, status, record, True, vertex)
-    synchronize_block()
-    if thread == 0:
-        begin_sweeps(status)
-    synchronize_block()
-    more = status.loop[Loop.MORE_SWEEPS]
-    while more == 1:
-        for i in range(thread, constraints, threads):
+    begin_sweeps(status)
+    while status.loop[Loop.MORE_SWEEPS] == 1:
+        for i in range(step.constraints.count[0]):
             _activate_constraint(step, status, tolerance, dt, i)
-        synchronize_block()
         count = int(step.constraints.active_count[0])
-        for sweep in range(SWEEPS_PER_BATCH):
-            for place in range(thread, count, threads):
+        for sweep in range(sweeps_per_batch):
+            for place in range(count):
                 _project_constraint(step, status, record, place)
-            synchronize_block()
-            for vertex in range(thread, particle_count, threads):
-                _update_vertex(step, status, record, sweep == SWEEPS_PER_BATCH - 1, vertex)
-            synchronize_block()
-        more = status.loop[Loop.MORE_SWEEPS]
-        synchronize_block()
+            for vertex in range(particle_count):
+                _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
 
 
 def project(work: Workspace, dt: float) -> None:
@@ -165,7 +152,7 @@ def project(work: Workspace, dt: float) -> None:
     """
     if work.sweeps_in_one_launch:
         inputs = [work.step, work.status, work.record, max(1, work.particle_count), work.tolerance, dt]
-        work.launch_block(_sweep, inputs)
+        work.launch(_sweep, 1, [*inputs, int(SWEEPS_PER_BATCH)])
     else:
         work.launch_over_bodies(move_to_end)
         work.launch_over_constraints(initialize_velocity_multipliers, dt)

@@ -18,16 +18,7 @@ from ..schedule import (
     single_elements,
     start_sweeps,
 )
-from ..tuning import (
-    BLOCK,
-    BLOCKS,
-    DIVIDING_PLANES,
-    ITERATIONS_RESERVED,
-    MAX_PARTICLES_OF_BLOCK,
-    MIN_ENTRIES,
-    PAIRS_PER_FACE,
-    TOLERANCE,
-)
+from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -274,17 +265,8 @@ class Workspace:
 
     @property
     def sweeps_in_one_launch(self) -> bool:
-        """Whether one block of threads makes all sweeps: of a GPU, if there are few particles; on a CPU, one thread.
-
-        To launch the sweeps of a small scene takes longer than they do.
-        """
-        is_small = self.device.is_cpu or self.particle_count <= MAX_PARTICLES_OF_BLOCK
-        return is_small and not self.body_count and self.recorder is None
-
-    def launch_block(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel on one block of threads, whose number is its last input."""
-        threads = 1 if self.device.is_cpu else BLOCK
-        wp.launch(kernel, threads, inputs=[*inputs, threads], device=self.device, block_dim=threads)
+        """Whether all sweeps are one launch, on the CPU, where a thread makes them: most take less than a launch."""
+        return self.device.is_cpu and not self.body_count and self.recorder is None
 
     def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.

@@ -7,7 +7,7 @@ import warp as wp
 from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
 from ..state.workspace import Workspace
-from ..tuning import COMPRESSION, FREE_STEPS, KEPT, MAX_CALM_STEPS, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
+from ..tuning import COMPRESSION, FREE_STEPS, KEPT, MAX_CALM_STEPS, MAX_MISSED, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
 from .kernels import mark_choice
 
 wp.set_module_options({"enable_backward": False})
@@ -113,7 +113,8 @@ def review_substeps(
 ):
     """Repeats the substeps of worlds whose strain asks for twice as many; of others, predicts those of the next step.
 
-    So it does where contacts that the substeps did not know strain an element after them: they know these then.
+    So it does where contacts that the substeps did not know strain an element after them: they know these then. If they
+    strain it too far, what was found is not what is to be met, and elements would stick to it.
     """
     world = wp.tid()
     n = number[world]
@@ -123,7 +124,7 @@ def review_substeps(
     predicted = float(n) * strain[world] / (SUBSTEP_STRAIN * STRAIN)
     missed = final_strain[world] / STRAIN
     too_few = predicted > 2.0 * float(n) and n < choices[choices.shape[0] - 1]
-    if passes[0] <= MAX_REPEATS and (too_few or missed > 2.0):
+    if passes[0] <= MAX_REPEATS and (too_few or (missed > 2.0 and missed < MAX_MISSED)):
         number[world] = wp.max(n, _choice(choices, predicted))
         is_pending[world] = 1
         repeats[0] = 1
