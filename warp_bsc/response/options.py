@@ -57,7 +57,7 @@ class StageOptions:
         separation=None,
         friction=None,
         restitution=None,
-        substeps="auto",
+        substeps: int | Literal["auto"] | None = "auto",
         bodies="pushed",
         min_distance=None,
         particle_radius=None,

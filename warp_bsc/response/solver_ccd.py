@@ -189,14 +189,16 @@ class SolverCCD(CollisionStage):
         self._limited = inner if options.lift_speed_limit and has_speed_limit(inner) else None
         self.report.speed_limit_lifted = self._limited is not None
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self._in_substeps, self._omitted, self._meter = None, None, StrainMeter(self._work)
+        self._meter = StrainMeter(self._work)
+        self._substepping: tuple[Substeps, InnerContacts] | None = None
+        self._in_substeps: Substeps | None = None  # of the step in progress, if it may have some
         if self.substeps == "auto":
-            self._omitted = self.report.substeps_omitted = reason_to_omit_substeps(solver)
-        if self.substeps is not None and self._omitted is None:
-            self._shared_contacts = InnerContacts(mesh, moves_bodies=motion.moves_bodies)
+            self.report.substeps_omitted = reason_to_omit_substeps(solver)
+        if self.substeps is not None and self.report.substeps_omitted is None:
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            self._in_substeps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
-            self.report.last_substeps, self.report.last_strain = self._in_substeps.substeps, self._in_substeps.strain
+            substeps_of_steps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
+            self._substepping = substeps_of_steps, InnerContacts(mesh, moves_bodies=motion.moves_bodies)
+            self.report.last_substeps, self.report.last_strain = substeps_of_steps.substeps, substeps_of_steps.strain
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -209,28 +211,30 @@ class SolverCCD(CollisionStage):
             )
 
     def _begin_step(self, state, contacts):
-        self._inner_contacts = None
-        if not self._takes_substeps():
+        self._in_substeps, self._inner_contacts = None, None
+        if self._substepping is None:
             return contacts
-        self._in_substeps.begin(state)
-        self._inner_contacts = self._shared_contacts
-        external = has_external_rigid_solver(self.solver)
-        return self._inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
-
-    def _takes_substeps(self):
-        """Returns whether the step that begins may take substeps; the report says why not."""
-        inner, self.report.substeps_omitted = self._in_substeps, self._omitted
-        if inner is None:
-            return False
+        in_substeps, inner_contacts = self._substepping
         if self.substeps == "auto":
-            if self._coupled is not None:
-                self.report.substeps_omitted = "a coupled solver steps the stage"
-            elif self.mesh.device.is_cuda and self.mesh.device.is_capturing and inner.may_allocate:
-                self.report.substeps_omitted = f"{type(self.solver).__name__} may allocate memory, in a graph"
-        return self.report.substeps_omitted is None
+            self.report.substeps_omitted = self._reason_to_omit_substeps(in_substeps)
+            if self.report.substeps_omitted is not None:
+                return contacts
+        self._in_substeps, self._inner_contacts = in_substeps, inner_contacts
+        in_substeps.begin(state)
+        external = has_external_rigid_solver(self.solver)
+        return inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
+
+    def _reason_to_omit_substeps(self, in_substeps):
+        """Returns why ``"auto"`` takes no substeps in the step that begins; None if it may."""
+        device = self.mesh.device
+        if self._coupled is not None:
+            return "a coupled solver steps the stage"
+        if device.is_cuda and device.is_capturing and in_substeps.may_allocate:
+            return f"{type(self.solver).__name__} may allocate memory, in a graph"
+        return None
 
     def _step_inner(self, *arguments, **options):
-        if self._inner_contacts is None:
+        if self._in_substeps is None:
             self._step_solver(*arguments, **options)
         else:
             self._in_substeps.take_whole_step(*arguments, **options)
@@ -239,13 +243,13 @@ class SolverCCD(CollisionStage):
         with contextlib.ExitStack() as stack:
             if self._limited is not None:
                 stack.enter_context(without_speed_limit(self._limited))
-            if self._inner_contacts is not None:
+            if self._in_substeps is not None:
                 stack.enter_context(without_own_contacts(self.solver))
             self.solver.step(*arguments, **options)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)
-        if self._inner_contacts is not None:
+        if self._in_substeps is not None and self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
             run_on_host(lambda: self._resolve(end, dt, solve), device)
@@ -295,7 +299,7 @@ class SolverCCD(CollisionStage):
                 self._motion.friction.read()
             self._motion.set_end(end, dt)
             solve()
-            if self._inner_contacts is None:
+            if self._in_substeps is None:
                 self.report.last_strain.zero_()
                 measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                 wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
