@@ -9,7 +9,8 @@ import warp as wp
 from newton_scenes import DT, SOFT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.substeps.strain import edges_at_rest
+from warp_bsc.response.substeps.strain import edges_at_rest, predict_substeps
+from warp_bsc.response.tuning import STRAIN, SUBSTEP_STRAIN
 
 
 def drape(device):
@@ -611,3 +612,25 @@ def test_strain_is_reported_and_warned_of_once(device):
             assert strained > 0 and "substeps='auto'" in of_strain[0]
         else:
             assert max(strains) < 0.2
+
+
+def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
+    """Half as many after 16 calm steps; after 32, if the next ones had to take more again."""
+    number, calm, patience = (wp.full(1, n, dtype=int, device=device) for n in (8, 0, 16))
+    choices, nothing = wp.array([2, 4, 8, 16, 32], dtype=int, device=device), wp.zeros(1, dtype=float, device=device)
+
+    def steps(count, needed):
+        """Takes steps whose strain asks for a number of substeps, and returns those of the last."""
+        for _ in range(count):
+            n = max(1, int(number.numpy()[0]))
+            strain = wp.full(1, needed * float(SUBSTEP_STRAIN * STRAIN) / n, dtype=float, device=device)
+            arrays = [strain, nothing, choices, number, calm, patience]
+            wp.launch(predict_substeps, 1, inputs=arrays, device=device)
+        return int(number.numpy()[0])
+
+    assert steps(15, 1.0) == 8 and steps(2, 1.0) == 4
+    assert steps(1, 7.0) == 8  # too soon
+    assert steps(30, 1.0) == 8 and steps(3, 1.0) == 4
+    assert steps(1, 31.0) == 32
+    assert steps(100, 9.0) == 32  # more than a quarter
+    assert steps(200, 0.0) == 0
