@@ -347,7 +347,7 @@ def lowest_vertex(rollout, state):
 def test_the_ground_stops_a_box_if_asked(tilt, device):
     model = box_above_ground(device, tilt=tilt, velocity=(0.5, 0.0, -4.0 * tilt))
     rollout = Rollout(model, bsc.SolverCCD(free(model), bodies="separated", friction=0.5))
-    for _ in range(90):
+    for _ in range(150):
         rollout.step()
         assert rollout.solver.report.certified and lowest_vertex(rollout, rollout.states[0]) > 0.0
     assert rollout.solver.report.totals.truncated_steps == 0
