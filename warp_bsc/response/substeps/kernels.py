@@ -28,9 +28,19 @@ def begin_step(
     patience: wp.array[int],
     # out
     needs_whole_step: wp.array[int],
+    strain: wp.array[float],
+    final_strain: wp.array[float],
+    is_chosen: wp.array[int],
+    must_choose: wp.array[int],
 ):
-    """Forgets the predicted substeps of worlds that were interrupted; says whether a world has none."""
+    """Forgets the predicted substeps of worlds that were interrupted; says whether a world has none. Clears others."""
     world = wp.tid()
+    strain[world] = 0.0
+    final_strain[world] = 0.0
+    if world == 0:
+        must_choose[0] = 0
+        for i in range(is_chosen.shape[0]):
+            is_chosen[i] = 0
     if interrupted[world] == 1:
         number[world] = 0
         calm[world] = 0

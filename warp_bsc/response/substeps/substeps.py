@@ -142,7 +142,8 @@ class Substeps:
         if self._chooses:
             self._needs_whole_step.zero_()
             inputs = [self._motion.vertices.interrupted, self._number, self._calm, self._patience]
-            self._work.launch(kernels.begin_step, self._work.worlds, inputs, [self._needs_whole_step])
+            outputs = [self._needs_whole_step, self._strain, self._final_strain, self._is_chosen, self._must_choose]
+            self._work.launch(kernels.begin_step, self._work.worlds, inputs, outputs)
 
     def take_whole_step(self, *arguments, **options) -> None:
         """Steps the inner solver, with its arguments, unless all worlds have predicted substeps, and need no more."""
@@ -201,8 +202,7 @@ class Substeps:
     def _choose(self, dt):
         """Chooses the substeps of each world: the predicted ones, or those that follow from a resolved whole step."""
         work = self._work
-        for array in (self.substeps, self._is_chosen, self._must_choose, self._strain, self._final_strain):
-            array.zero_()
+        self.substeps.zero_()
         inputs = [work.step, self._has_constraints, self._extrapolates, self._device_choices, work.status, self._number]
         outputs = [self._is_chosen, self.substeps, self._must_choose]
         work.launch(kernels.use_predicted_substeps, work.worlds, inputs, outputs)
