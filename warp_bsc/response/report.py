@@ -114,7 +114,7 @@ class SolverReport:
         wp.copy(self._strained, self.device_totals.strained_steps)
 
     def warn_if_strained(self) -> None:
-        """Warns once after a step whose :attr:`strain` is more than 0.2, as far as the host knows; does not wait."""
+        """Warns once after a step whose :attr:`strain` is more than 0.2, as the host knows it; waits only to warn."""
         if self._has_warned or not self._strained.numpy()[0]:
             return
         self._has_warned = True

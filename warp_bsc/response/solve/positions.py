@@ -147,7 +147,7 @@ def _sweep(
     begin_sweeps(status)
     batch = int(0)
     while status.loop[Loop.MORE_SWEEPS] == 1 and batch < batches:
-        for i in range(step.constraints.count[0]):
+        for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
             _activate_constraint(step, status, tolerance, i)
         count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):

@@ -129,13 +129,13 @@ def _sweep(
     sweeps_per_batch: int,
 ):
     """Initializes multipliers and makes all sweeps, on one thread."""
-    for i in range(step.constraints.count[0]):
+    for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
         _initialize_multiplier(step, dt, i)
     for vertex in range(particle_count):
         _update_vertex(step, status, record, True, vertex)
     begin_sweeps(status)
     while status.loop[Loop.MORE_SWEEPS] == 1:
-        for i in range(step.constraints.count[0]):
+        for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
             _activate_constraint(step, status, tolerance, dt, i)
         count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):

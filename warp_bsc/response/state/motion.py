@@ -179,7 +179,6 @@ class ModelMotion:
         mesh: The mesh.
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
-        carried: Other arrays that a step takes over from the last one.
         keeps_poses: Whether ``vertices.bodies`` has the poses of bodies at the start and end: if the response can move
             bodies, or if the model requires gradients.
     """
@@ -194,7 +193,6 @@ class ModelMotion:
         add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
         add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
         self._last: wp.array[wp.vec3] | None = None
-        self.carried: list[wp.array] = []
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction = friction.vertices
         if mesh.distances is not None:
@@ -266,7 +264,7 @@ class ModelMotion:
 
     def starts(self) -> list[wp.array]:
         """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
-        arrays = [self.vertices.interrupted, *self.carried]
+        arrays: list[wp.array] = [self.vertices.interrupted]
         return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
     def set_start(self, start: StateArrays) -> None:

@@ -111,7 +111,7 @@ def review_substeps(
     repeats: wp.array[int],
     largest: wp.array[float],
 ):
-    """Repeats the substeps of worlds whose strain asks for twice as many; of others, predicts those of the next step.
+    """Repeats the substeps of worlds whose strain asks for more than twice as many.
 
     So it does where contacts that the substeps did not know strain an element after them: they know these then. If they
     strain it too far, what was found is not what is to be met, and elements would stick to it.
@@ -121,7 +121,7 @@ def review_substeps(
     is_pending[world] = 0
     if n == 0:
         return
-    predicted = float(n) * strain[world] / (SUBSTEP_STRAIN * STRAIN)
+    predicted = _predicted(n, strain[world])
     missed = final_strain[world] / STRAIN
     too_few = predicted > 2.0 * float(n) and n < choices[choices.shape[0] - 1]
     if passes[0] <= MAX_REPEATS and (too_few or (missed > 2.0 and missed < MAX_MISSED)):
@@ -152,7 +152,7 @@ def predict_substeps(
     world = wp.tid()
     n = number[world]
     if n > 0:
-        predicted = wp.max(float(n) * strain[world] / SUBSTEP_STRAIN, final_strain[world]) / STRAIN
+        predicted = wp.max(_predicted(n, strain[world]), final_strain[world] / STRAIN)
         if predicted > float(n):
             number[world] = _choice(choices, predicted)
             _lose_calm(calm, patience, world)

@@ -125,7 +125,6 @@ class Substeps:
             self._strain, self._final_strain = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
             self._calm = wp.zeros(worlds, dtype=int, device=device)  # steps with fewer
             self._patience = wp.full(worlds, int(CALM_STEPS), dtype=int, device=device)
-            self._motion.carried += [self._number, self._calm, self._patience]
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
             self._passes = wp.zeros(1, dtype=int, device=device)
@@ -175,7 +174,6 @@ class Substeps:
             control: As for the inner solver.
             contacts: As for the inner solver.
             dt: Length of the step [s].
-
         """
         work, in_graph = self._work, self._mesh.device.is_capturing
         work.motion = self._motion  # also after an error in a substep

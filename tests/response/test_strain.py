@@ -1,0 +1,124 @@
+"""Strain by contacts: it is measured and warned of, and says how many substeps each world takes."""
+
+import warnings
+
+import newton
+import numpy as np
+import warp as wp
+from newton_scenes import SOLVERS, Rollout, add_patch, bullet
+
+import warp_bsc as bsc
+from warp_bsc.response.substeps.strain import edges_at_rest, predict_substeps
+from warp_bsc.response.tuning import STRAIN, SUBSTEP_STRAIN
+
+
+def test_lengths_at_rest_are_those_of_the_material(device):
+    """Edges of cloth and of a soft body, apart from where they are now."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 1.0))
+    sizes = {"dim_x": 1, "dim_y": 1, "dim_z": 1, "cell_x": 0.1, "cell_y": 0.2, "cell_z": 0.3}
+    material = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 0.0}
+    builder.add_soft_grid(pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), **sizes, **material)
+    x = np.array(builder.particle_q)
+    builder.particle_q = [wp.vec3(*row) for row in 2.0 * x]
+    edges, lengths, is_solid = edges_at_rest(builder.finalize(device=device))
+    assert np.allclose(lengths, np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1), rtol=1e-5)
+    assert is_solid.tolist() == (edges >= 9).all(axis=1).tolist()
+    assert len(edges) == 16 + 18
+
+
+def test_each_world_takes_the_substeps_that_it_needs(device):
+    """Three worlds, of which one takes none, in one model and each in a model of its own."""
+    speeds = 0.1, 3.0, 30.0
+    worlds, alone = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0)), []
+    for speed in speeds:
+        world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        add_patch(world, 8, 0.05, (0.0, 0.0, 0.0), fixed=True)
+        add_patch(world, 4, 0.03, (0.011, 0.017, 2e-4 + 0.004 * speed), velocity=(0.0, 0.0, -speed))
+        worlds.add_world(world)
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.add_world(world)
+        alone.append(builder)
+    rollouts = []
+    for builder in (worlds, *alone):
+        builder.color()
+        model = builder.finalize(device=device)
+        solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), separation=2e-4, substeps="auto")
+        rollouts.append(Rollout(model, solver))
+    substeps = []
+    for _ in range(3):
+        for rollout in rollouts:
+            rollout.step()
+        numbers = [rollout.solver.report.substeps for rollout in rollouts]
+        assert numbers[0] == max(numbers[1:])
+        substeps.append(numbers[1:])
+        expected = np.concatenate([rollout.positions for rollout in rollouts[1:]])
+        assert rollouts[0].positions.tobytes() == expected.tobytes()
+    assert any(len(set(numbers)) == 3 for numbers in substeps)
+    assert all(rollout.solver.report.totals.uncertified_steps == 0 for rollout in rollouts)
+
+
+def test_the_report_says_where_auto_takes_none(device):
+    """The default takes substeps behind solvers that can be restored, and none elsewhere."""
+    model, builder = bullet(20.0, device=device), newton.ModelBuilder()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
+    differentiable = builder.finalize(device=device, requires_grad=True)
+
+    class Outer(newton.solvers.SolverBase):
+        def __init__(self, inner):
+            super().__init__(inner.model)
+            self.entries = [inner]
+
+    for inner, expected in (
+        (SOLVERS["vbd"](model), None),
+        (SOLVERS["xpbd"](model), None),
+        (SOLVERS["semi_implicit"](model), "explicit"),
+        (SOLVERS["semi_implicit"](differentiable), "requires gradients"),
+        (Outer(SOLVERS["vbd"](model)), "Outer steps other solvers"),
+    ):
+        omitted = bsc.SolverCCD(inner).report.substeps_omitted
+        assert omitted is None if expected is None else expected in omitted
+
+
+def test_strain_is_reported_and_warned_of_once(device):
+    """A patch at 20 m/s stretches a sheet far in a step as a whole; substeps do not, and nobody warns of them."""
+    for substeps in (None, "auto"):
+        model = bullet(20.0, device=device)
+        rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            strains = []
+            for _ in range(8):
+                rollout.step()
+                strains.append(rollout.solver.report.strain)
+                assert rollout.solver.report.certified
+        of_strain = [str(warning.message) for warning in caught if "strained an edge" in str(warning.message)]
+        strained = rollout.solver.report.totals.strained_steps
+        assert strained == np.count_nonzero(np.array(strains) > 0.2)
+        assert len(of_strain) == min(strained, 1)
+        if substeps is None:
+            assert strained > 0 and "substeps='auto'" in of_strain[0]
+        else:
+            assert max(strains) < 0.2
+
+
+def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
+    """Half as many after 16 calm steps; after 32, if the next ones had to take more again."""
+    number, calm, patience = (wp.full(1, n, dtype=int, device=device) for n in (8, 0, 16))
+    choices, nothing = wp.array([2, 4, 8, 16, 32], dtype=int, device=device), wp.zeros(1, dtype=float, device=device)
+
+    def steps(count, needed):
+        """Takes steps whose strain asks for a number of substeps, and returns those of the last."""
+        for _ in range(count):
+            n = max(1, int(number.numpy()[0]))
+            strain = wp.full(1, needed * float(SUBSTEP_STRAIN * STRAIN) / n, dtype=float, device=device)
+            arrays = [strain, nothing, choices, number, calm, patience]
+            wp.launch(predict_substeps, 1, inputs=arrays, device=device)
+        return int(number.numpy()[0])
+
+    assert steps(15, 1.0) == 8 and steps(2, 1.0) == 4
+    assert steps(1, 7.0) == 8  # too soon
+    assert steps(30, 1.0) == 8 and steps(3, 1.0) == 4
+    assert steps(1, 31.0) == 32
+    assert steps(100, 9.0) == 32  # more than a quarter
+    assert steps(200, 0.0) == 0
