@@ -243,7 +243,7 @@ class SolverCCD(CollisionStage):
         with contextlib.ExitStack() as stack:
             if self._limited is not None:
                 stack.enter_context(without_speed_limit(self._limited))
-            if self._in_substeps is not None:
+            if self._substepping is not None and self._coupled is None:
                 stack.enter_context(without_own_contacts(self.solver))
             self.solver.step(*arguments, **options)
 
@@ -300,6 +300,8 @@ class SolverCCD(CollisionStage):
             self._motion.set_end(end, dt)
             solve()
             if self._in_substeps is None:
+                if self._substepping is not None:
+                    self._substepping[0].substeps.zero_()
                 self.report.last_strain.zero_()
                 measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                 wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)

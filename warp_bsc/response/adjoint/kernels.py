@@ -103,7 +103,7 @@ def initialize_multipliers(restored: RestoredStep, swept: Projection):
 
 @wp.kernel
 def add_torques(step: Step, totals: wp.array2d[wp.float64]):
-    """Adds the torques of contacts to the totals of their worlds, see :func:`.solve.angular_momentum.sum_torques`."""
+    """Adds the torques of contacts to the totals of their worlds, see :func:`.solve.angular_momentum.add_torques`."""
     i = wp.tid()
     if i >= step.constraints.count[0] or not acts(step, i):
         return
@@ -120,7 +120,7 @@ def add_torques(step: Step, totals: wp.array2d[wp.float64]):
 def add_moments(step: Step, totals: wp.array2d[wp.float64]):
     """Adds the moments of vertices and bodies, and the torques of bodies, to the totals of their worlds.
 
-    See :func:`.solve.angular_momentum.sum_moments` and :func:`.solve.angular_momentum.sum_body_moments`.
+    See :func:`.solve.angular_momentum.add_moments` and :func:`.solve.angular_momentum.sum_body_moments`.
     """
     vertex = wp.tid()
     body = vertex - step.motion.x0.shape[0]
@@ -154,7 +154,7 @@ def turn_velocities(
 ):
     """Computes how the turn of each world changes the velocities of its vertices and bodies.
 
-    See :func:`.solve.angular_momentum.turn_vertices` and :func:`.solve.angular_momentum.turn_bodies`.
+    See :func:`.solve.angular_momentum.turn_vertex` and :func:`.solve.angular_momentum.turn_bodies`.
     """
     vertex = wp.tid()
     body = vertex - step.motion.x0.shape[0]

@@ -88,8 +88,8 @@ def is_held(step: Step, i: int) -> bool:
     return held
 
 
-@wp.kernel
-def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
+@wp.func
+def add_torques(step: Step, thread: int, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
 
     For one contact they cancel; for many at once, which share vertices, they need not. Each of ``threads`` threads sums
@@ -97,7 +97,7 @@ def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
     """
     world = int(0)
     added = _Torque()
-    for i in range(wp.tid(), wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
+    for i in range(thread, wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
         own = step.motion.world[step.constraints.vertices[i][0]]
         if own != world:
             _add(sums, world, added)
@@ -111,6 +111,12 @@ def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
                 for axis in range(3):
                     added[axis] += _units(torque[axis])
     _add(sums, world, added)
+
+
+@wp.kernel
+def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
+    """Launches :func:`add_torques`."""
+    add_torques(step, wp.tid(), threads, sums)
 
 
 @wp.func
@@ -140,16 +146,16 @@ def moments(step: Step, vertex: int) -> Moments:
     return _moments(mass, to_double(vertices.x1[vertex]), ZERO, wp.mat33d(), mass * wp.dot(change, change))
 
 
-@wp.kernel
-def sum_moments(step: Step, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+@wp.func
+def add_moments(step: Step, particles: int, thread: int, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the moments of the vertices that collided, and the torques of those that were divided.
 
-    Threads are as in :func:`sum_torques`.
+    Threads are as in :func:`add_torques`.
     """
     motion, vertices = step.motion, step.vertices
     world = int(0)
     added = _Sums()
-    for vertex in range(wp.tid(), particles, threads):
+    for vertex in range(thread, particles, threads):
         own = motion.world[vertex]
         if own != world:
             _add(sums, world, added)
@@ -166,6 +172,12 @@ def sum_moments(step: Step, particles: int, threads: int, sums: wp.array2d[wp.in
                 for axis in range(3):
                     added[axis] += _units(torque[axis])
     _add(sums, world, added)
+
+
+@wp.kernel
+def sum_moments(step: Step, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+    """Launches :func:`add_moments`."""
+    add_moments(step, particles, wp.tid(), threads, sums)
 
 
 @wp.func
@@ -248,10 +260,9 @@ def _totals(sums: wp.array2d[wp.int64], world: int):
     return torque, total
 
 
-@wp.kernel
-def turn_vertices(step: Step, sums: wp.array2d[wp.int64]):
-    """Turns the vertices that collided in each world, which removes the torque that contacts added."""
-    vertex = wp.tid()
+@wp.func
+def turn_vertex(step: Step, sums: wp.array2d[wp.int64], vertex: int):
+    """Turns a vertex with all that collided in its world, which removes the torque that contacts added."""
     world = step.motion.world[vertex]
     if not turns(step, vertex) or sums[world, HELD] != wp.int64(0):
         return
@@ -261,8 +272,14 @@ def turn_vertices(step: Step, sums: wp.array2d[wp.int64]):
 
 
 @wp.kernel
+def turn_vertices(step: Step, sums: wp.array2d[wp.int64]):
+    """Launches :func:`turn_vertex`."""
+    turn_vertex(step, sums, wp.tid())
+
+
+@wp.kernel
 def turn_bodies(step: Step, sums: wp.array2d[wp.int64]):
-    """Turns the bodies that collided as :func:`turn_vertices` does the vertices of their world."""
+    """Turns the bodies that collided as :func:`turn_vertex` does the vertices of their world."""
     body = wp.tid()
     world = wp.max(step.motion.bodies.world[body], 0)
     if not body_turns(step, body) or sums[world, HELD] != wp.int64(0):

@@ -22,6 +22,7 @@ from ..state.workspace import Workspace
 from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
 from . import sweeps
 from .bodies import move_bodies, place_vertices
+from .cluster import BLOCK, CLUSTER, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 
@@ -126,7 +127,7 @@ def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: 
     _update_vertex(step, status, record, last, wp.tid())
 
 
-@wp.kernel(module="unique")
+@wp.kernel(module="unique", cluster_dim=CLUSTER, launch_bounds=BLOCK)
 def _sweep(
     step: Step,
     status: SolveStatus,
@@ -136,25 +137,36 @@ def _sweep(
     begins_moved: bool,
     batches: int,
     sweeps_per_batch: int,
+    threads: int,
 ):
-    """Makes batches of sweeps, on one thread.
+    """Makes batches of sweeps in one launch, see :mod:`.cluster`.
 
     With ``begins_moved``, multipliers have moved vertices before the first sweep.
     """
+    thread = wp.tid()
     if begins_moved:
-        for vertex in range(particle_count):
+        for vertex in range(thread, particle_count, threads):
             _update_vertex(step, status, record, True, vertex)
-    begin_sweeps(status)
+        wait_for_others()
+    if thread == 0:
+        begin_sweeps(status)
+    wait_for_others()
+    count = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    more = status.loop[Loop.MORE_SWEEPS]
     batch = int(0)
-    while status.loop[Loop.MORE_SWEEPS] == 1 and batch < batches:
-        for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
+    while more == 1 and batch < batches:
+        for i in range(thread, count, threads):
             _activate_constraint(step, status, tolerance, i)
-        count = int(step.constraints.active_count[0])
+        wait_for_others()
+        active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
-            for place in range(count):
+            for place in range(thread, active_count, threads):
                 _project_constraint(step, status, record, place)
-            for vertex in range(particle_count):
+            wait_for_others()
+            for vertex in range(thread, particle_count, threads):
                 _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
+            wait_for_others()
+        more = status.loop[Loop.MORE_SWEEPS]
         batch += 1
 
 
@@ -166,17 +178,13 @@ def project(work: Workspace, tolerance: float = 1.0, *, begins_moved: bool = Fal
         tolerance: Share of the tolerance of a whole step.
         begins_moved: Whether the constraints begin with multipliers, whose sums have still to move vertices and bodies.
     """
-    if work.sweeps_in_one_launch:
-        _launch_sweeps(work, tolerance, begins_moved, int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH), int(SWEEPS_PER_BATCH))
+    if work.sweeping_threads:
+        batches = int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH)
+        work.sweep_at_once(_sweep, [tolerance * work.tolerance, begins_moved, batches, int(SWEEPS_PER_BATCH)])
         return
     if begins_moved:
         _update(work, last=True)
     work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
-
-
-def _launch_sweeps(work, tolerance, begins_moved, batches, sweeps_per_batch):
-    inputs = [work.step, work.status, work.record, max(1, work.particle_count), tolerance * work.tolerance]
-    work.launch(_sweep, 1, [*inputs, begins_moved, batches, sweeps_per_batch])
 
 
 def leave_planes(work: Workspace) -> None:
@@ -185,8 +193,8 @@ def leave_planes(work: Workspace) -> None:
 
 
 def _leave_planes(work):
-    if work.sweeps_in_one_launch:
-        _launch_sweeps(work, 1.0, False, 1, 1)
+    if work.sweeping_threads:
+        work.sweep_at_once(_sweep, [work.tolerance, False, 1, 1])
         return
     work.launch(start_sweeps, 1, [work.status])
     work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)

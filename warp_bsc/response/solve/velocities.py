@@ -11,8 +11,18 @@ from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import TOLERANCE_OF_BODIES
 from . import sweeps
-from .angular_momentum import sum_body_moments, sum_moments, sum_torques, turn_bodies, turn_vertices
+from .angular_momentum import (
+    add_moments,
+    add_torques,
+    sum_body_moments,
+    sum_moments,
+    sum_torques,
+    turn_bodies,
+    turn_vertex,
+    turn_vertices,
+)
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
+from .cluster import BLOCK, CLUSTER, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 
@@ -118,7 +128,7 @@ def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last:
     _update_vertex(step, status, record, last, wp.tid())
 
 
-@wp.kernel(module="unique")
+@wp.kernel(module="unique", cluster_dim=CLUSTER, launch_bounds=BLOCK)
 def _sweep(
     step: Step,
     status: SolveStatus,
@@ -127,37 +137,59 @@ def _sweep(
     tolerance: wp.float64,
     dt: wp.float64,
     sweeps_per_batch: int,
+    sums: wp.array2d[wp.int64],
+    threads: int,
 ):
-    """Initializes multipliers and makes all sweeps, on one thread."""
-    for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
+    """Solves velocities and restores angular momentum in one launch, see :mod:`.cluster`."""
+    thread = wp.tid()
+    for world in range(thread, sums.shape[0], threads):
+        for column in range(sums.shape[1]):
+            sums[world, column] = wp.int64(0)
+    count = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    for i in range(thread, count, threads):
         _initialize_multiplier(step, dt, i)
-    for vertex in range(particle_count):
+    wait_for_others()
+    for vertex in range(thread, particle_count, threads):
         _update_vertex(step, status, record, True, vertex)
-    begin_sweeps(status)
-    while status.loop[Loop.MORE_SWEEPS] == 1:
-        for i in range(wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])):
+    wait_for_others()
+    if thread == 0:
+        begin_sweeps(status)
+    wait_for_others()
+    more = status.loop[Loop.MORE_SWEEPS]
+    while more == 1:
+        for i in range(thread, count, threads):
             _activate_constraint(step, status, tolerance, dt, i)
-        count = int(step.constraints.active_count[0])
+        wait_for_others()
+        active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
-            for place in range(count):
+            for place in range(thread, active_count, threads):
                 _project_constraint(step, status, record, place)
-            for vertex in range(particle_count):
+            wait_for_others()
+            for vertex in range(thread, particle_count, threads):
                 _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
+            wait_for_others()
+        more = status.loop[Loop.MORE_SWEEPS]
+    add_torques(step, thread, threads, sums)
+    wait_for_others()
+    add_moments(step, particle_count, thread, threads, sums)
+    wait_for_others()
+    for vertex in range(thread, particle_count, threads):
+        turn_vertex(step, sums, vertex)
 
 
 def project(work: Workspace, dt: float) -> None:
     """Solves friction and restitution of all contacts that moved a vertex in a step of length ``dt`` [s].
 
-    Then restores angular momentum.
+    Then restores angular momentum: turns all that collided in each world where nothing is held, which removes the
+    torque that contacts added.
     """
-    if work.sweeps_in_one_launch:
-        inputs = [work.step, work.status, work.record, max(1, work.particle_count), work.tolerance, dt]
-        work.launch(_sweep, 1, [*inputs, int(SWEEPS_PER_BATCH)])
-    else:
-        work.launch_over_bodies(move_to_end)
-        work.launch_over_constraints(initialize_velocity_multipliers, dt)
-        _update(work, last=True)
-        work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
+    if work.sweeping_threads:
+        work.sweep_at_once(_sweep, [work.tolerance, dt, int(SWEEPS_PER_BATCH), work.moments])
+        return
+    work.launch_over_bodies(move_to_end)
+    work.launch_over_constraints(initialize_velocity_multipliers, dt)
+    _update(work, last=True)
+    work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
     _restore_angular_momentum(work)
 
 
@@ -172,7 +204,6 @@ def _update(work, last):
 
 
 def _restore_angular_momentum(work):
-    """Turns all that collided in each world where nothing is held, which removes the torque that contacts added."""
     sums, threads = work.moments, work.summing_threads
     sums.zero_()
     work.launch(sum_torques, threads, [work.step, threads, sums])

@@ -18,6 +18,7 @@ from ..schedule import (
     single_elements,
     start_sweeps,
 )
+from ..solve.cluster import BLOCK, threads_of_cluster
 from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
@@ -84,6 +85,8 @@ class Workspace:
         differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
+        sweeping_threads: Threads that make all sweeps in one launch; 0 if each is launched, as those of bodies and of
+            steps that may be recorded are.
     """
 
     def __init__(
@@ -134,6 +137,8 @@ class Workspace:
         self.kept = wp.zeros(1, dtype=int, device=device)
         self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
+        at_once = not self.body_count and not differentiable
+        self.sweeping_threads = threads_of_cluster(device, self.particle_count) if at_once else 0
         self._max_blocks = BLOCKS * device.sm_count
 
     @property
@@ -263,10 +268,16 @@ class Workspace:
         if self.body_count:
             self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
 
-    @property
-    def sweeps_in_one_launch(self) -> bool:
-        """Whether all sweeps are one launch, on the CPU, where a thread makes them: most take less than a launch."""
-        return self.device.is_cpu and not self.body_count and self.recorder is None
+    def sweep_at_once(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        """Launches a kernel that makes all sweeps, with the step as its first input; its last is its threads."""
+        threads = self.sweeping_threads
+        wp.launch(
+            kernel,
+            threads,
+            inputs=[self.step, self.status, self.record, max(1, self.particle_count), *inputs, threads],
+            device=self.device,
+            block_dim=min(threads, BLOCK),
+        )
 
     def sweep(self, number: int, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:
         """Sweeps a number of times over one active set, which ``activate`` fills, see :mod:`.solve.sweeps`.
