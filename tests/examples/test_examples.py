@@ -333,7 +333,7 @@ def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypat
 
 @pytest.mark.slow
 def test_funnel_is_passed(capsys):
-    example = run(path_of("funnel"), 46, "--triangles", "1000")
+    example = run(path_of("funnel"), 46, "--triangles", "1352")  # of fewer, how many are in by then is chance
     example.test_final()
     example.print_report()
     assert "0 not certified" in capsys.readouterr().out

@@ -35,8 +35,8 @@ BEND_OF_SHEET, BEND_OF_BODY = wp.constant(wp.float64(0.5)), wp.constant(wp.float
 """Sines of the angles by which a sheet may bend towards a body, and a body towards a sheet, which rounding allows."""
 
 # sweeps
-RELAXATION = wp.constant(wp.float64(1.5))
-"""Active constraints of a vertex that count as one where they only push: mostly they push the same way."""
+COUNTED = wp.constant(wp.float64(2.0 / 3.0))
+"""Share of the active constraints of a vertex that counts where they only push: mostly they push the same way."""
 PUSHING_MOMENTUM = wp.constant(wp.float64(0.5))
 """Largest momentum of a multiplier that only pushes."""
 SLIDING = wp.constant(wp.float64(0.999))
@@ -90,6 +90,8 @@ SUBSTEPS = (2, 4, 8, 16, 32)
 STRAIN = wp.constant(0.01)
 """Strain by contacts that ``"auto"`` leaves to a substep: elongation of an edge of cloth beyond its length at rest, or
 change of the length of an edge in a soft body, as a share of that length."""
+WHOLE_STRAIN = wp.constant(0.02)
+"""Strain by contacts up to which ``"auto"`` takes no substeps: piles, whose layers never quite rest, stay below."""
 SUBSTEP_ITERATIONS = 2
 """Fewest iterations of the inner solver in a substep."""
 SUBSTEP_STRAIN = wp.constant(1.5)

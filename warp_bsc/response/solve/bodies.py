@@ -62,7 +62,7 @@ def activate_bodies(step: Step, i: int):
 
 
 @wp.func
-def body_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], relaxation: wp.float64):
+def body_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
     """Returns what the bodies of a constraint add to its inverse mass [1/kg], along the normal and across it.
 
     The inverse mass of a body is a matrix. The two numbers belong to a larger one, without products of the normal with
@@ -74,7 +74,7 @@ def body_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], relaxation: wp
     for side in range(2):
         body, weight, arm = _lever(step, i, side, x)
         if body >= 0:
-            parts = wp.max(wp.float64(step.vertices.bodies.active[body]) / relaxation, ONE)
+            parts = wp.max(wp.float64(step.vertices.bodies.active[body]) * counted, ONE)
             inverse_inertia = step.vertices.bodies.inverse_inertia[body]
             linear = weight * weight * wp.float64(step.motion.bodies.inverse_mass[body])
             turned = wp.cross(inverse_inertia * wp.cross(arm, normal), arm)

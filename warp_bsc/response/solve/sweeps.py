@@ -14,26 +14,26 @@ from ..state.fixed_sum import add_to_sum
 from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
-from ..tuning import CREEP, RELAXATION, SLIDING
+from ..tuning import COUNTED, CREEP, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 
 @wp.func
-def _effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], relaxation: wp.float64):
+def _effective_inverse_masses(step: Step, i: int, x: wp.array[wp.vec3], counted: wp.float64):
     """Returns the inverse masses of a constraint [1/kg] along its normal and across it, at positions ``x`` of vertices.
 
-    Its vertices and bodies are split among their active constraints.
+    Its vertices and bodies are split among the share ``counted`` of their active constraints.
     """
     inverse_mass = ZERO
     weights = step.constraints.weights[i]
     for j in range(4):
         vertex = step.constraints.vertices[i][j]
-        parts = wp.max(wp.float64(step.vertices.active[vertex]) / relaxation, ONE)
+        parts = wp.max(wp.float64(step.vertices.active[vertex]) * counted, ONE)
         share = wp.float64(step.motion.inverse_mass[vertex]) * parts
         inverse_mass += weights[j] * weights[j] * share
     if not step.motion.bodies.of_vertex:
         return inverse_mass, inverse_mass
-    along, across = body_inverse_masses(step, i, x, relaxation)
+    along, across = body_inverse_masses(step, i, x, counted)
     return inverse_mass + along, inverse_mass + across
 
 
@@ -51,12 +51,18 @@ def _multiplier_after(
 
     Along the normal it only pushes; across, it is limited by friction (Coulomb).
     """
-    along = wp.max(wp.dot(multiplier, normal) - excess / inverse_mass_along, ZERO)
-    across = multiplier - wp.dot(multiplier, normal) * normal
-    across -= (motion - wp.dot(motion, normal) * normal) / inverse_mass_across
-    length = wp.length(across)
-    if length > friction * along:
-        across = across * (friction * along / length)
+    mass = ONE / inverse_mass_along  # few divisions: they take most of the time of a sweep
+    mass_across = mass
+    if inverse_mass_across != inverse_mass_along:
+        mass_across = ONE / inverse_mass_across
+    before = wp.dot(multiplier, normal)
+    along = wp.max(before - mass * excess, ZERO)
+    across = multiplier - mass_across * motion
+    across -= wp.dot(across, normal) * normal
+    limit = friction * along
+    square = wp.length_sq(across)
+    if square > limit * limit:
+        across *= limit / wp.sqrt(square)
     return along * normal + across
 
 
@@ -72,8 +78,8 @@ def path_of(step: Step, i: int) -> wp.vec3d:
 def position_multiplier_after(step: Step, i: int, pushes_only: bool) -> wp.vec3d:
     """Returns the position multiplier of a constraint after a sweep, without momentum."""
     old = step.constraints.position_multiplier[i]
-    relaxation = wp.where(pushes_only, RELAXATION, ONE)
-    along, across = _effective_inverse_masses(step, i, step.motion.x1, relaxation)
+    counted = wp.where(pushes_only, COUNTED, ONE)
+    along, across = _effective_inverse_masses(step, i, step.motion.x1, counted)
     if along <= ZERO:
         return old
     excess = gap(step, i)
@@ -156,7 +162,7 @@ def momentum_of(step: Step, status: SolveStatus, i: int, slow: int) -> wp.float6
     step.constraints.last_sweep[i] = sweep
     if last != sweep - 1 or sweep == max_sweeps(step, status, i, slow) - 1:
         return ZERO
-    return wp.float64(sweep) / wp.float64(sweep + 3)
+    return wp.float64(float(sweep) / float(sweep + 3))
 
 
 @wp.func

@@ -128,7 +128,7 @@ def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last:
     _update_vertex(step, status, record, last, wp.tid())
 
 
-@wp.kernel(module="unique", cluster_dim=CLUSTER, launch_bounds=BLOCK)
+@wp.kernel(module="unique", enable_backward=False, cluster_dim=CLUSTER, launch_bounds=BLOCK)
 def _sweep(
     step: Step,
     status: SolveStatus,

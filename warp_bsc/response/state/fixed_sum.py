@@ -4,8 +4,8 @@ import warp as wp
 
 from .vectors import to_double, to_single
 
-_UNITS = wp.constant(wp.float64(2.0**40))
-"""Units in 1, a metre, a radian, and in these per second."""
+_UNITS, _UNIT = wp.constant(wp.float64(2.0**40)), wp.constant(wp.float64(2.0**-40))
+"""Units in 1, a metre, a radian, and in these per second; and a unit."""
 
 
 @wp.func
@@ -17,7 +17,7 @@ def to_units(x: wp.float64) -> wp.int64:
 @wp.func
 def from_units(units: wp.int64) -> wp.float64:
     """Returns the number that an integer in units stands for."""
-    return wp.float64(units) / _UNITS
+    return _UNIT * wp.float64(units)
 
 
 @wp.func

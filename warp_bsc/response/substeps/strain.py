@@ -7,7 +7,17 @@ import warp as wp
 from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
 from ..state.workspace import Workspace
-from ..tuning import COMPRESSION, FREE_STEPS, KEPT, MAX_CALM_STEPS, MAX_MISSED, MAX_REPEATS, STRAIN, SUBSTEP_STRAIN
+from ..tuning import (
+    COMPRESSION,
+    FREE_STEPS,
+    KEPT,
+    MAX_CALM_STEPS,
+    MAX_MISSED,
+    MAX_REPEATS,
+    STRAIN,
+    SUBSTEP_STRAIN,
+    WHOLE_STRAIN,
+)
 from .kernels import mark_choice
 
 wp.set_module_options({"enable_backward": False})
@@ -80,7 +90,9 @@ def choose_substeps(
     world = wp.tid()
     status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
     if number[world] == 0 and has_constraints[world] == 1:
-        n = _choice(choices, strain[world] / STRAIN)
+        n = int(0)
+        if strain[world] > WHOLE_STRAIN:
+            n = _choice(choices, strain[world] / STRAIN)
         number[world] = n
         if n > 0:
             mark_choice(choices, n, is_chosen, substeps)

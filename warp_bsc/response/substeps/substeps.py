@@ -5,12 +5,12 @@ therefore begins with positions and velocities that include the contacts, and pu
 step only. The stretch between solver and contacts falls with the length of the substep. Contacts are detected once,
 before the substeps; the motion of the whole step is detected and certified after them.
 
-With ``"auto"``, a world takes whole steps first. If contacts strain an element by more than ``STRAIN`` against the
-prediction of the inner solver, the step is repeated, in the smallest number of ``SUBSTEPS`` that brings the strain
-below, if that is in proportion to the length of a substep. The next step begins in substeps, as many as the strain of
-these asks for; without bodies, behind a solver that only moves particles, it takes no whole step before them, and the
-contacts are those of particles that fly on. If substeps turn out to be too few, or if contacts that they did not know
-strain an element after them, the step is repeated with more, or with these contacts too.
+With ``"auto"``, a world takes whole steps first. If contacts strain an element by more than ``WHOLE_STRAIN`` against
+the prediction of the inner solver, the step is repeated, in the smallest number of ``SUBSTEPS`` that brings the strain
+below ``STRAIN``, if it is in proportion to the length of a substep. The next step begins in substeps, as many as the
+strain of these asks for; without bodies, behind a solver that only moves particles, it takes no whole step before them,
+and the contacts are those of particles that fly on. If substeps turn out to be too few, or if contacts that they did
+not know strain an element after them, the step is repeated with more, or with these contacts too.
 
 Substeps share the iterations of VBD and Style3D, each with at least ``SUBSTEP_ITERATIONS``: many substeps of few
 iterations converge better than few of many (Macklin et al. 2019). A substep begins with the position multipliers of the
