@@ -268,15 +268,15 @@ def test_style3d_has_contacts_of_its_own(device, monkeypatch):
     solver = SolverStyle3D(model)
     own = solver.collision
     assert own is not None
-    with of_newton.without_own_contacts(solver):
+    with of_newton.with_contacts(solver, None):
         assert solver.collision is None
         step(solver, model)
     assert solver.collision is own
-    with of_newton.without_own_contacts(SolverXPBD(model)):
+    with of_newton.with_contacts(SolverXPBD(model), None):
         pass
     monkeypatch.delattr(solver, "collision")
     with pytest.raises(RuntimeError, match=r"no SolverStyle3D.collision.*omit substeps"):
-        of_newton.without_own_contacts(solver).__enter__()
+        of_newton.with_contacts(solver, None).__enter__()
 
 
 def test_soft_contacts_have_arrays_and_counters(device):

@@ -146,13 +146,14 @@ def attributes_of(solver: SolverBase) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def without_own_contacts(solver: SolverBase) -> Iterator[None]:
-    """Keeps Style3D from resolving contacts of cloth with itself while it steps: the stage resolves them.
+def with_contacts(solver: SolverBase, contacts: object | None) -> Iterator[None]:
+    """Gives Style3D other contacts than its own while it steps, or none: the stage resolves those.
 
     Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between
     both, layers that the stage has moved together are thrown apart. Has no effect on other solvers.
 
-    Contract: ``SolverStyle3D.collision`` holds these contacts; None disables them.
+    Contract: ``SolverStyle3D.collision`` holds these contacts, see :class:`.substeps.style3d_contacts.Style3DContacts`
+    for its methods; None disables them.
 
     Raises:
         RuntimeError: If Style3D has no such attribute.
@@ -162,7 +163,7 @@ def without_own_contacts(solver: SolverBase) -> Iterator[None]:
         return
     if not hasattr(solver, "collision"):
         raise missing("newton", "SolverStyle3D.collision", "cloth would rest in two places; omit substeps")
-    own, solver.collision = solver.collision, None
+    own, solver.collision = solver.collision, contacts
     try:
         yield
     finally:

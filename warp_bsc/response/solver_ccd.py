@@ -6,10 +6,11 @@ from typing import Literal
 
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase
+from newton.solvers import SolverBase, SolverStyle3D
 
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, without_own_contacts
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
+from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
@@ -23,6 +24,7 @@ from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
 from .substeps.strain import StrainMeter
+from .substeps.style3d_contacts import Style3DContacts
 from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
 from .write_back import count_record, write_back
@@ -194,6 +196,10 @@ class SolverCCD(CollisionStage):
         self._in_substeps: Substeps | None = None  # of the step in progress, if it may have some
         if self.substeps == "auto":
             self.report.substeps_omitted = reason_to_omit_substeps(solver)
+        self._inner_rows: Style3DContacts | None = None
+        if self.substeps == "auto" and self.report.substeps_omitted is None and isinstance(inner, SolverStyle3D):
+            self.report.substeps_omitted = "SolverStyle3D sees the contacts in its iterations"
+            self._inner_rows = Style3DContacts(self._work)
         if self.substeps is not None and self.report.substeps_omitted is None:
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
             substeps_of_steps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
@@ -234,6 +240,10 @@ class SolverCCD(CollisionStage):
         return None
 
     def _step_inner(self, *arguments, **options):
+        if self._inner_rows is not None and self._coupled is None:
+            state_in, dt = arguments[0], arguments[-1]
+            with paused_tape():
+                run_on_host(functools.partial(self._inner_rows.find, state_in, dt), self.mesh.device)
         if self._in_substeps is None:
             self._step_solver(*arguments, **options)
         else:
@@ -243,8 +253,8 @@ class SolverCCD(CollisionStage):
         with contextlib.ExitStack() as stack:
             if self._limited is not None:
                 stack.enter_context(without_speed_limit(self._limited))
-            if self._substepping is not None and self._coupled is None:
-                stack.enter_context(without_own_contacts(self.solver))
+            if self._coupled is None and (self._substepping is not None or self._inner_rows is not None):
+                stack.enter_context(with_contacts(self.solver, self._inner_rows))
             self.solver.step(*arguments, **options)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):

@@ -1,0 +1,230 @@
+"""Contacts inside the solve of Style3D: each of its iterations sees the constraints, as forces with multipliers.
+
+Before a step, the contacts of particles that fly on are detected. They and the proximities become constraints, planes
+at the times of impact, which Style3D gets in place of contacts of its own: an augmented Lagrangian, whose multipliers
+each iteration updates. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in
+equilibrium with them, so that it needs no substeps. What is left, the stage detects and resolves as ever.
+
+References:
+    R. Glowinski and P. Le Tallec, Augmented Lagrangian and Operator-Splitting Methods in Nonlinear Mechanics, SIAM
+    1989, doi:10.1137/1.9781611970838.
+"""
+
+import newton
+import warp as wp
+
+from ..state.motion import ModelMotion, StateArrays, arrays_of
+from ..state.structs import Constraints, Motion
+from ..state.vectors import to_double, to_single
+from ..state.workspace import Workspace
+from ..step import add_proximities, find_contacts
+from ..tuning import INNER_STIFFNESS, SLOWEST_SLIP
+from . import kernels
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class _Rows:
+    """The constraints as Style3D takes them."""
+
+    stiffness: wp.array[float]  # [N/m], 0 where nothing can be moved
+    multiplier: wp.array[float]  # [N]
+    along: wp.array[float]  # derivative of the force along the normal, 0 where it does not push [N/m]
+    across: wp.array[float]  # the same across the normal, by friction [N/m]
+
+
+@wp.func
+def _point(
+    motion: Motion, constraints: Constraints, i: int, x: wp.array[wp.vec3], fixed: wp.array[wp.vec3]
+) -> wp.vec3d:
+    """Returns the vector between contact points, with particles that can be moved at ``x``, other vertices ``fixed``."""
+    point = wp.vec3d()
+    for j in range(4):
+        vertex = constraints.vertices[i][j]
+        if motion.inverse_mass[vertex] > 0.0:
+            point += constraints.weights[i][j] * to_double(x[vertex])
+        else:
+            point += constraints.weights[i][j] * to_double(fixed[vertex])
+    return point
+
+
+@wp.kernel
+def _begin_rows(motion: Motion, constraints: Constraints, dt: float, rows: _Rows, threads: int):
+    """Initializes multipliers, and chooses stiffnesses by the mass that a constraint moves."""
+    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
+        inverse_mass = float(0.0)
+        for j in range(4):
+            weight = float(constraints.weights[i][j])
+            inverse_mass += weight * weight * motion.inverse_mass[constraints.vertices[i][j]]
+        rows.stiffness[i] = 0.0
+        if inverse_mass > 0.0:
+            rows.stiffness[i] = INNER_STIFFNESS / (inverse_mass * dt * dt)
+        rows.multiplier[i] = 0.0
+        rows.along[i] = 0.0
+        rows.across[i] = 0.0
+
+
+@wp.kernel
+def _add_forces(
+    # in
+    motion: Motion,
+    constraints: Constraints,
+    x: wp.array[wp.vec3],
+    x_before: wp.array[wp.vec3],
+    slowest: float,
+    updates: bool,
+    # in and out
+    rows: _Rows,
+    # out
+    forces: wp.array[wp.vec3],
+    diagonal: wp.array[wp.mat33],
+    threads: int,
+):
+    """Adds the forces of constraints and the diagonal of their derivative; ``updates`` the multipliers before.
+
+    Friction acts against the slip since the start of the step, in proportion below ``slowest`` [m].
+    """
+    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
+        stiffness = rows.stiffness[i]
+        if stiffness > 0.0:
+            normal = to_single(constraints.normal[i])
+            point = _point(motion, constraints, i, x, motion.x1)
+            violation = float(constraints.separation[i] - wp.dot(constraints.normal[i], point))
+            if updates:
+                rows.multiplier[i] = wp.max(rows.multiplier[i] + stiffness * violation, 0.0)
+            push = rows.multiplier[i] + stiffness * violation
+            rows.along[i] = 0.0
+            rows.across[i] = 0.0
+            if push > 0.0:
+                slip = to_single(point - _point(motion, constraints, i, x_before, motion.x0))
+                slip -= wp.dot(slip, normal) * normal
+                across = constraints.friction[i] * push / wp.max(wp.length(slip), slowest)
+                rows.along[i] = stiffness
+                rows.across[i] = across
+                force = push * normal - across * slip
+                normals = wp.outer(normal, normal)
+                derivative = stiffness * normals + across * (wp.identity(3, float) - normals)
+                for j in range(4):
+                    vertex = constraints.vertices[i][j]
+                    if motion.inverse_mass[vertex] > 0.0:
+                        weight = float(constraints.weights[i][j])
+                        wp.atomic_add(forces, vertex, weight * force)
+                        wp.atomic_add(diagonal, vertex, weight * weight * derivative)
+
+
+@wp.kernel
+def _multiply(
+    motion: Motion,
+    constraints: Constraints,
+    rows: _Rows,
+    x: wp.array[wp.vec3],
+    # out
+    product: wp.array[wp.vec3],
+    threads: int,
+):
+    """Multiplies changes of positions by the derivative of the forces."""
+    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
+        if rows.along[i] > 0.0:
+            normal = to_single(constraints.normal[i])
+            change = wp.vec3()
+            for j in range(4):
+                vertex = constraints.vertices[i][j]
+                if motion.inverse_mass[vertex] > 0.0:
+                    change += float(constraints.weights[i][j]) * x[vertex]
+            along = wp.dot(change, normal) * normal
+            resisting = rows.along[i] * along + rows.across[i] * (change - along)
+            for j in range(4):
+                vertex = constraints.vertices[i][j]
+                if motion.inverse_mass[vertex] > 0.0:
+                    wp.atomic_add(product, vertex, float(constraints.weights[i][j]) * resisting)
+
+
+class Style3DContacts:
+    """The constraints of a step, with the interface of the collision handler of ``SolverStyle3D``.
+
+    It takes the place of that attribute while Style3D steps, see
+    :func:`warp_bsc._private_names.of_newton.with_contacts`.
+    """
+
+    def __init__(self, work: Workspace):
+        """Allocates buffers; ``work`` is free between steps of the stage."""
+        mesh, device = work.mesh, work.device
+        model = mesh.model
+        self._work, self._model = work, model
+        self._flight = ModelMotion(mesh, work.motion.friction)
+        self._last = wp.clone(work.vertices.x1)
+        self._flight.remember(self._last)
+        self._end = StateArrays()
+        self._end.particle_q, self._end.particle_qd = (
+            wp.zeros(model.particle_count, dtype=wp.vec3, device=device) for _ in range(2)
+        )
+        self._flies = wp.ones(work.worlds, dtype=int, device=device)
+        self._rows = _Rows()
+        self._reserve(1)
+        self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
+        self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
+        self._threads = 1 if device.is_cpu else 4 * 256 * device.sm_count  # Warp's additions are not atomic on the CPU
+
+    def _reserve(self, capacity):
+        for name in _Rows.vars:
+            setattr(self._rows, name, wp.zeros(capacity, dtype=float, device=self._work.device))
+
+    def find(self, state: newton.State, dt: float) -> None:
+        """Finds the contacts of particles that fly on from a state for a step of length ``dt`` [s]."""
+        work, flight, model, start = self._work, self._flight, self._model, arrays_of(state)
+        motion, work.motion = work.motion, flight
+        try:
+            wp.copy(self._last, work.vertices.x1)
+            flight.set_start(start)
+            flight.set_end(start, dt)
+            inputs = [start, state.particle_f, model.particle_world, model.gravity, dt, self._flies]
+            work.launch(kernels.extrapolate, model.particle_count, inputs, [flight.vertices, self._end])
+            find_contacts(work)
+            add_proximities(work)
+            wp.copy(work.vertices.x1, self._last)  # where the step before ended
+        finally:
+            work.motion = motion
+        if len(self._rows.stiffness) < len(work.constraints.vertices):
+            self._reserve(len(work.constraints.vertices))
+        self._launch(_begin_rows, [dt, self._rows])
+
+    def _launch(self, kernel, inputs):
+        self._work.launch(
+            kernel, self._threads, [self._flight.vertices, self._work.constraints, *inputs, self._threads]
+        )
+
+    def frame_begin(self, *_arguments) -> None:
+        """Does nothing: :meth:`find` has found the contacts."""
+
+    def accumulate_contact_force(
+        self,
+        dt: float,
+        iteration: int,
+        state_in: newton.State,
+        state_out: newton.State,
+        contacts: newton.Contacts | None,
+        particle_forces: wp.array,
+        particle_q_prev: wp.array,
+        particle_stiff: wp.array | None = None,
+    ) -> None:
+        """Adds the forces of an iteration [N], whose positions are those of ``state_in``."""
+        self._diagonal.zero_()
+        inputs = [state_in.particle_q, particle_q_prev, float(SLOWEST_SLIP) * dt, iteration > 0]
+        self._launch(_add_forces, [*inputs, self._rows, particle_forces, self._diagonal])
+
+    def contact_hessian_diagonal(self) -> wp.array:
+        """Returns the blocks on the diagonal of the derivative of the forces [N/m], shape [particle_count]."""
+        return self._diagonal
+
+    def hessian_multiply(self, x: wp.array) -> wp.array:
+        """Returns the product of the derivative of the forces with changes of positions [N], shape [particle_count]."""
+        self._product.zero_()
+        self._launch(_multiply, [self._rows, x, self._product])
+        return self._product
+
+    def linear_iteration_end(self, *_arguments) -> None:
+        """Does nothing."""
+
+    def frame_end(self, *_arguments) -> None:
+        """Does nothing."""
