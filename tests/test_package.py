@@ -59,6 +59,9 @@ LIBRARIES = {
         "warp_bsc/_private_names/of_newton.py",
         "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/newton_process.py",  # runs them
+        "warp_bsc/bench/crossings.py",  # of a model
+        "warp_bsc/bench/response_simulation.py",  # steps its solvers
+        "warp_bsc/bench/response_scenes.py",  # makes models
     },
     "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
     "rich": {"cli"},

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import asdict, fields
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals, describe_download
@@ -237,8 +236,7 @@ class _Crossings:
     """
 
     def __init__(self, example: Any):
-        from ..detection.detector import CollisionDetector  # noqa: PLC0415 (response, below, imports Newton)
-        from ..response.state.mesh import ModelMesh  # noqa: PLC0415 (imports Newton)
+        from .crossings import CrossingCounter  # noqa: PLC0415 (imports Newton)
 
         model = getattr(example, "model", None)
         self._example = example
@@ -247,29 +245,20 @@ class _Crossings:
             raise _NotApplicable("it has no attributes model and state_0")
         if not model.tri_count + model.tet_count:
             raise _NotApplicable("it has neither cloth nor soft bodies")
-        self._mesh = ModelMesh(model)
-        self._detector = CollisionDetector(self._mesh, method="exact")
-        self._x = wp.zeros(self._mesh.vertex_count, dtype=wp.vec3, device=model.device)
-        particles = model.particle_count
-        self._edge_is_soft, self._face_is_soft = (
-            elements.min(axis=1) < particles for elements in (self._mesh.edges, self._mesh.faces)
-        )
+        self._counter = CrossingCounter(model)
 
     def count(self) -> int:
         """Returns the number of crossings of an edge or a face of cloth or of a soft body."""
-        self._read_positions()
-        edges, faces = self._detector.find_intersections(self._x).T
-        return int((self._edge_is_soft[edges] | self._face_is_soft[faces]).sum())
+        return self._counter.count(self._state)
 
     def are_finite(self) -> bool:
         """Returns whether the positions of all vertices of faces are finite."""
-        self._read_positions()
-        return bool(np.isfinite(self._x.numpy()[self._mesh.vertices]).all())
+        return self._counter.is_finite(self._state)
 
-    def _read_positions(self) -> None:
-        """Reads the positions of the state, which the example may have replaced by another."""
-        state = getattr(self._example, self._name)
-        self._mesh.positions(state.particle_q, state.body_q, self._x)
+    @property
+    def _state(self):
+        """The state, which the example may have replaced by another."""
+        return getattr(self._example, self._name)
 
 
 def _main() -> None:

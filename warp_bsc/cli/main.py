@@ -5,7 +5,7 @@ import sys
 from typing import NoReturn
 
 from .._version import __version__
-from . import bench_detector, bench_newton, bench_paper, bench_queries, query, replay
+from . import bench_detector, bench_newton, bench_paper, bench_queries, bench_response, query, replay
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_command
@@ -33,11 +33,18 @@ examples:
   warp-bsc bench detector
   warp-bsc bench queries
   warp-bsc bench newton
+  warp-bsc bench response
   warp-bsc bench detector --help
 
 {explain_statuses()}"""
 
-_BENCHMARKS = {"paper": bench_paper, "detector": bench_detector, "queries": bench_queries, "newton": bench_newton}
+_BENCHMARKS = {
+    "paper": bench_paper,
+    "detector": bench_detector,
+    "queries": bench_queries,
+    "newton": bench_newton,
+    "response": bench_response,
+}
 
 
 class _Parser(argparse.ArgumentParser):

@@ -1,0 +1,192 @@
+"""Measurements of contact: the measures on states made by hand, and that all scenes run in all configurations."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_bsc.bench import response_scenes
+from warp_bsc.bench.crossings import CrossingCounter
+from warp_bsc.bench.response import (
+    CONFIGURATIONS,
+    REFERENCE,
+    SCENES,
+    SEMI_IMPLICIT_RATE,
+    WARM_UP,
+    ResponseMeasurement,
+    measure_response,
+)
+from warp_bsc.bench.response_scenes import NotRunnable, build_scene
+from warp_bsc.bench.response_simulation import Samples, energy_gained, largest_stretch, total_energy
+
+
+def measure(scene, configuration, *, device, **options):
+    run = measure_response(scene, configuration, device=device, **options)
+    assert (run.scene, run.configuration, run.problem) == (scene, configuration, None)
+    return run.measured
+
+
+def test_the_largest_stretch_of_an_edge():
+    x = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0]], dtype=np.float32)
+    edges, lengths = np.array([[0, 1], [0, 2]]), np.array([2.0, 4.0])
+    assert largest_stretch(x, edges, lengths) == pytest.approx(0.5)
+    assert largest_stretch(x, edges[1:], lengths[1:]) == pytest.approx(-0.5)
+
+
+def test_the_energy_of_masses_in_two_worlds():
+    x, v = np.array([[0, 0, 1], [0, 0, 2], [5, 0, -1]]), np.array([[3, 0, 4], [0, 0, 0], [0, 1, 0]])
+    gravity = np.array([[0.0, 0.0, -10.0]] * 3)
+    found = total_energy(x, v, np.array([2.0, 1.0, 4.0]), gravity, np.array([0, 0, 1]), 2)
+    assert found == pytest.approx([2 * 12.5 + 20 + 20, 2 - 40])
+
+
+def test_energy_is_gained_above_the_least_so_far():
+    energy = np.array([[5.0, 1.0], [3.0, 1.0], [4.0, 0.5], [2.0, 3.0], [2.5, 0.0]])
+    assert energy_gained(energy) == pytest.approx(2.5)  # of the second world
+    assert energy_gained(energy[:, :1]) == pytest.approx(1.0)
+    assert energy_gained(energy, [(3, 1)]) == pytest.approx(1.0)
+    assert energy_gained(energy, [(0, 1), (3, 1), (4, 0)]) == pytest.approx(1.0)
+    assert energy_gained(energy[::-1], [(0, 0)]) == pytest.approx(3.0)
+
+
+def test_samples_of_a_state(device):
+    """A ball of 2 kg that turns, and a spring stretched by a half whose first particle is held."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -10.0))
+    for x in (0.0, 1.0):
+        builder.add_particle(wp.vec3(x, 0.0, 0.0), wp.vec3(), x)
+    builder.add_spring(0, 1, 1.0, 0.0, 0.0)
+    inertia = wp.mat33(*np.diag([3.0, 3.0, 3.0]).ravel().tolist())
+    builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0)), mass=2.0, inertia=inertia, lock_inertia=True)
+    builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 7.0)), mass=2.0, is_kinematic=True)
+    model = builder.finalize(device=device)
+    state, samples = model.state(), Samples(model)
+    state.particle_q.assign(np.array([[0, 0, 0], [1.5, 0, 0]], dtype=np.float32))
+    state.particle_qd.assign(np.array([[9, 0, 0], [0, 2, 0]], dtype=np.float32))
+    state.body_qd.assign(np.array([[1, 0, 0, 0, 2, 0], [4, 0, 0, 0, 0, 0]], dtype=np.float32))
+    assert samples.add(state)
+    assert (samples.stretch, samples.speed) == (pytest.approx([0.5]), pytest.approx([2.0]))
+    ball = 2.0 * 10.0 * 1.0 + 0.5 * 2.0 * 1.0 + 0.5 * 3.0 * 4.0
+    kinematic = 0.0 if model.body_inv_mass.numpy()[1] == 0.0 else 2.0 * 70.0 + 0.5 * 2.0 * 16.0
+    assert samples.energy[0] == pytest.approx([0.5 * 1.0 * 4.0 + ball + kinematic])
+    state.particle_q.assign(np.array([[0, 0, 0], [np.nan, 0, 0]], dtype=np.float32))
+    assert not samples.add(state)
+    assert len(samples.stretch) == 1
+
+
+def test_the_measures_of_a_run():
+    times = [1.0, 1.0, 4.0]
+    found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, None, None, times)
+    assert (found.median, found.mean) == (1.0, 2.0)
+
+
+def test_no_scene_begins_with_a_crossing(device):
+    assert tuple(response_scenes.SCENES) == SCENES
+    for name in SCENES:
+        with wp.ScopedDevice(device):
+            scene = build_scene(name, "vbd")
+            state = scene.model.state()
+        assert CrossingCounter(scene.model, strands=scene.strands).count(state) == 0, name
+        assert 100 < scene.model.tri_count <= 2000, name
+        if scene.motion and scene.motion.poses:  # they begin where the model has them
+            assert np.allclose(scene.motion.poses(0.0), state.body_q.numpy(), atol=1e-6), name
+        if scene.motion and scene.motion.positions:
+            held = state.particle_q.numpy()[list(scene.motion.held)]
+            assert np.allclose(scene.motion.positions(0.0), held, atol=1e-6), name
+
+
+@pytest.mark.parametrize("solver", ["xpbd", "style3d", "semi-implicit"])
+def test_every_scene_is_built_for_a_solver_or_says_why_not(solver, device):
+    missing = set()
+    for name in SCENES:
+        with wp.ScopedDevice(device):
+            try:
+                build_scene(name, solver)
+            except NotRunnable:
+                missing.add(name)
+    style3d = {"tube_cone", "soft_bowl", "pile", "press", "press_tight", "ropes", "ball_two_way"}
+    assert missing == (style3d if solver == "style3d" else set())
+
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+def test_each_configuration_runs(configuration, device):
+    frames = []
+    options = {"seconds": 0.1, "reference_rate": 120, "progress": lambda *done: frames.append(done)}
+    found = measure("box_edge", configuration, device=device, **options)
+    rate = 120 if configuration == REFERENCE else 60
+    assert (found.rate, found.steps, found.device) == (rate, rate // 10, str(device))
+    assert frames == [(step, found.steps) for step in range(0, found.steps + 1, 2)]
+    assert len(found.milliseconds) == found.steps - WARM_UP
+    assert min(found.milliseconds) > 0.0
+    assert 0.0 <= found.stretch_at_end <= found.stretch_at_most < 30.0
+    assert found.rest_speed > 100.0  # it falls
+    assert found.energy_gained is not None
+    if configuration in ("plain", "self-contact"):
+        assert found.uncertified_steps is found.substeps is None
+    else:
+        assert (found.crossings, found.uncertified_steps) == (0, 0)
+        assert found.substeps == 1.0 if configuration == REFERENCE else found.substeps > 1.0
+    assert found.spread is None
+
+
+def test_a_program_moves_bodies_and_particles(device):
+    """A fast ball takes the cloth with it, which it passes without the stage; the mouth of a tube rises."""
+    ball = measure("ball", "stage", device=device, seconds=0.05)
+    assert ball.energy_gained is None
+    assert (ball.crossings, ball.uncertified_steps) == (0, 0)
+    assert ball.stretch_at_most > 5.0
+    assert measure("ball", "plain", device=device, seconds=0.05).stretch_at_most < ball.stretch_at_most
+
+
+def test_worlds_are_reset(device):
+    scene = measure("worlds", "stage", device=device, seconds=0.9)
+    assert (scene.crossings, scene.uncertified_steps) == (0, 0)
+    assert scene.energy_gained is not None and scene.energy_gained < 0.1  # a reset is not counted
+
+
+def test_a_small_offset_of_the_start(device):
+    frames = []
+    options = {"seconds": 0.1, "perturb": 1e-6, "progress": lambda *done: frames.append(done)}
+    found = measure("box_edge", "stage", device=device, **options)
+    assert found.spread.distance == 1e-6
+    assert 0.0 <= found.spread.stretch_at_end < 1.0
+    assert 0.0 <= found.spread.stretch_at_most < 1.0
+    assert frames[-1] == (12, 12)
+    assert measure("box_edge", "plain", device=device, seconds=0.1, perturb=1e-6).spread is None
+
+
+def test_what_a_solver_cannot_run(device):
+    assert measure_response("pile", "stage", solver="style3d", device=device).problem == "Style3D has no tetrahedra"
+    run = measure_response("sphere", "self-contact", solver="xpbd", device=device)
+    assert (run.measured, run.problem) == (None, "only VBD has contacts between particles of cloth")
+
+
+def test_the_explicit_solver_takes_small_steps(device):
+    found = measure("box_edge", "plain", solver="semi-implicit", device=device, seconds=0.005)
+    assert (found.rate, found.steps) == (SEMI_IMPLICIT_RATE, 10)
+
+
+def test_positions_that_are_not_finite(device, monkeypatch):
+    def build_broken(builder):
+        scene = response_scenes._build_box_edge(builder)
+        scene.model.particle_qd.fill_(np.nan)
+        return scene
+
+    monkeypatch.setitem(response_scenes.SCENES, "box_edge", build_broken)
+    problem = measure_response("box_edge", "plain", device=device, seconds=0.1).problem
+    assert problem == "positions are not finite after step 1 of 6"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scene": "cube"}, "scene must be one of sphere, .*, not 'cube'"),
+        ({"configuration": "both"}, "configuration must be one of plain, .*, not 'both'"),
+        ({"solver": "mpm"}, "solver must be one of vbd, xpbd, style3d, semi-implicit, not 'mpm'"),
+        ({"seconds": 0.0}, "seconds must be finite and more than 0, not 0.0"),
+        ({"reference_rate": 0}, "reference_rate must be at least 1, not 0"),
+        ({"perturb": np.inf}, "perturb must be finite, not inf"),
+    ],
+)
+def test_wrong_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        measure_response(**{"scene": "sphere", "configuration": "plain"} | options)

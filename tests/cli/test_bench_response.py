@@ -1,0 +1,172 @@
+"""The command ``warp-bsc bench response``: its tables, its outputs, and what an interrupt leaves."""
+
+import json
+
+import pytest
+
+from warp_bsc.bench.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
+from warp_bsc.cli import bench_response
+from warp_bsc.cli.main import main
+
+
+def measurement(**others):
+    values = {
+        "device": "cpu",
+        "particles": 289,
+        "triangles": 512,
+        "rate": 60,
+        "steps": 150,
+        "stretch_at_end": 12.345,
+        "stretch_at_most": 1234.5,
+        "rest_speed": 40.04,
+        "energy_gained": 0.00284,
+        "crossings": 1040,
+        "uncertified_steps": None,
+        "substeps": None,
+        "milliseconds": [10.0, 12.0, 11.0, 2000.0],
+    }
+    return ResponseMeasurement(**values | others)
+
+
+RUNS = {
+    ("sphere", "plain"): measurement(),
+    ("sphere", "stage"): measurement(
+        crossings=0, uncertified_steps=2, substeps=13.9, energy_gained=None, spread=Spread(1e-6, 0.25, 1.5)
+    ),
+    ("sphere", "reference"): measurement(rate=1920, steps=4800, uncertified_steps=0, substeps=1.0),
+    ("pile", "plain"): "a reason [red]",
+}
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Replaces the runs by made-up ones; returns their options."""
+    calls = []
+
+    def measure_response(scene, configuration, **options):
+        calls.append({"scene": scene, "configuration": configuration, **options})
+        options["progress"](2, 6)
+        result = RUNS.get((scene, configuration), RUNS["sphere", "plain"])
+        problem = result if isinstance(result, str) else None
+        found = None if problem else result
+        return ResponseRun(scene, options["solver"], configuration, measured=found, problem=problem)
+
+    monkeypatch.setattr(bench_response, "measure_response", measure_response)
+    return calls
+
+
+def run(capsys, *arguments, status=0):
+    assert main(["bench", "response", *map(str, arguments), "--device", "cpu"]) == status
+    return capsys.readouterr()
+
+
+def test_tables(capsys, monkeypatch, measured):
+    monkeypatch.setenv("COLUMNS", "100")
+    options = ["--configurations", "plain,stage,reference", "--perturb", "1e-6"]
+    lines = run(capsys, "sphere", "pile", *options).out.splitlines()
+    assert max(map(len, lines)) <= 100
+    rows = [line.split() for line in lines if line.startswith(("plain ", "stage ", "reference "))]
+    assert rows == [
+        ["plain", "12.35", "1,234.50", "40.0", "0.0028", "1,040", "11.50", "508.25"],
+        ["stage", "12.35", "1,234.50", "40.0", "0", "2", "13.9", "11.50", "508.25"],
+        ["reference", "12.35", "1,234.50", "40.0", "0.0028", "1,040", "0", "1.0", "11.50", "508.25"],
+        ["plain"],
+        ["stage", "12.35", "1,234.50", "40.0", "0.0028", "1,040", "11.50", "508.25"],
+        ["reference", "12.35", "1,234.50", "40.0", "0.0028", "1,040", "11.50", "508.25"],
+    ]
+    assert "289 particles, 512 triangles, 150 steps of 1/60 s or 4,800 steps of 1/1920 s" in lines
+    assert "stage, particles moved by 1e-06 m: stretch differs by 0.25 at the end, 1.50 at most" in lines
+    assert "plain: not run: a reason [red]" in lines
+    assert not any("Interrupted" in line for line in lines)
+
+
+def test_json(capsys, tmp_path, measured):
+    arguments = ["sphere", "pile", "--configurations", "plain,stage", "--perturb", "1e-6", "--seconds", "0.5"]
+    arguments += ["--reference-rate", "960", "--solver", "xpbd"]
+    found = json.loads(run(capsys, *arguments, "--json").out)
+    names = [(row["scene"], row["solver"], row["configuration"]) for row in found["runs"]]
+    assert names == [(scene, "xpbd", name) for scene in ("sphere", "pile") for name in ("plain", "stage")]
+    general = {"benchmark": "response", "device": "cpu", "steps_left_out": 2, "partial": False}
+    assert found.items() >= general.items()
+    first, second, third, _ = found["runs"]
+    milliseconds = first["measured"]["milliseconds"]
+    assert milliseconds == {"median": 11.5, "mean": 508.25, "steps": [10.0, 12.0, 11.0, 2000.0]}
+    assert first["problem"] is first["measured"]["spread"] is third["measured"] is None
+    assert third["problem"] == "a reason [red]"
+    assert second["measured"]["spread"] == {"distance": 1e-6, "stretch_at_end": 0.25, "stretch_at_most": 1.5}
+    options = {"seconds": 0.5, "reference_rate": 960, "solver": "xpbd", "perturb": 1e-6}
+    assert all(call.items() >= options.items() for call in measured)
+
+    path = tmp_path / "found.json"
+    output = run(capsys, *arguments, "--json", path).out
+    assert json.loads(path.read_text()) == found
+    assert output.startswith("Contact on cpu")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], CONFIGURATIONS),
+        (["--no-reference"], CONFIGURATIONS[:-1]),
+        (["--solver", "xpbd"], ("plain", "stage", "stage+contacts", "reference")),
+        (["--configurations", "stage,plain,stage"], ("stage", "plain")),
+        (["--configurations", "reference", "--no-reference"], ("reference",)),
+    ],
+)
+def test_configurations(capsys, measured, arguments, expected):
+    run(capsys, "sphere", *arguments)
+    assert tuple(call["configuration"] for call in measured) == expected
+
+
+def test_all_scenes_by_default_and_each_once(capsys, measured):
+    run(capsys, "--configurations", "plain")
+    assert tuple(call["scene"] for call in measured) == SCENES
+    measured.clear()
+    run(capsys, "worlds", "ball", "worlds", "--configurations", "plain")
+    assert [call["scene"] for call in measured] == ["worlds", "ball"]
+
+
+@pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
+def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
+    made_up = bench_response.measure_response
+
+    def interrupt_third(*arguments, **options):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        return made_up(*arguments, **options)
+
+    monkeypatch.setattr(bench_response, "measure_response", interrupt_third)
+    path = tmp_path / "found.json"
+    output = run(capsys, "sphere", *["--json", path] * to_file, status=130)
+    assert "Interrupted: the other runs are missing." in output.out
+    assert output.err == "warp-bsc: interrupted\n"
+    assert path.exists() == to_file
+    if to_file:
+        found = json.loads(path.read_text())
+        assert (len(found["runs"]), found["partial"]) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["spere"], "'spere': there is no scene of this name; did you mean sphere? The scenes are sphere, box_edge, "),
+        (["cube"], "'cube': there is no scene of this name. The scenes are sphere, box_edge, "),
+        (
+            ["--configurations", "plain,both"],
+            "must be of plain, self-contact, stage, stage+contacts, reference, not 'b",
+        ),
+        (["--solver", "mpm"], "invalid choice: 'mpm'"),
+        (["--seconds", "0"], "--seconds: must be a finite number more than 0, not 0"),
+        (["--perturb", "far"], "--perturb: must be a finite number, not far"),
+        (["--perturb", "1e-6", "--configurations", "plain"], "--perturb runs the configuration stage a second time"),
+        (["--reference-rate", "0"], "--reference-rate: must be an integer of at least 1"),
+        (["--json", "sphere"], "--json sphere: this is a scene; name scenes before the options"),
+        (["--json", "gone/found.json"], "there is no folder gone"),
+    ],
+)
+def test_wrong_use(capsys, measured, arguments, part):
+    output = run(capsys, *arguments, status=2)
+    (line,) = output.err.splitlines()
+    assert line.startswith("warp-bsc: error: ")
+    assert part in line
+    assert output.out == "" and not measured

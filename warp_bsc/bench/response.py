@@ -1,0 +1,271 @@
+"""Measures what a solver and the collision stage make of scenes in contact: stretch, rest, energy and time.
+
+The scenes are in :mod:`.response_scenes`, which is imported with Newton when the first one is measured.
+"""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+__all__ = [
+    "CONFIGURATIONS",
+    "REFERENCE",
+    "REFERENCE_RATE",
+    "SCENES",
+    "SEMI_IMPLICIT_RATE",
+    "SOLVERS",
+    "WARM_UP",
+    "ResponseMeasurement",
+    "ResponseRun",
+    "Spread",
+    "measure_response",
+]
+
+SCENES = (
+    "sphere",
+    "box_edge",
+    "tube_cone",
+    "fold",
+    "soft_bowl",
+    "pile",
+    "press",
+    "press_tight",
+    "ropes",
+    "ball",
+    "ball_two_way",
+    "worlds",
+)
+"""Names of the scenes."""
+
+REFERENCE = "reference"
+"""The configuration with a small step."""
+
+CONFIGURATIONS = ("plain", "self-contact", "stage", "stage+contacts", REFERENCE)
+"""The configurations.
+
+``plain``: the solver with Newton's contacts. ``self-contact``: the same with VBD's own contacts between particles.
+``stage``: :class:`warp_bsc.SolverCCD` with default arguments, without contacts of Newton. ``stage+contacts``: the same
+with them. ``reference``: :class:`warp_bsc.SolverCCD` without substeps, without contacts of Newton, at a small step.
+"""
+
+SOLVERS = ("vbd", "xpbd", "style3d", "semi-implicit")
+"""The inner solvers."""
+
+REFERENCE_RATE = 1920
+"""Default number of steps a second of the reference."""
+
+SEMI_IMPLICIT_RATE = 1920
+"""Steps a second of the semi-implicit solver in all configurations: it is explicit, and unstable at larger steps."""
+
+WARM_UP = 2
+"""Steps at the start whose times are left out: kernels are compiled and buffers grow in them."""
+
+_STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {"substeps": None}}
+"""Arguments of the stage by configuration."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Differences between two runs of which one begins with all particles moved sideways.
+
+    Attributes:
+        distance: How far they are moved [m].
+        stretch_at_end: Difference of the stretches at the end [%].
+        stretch_at_most: Difference of the largest stretches [%].
+    """
+
+    distance: float
+    stretch_at_end: float
+    stretch_at_most: float
+
+
+@dataclass(frozen=True)
+class ResponseMeasurement:
+    """What a run gave.
+
+    Attributes:
+        device: The Warp device.
+        particles: Number of particles.
+        triangles: Number of triangles of cloth and of the surfaces of soft bodies.
+        rate: Steps a second.
+        steps: Number of steps.
+        stretch_at_end: Largest elongation of an edge of cloth, a tetrahedron or a spring beyond its length at rest,
+            mean over the last tenth of the steps [%].
+        stretch_at_most: The same, the largest of all steps [%].
+        rest_speed: Mean speed of movable particles over the last tenth of the steps [mm/s].
+        energy_gained: Largest rise of the kinetic and gravitational energy of a world above its least value so far
+            [J]; None where a program moves something. A rebound of what is strained counts.
+        crossings: Crossings of cloth, soft bodies and springs at the end, also with rigid shapes.
+        uncertified_steps: Steps that were not certified; None without a stage.
+        substeps: Mean number of substeps of a step, 1 for a step that was not taken in substeps; None without a stage.
+        milliseconds: Time of each step but the first :data:`WARM_UP` [ms], with Newton's contacts; two steps are timed
+            together.
+        spread: What a small offset of the start changes; None if it was not measured.
+    """
+
+    device: str
+    particles: int
+    triangles: int
+    rate: int
+    steps: int
+    stretch_at_end: float
+    stretch_at_most: float
+    rest_speed: float
+    energy_gained: float | None
+    crossings: int
+    uncertified_steps: int | None
+    substeps: float | None
+    milliseconds: list[float]
+    spread: Spread | None = None
+
+    @property
+    def median(self) -> float:
+        """Median time of a step [ms]."""
+        return float(np.median(self.milliseconds))
+
+    @property
+    def mean(self) -> float:
+        """Mean time of a step [ms]."""
+        return float(np.mean(self.milliseconds))
+
+
+@dataclass(frozen=True)
+class ResponseRun:
+    """A run of a scene in a configuration.
+
+    Attributes:
+        scene: One of :data:`SCENES`.
+        solver: One of :data:`SOLVERS`.
+        configuration: One of :data:`CONFIGURATIONS`.
+        measured: The measurement; None if there is none.
+        problem: Why there is no measurement; None if there is one.
+    """
+
+    scene: str
+    solver: str
+    configuration: str
+    measured: ResponseMeasurement | None = None
+    problem: str | None = None
+
+
+def measure_response(
+    scene: str,
+    configuration: str,
+    *,
+    solver: str = "vbd",
+    device: str | wp.Device | None = None,
+    seconds: float | None = None,
+    reference_rate: int = REFERENCE_RATE,
+    perturb: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ResponseRun:
+    """Runs a scene in a configuration, on a GPU from a CUDA graph of two steps, and measures it.
+
+    Args:
+        scene: One of :data:`SCENES`.
+        configuration: One of :data:`CONFIGURATIONS`.
+        solver: One of :data:`SOLVERS`.
+        device: The Warp device; default: the current one.
+        seconds: Simulated time [s]; default: that of the scene. There are at least four steps, and an even number.
+        reference_rate: Steps a second of the reference.
+        perturb: Distance [m]: the configuration ``stage`` runs a second time with all particles moved that far along x,
+            see :class:`Spread`.
+        progress: Called with the number of steps done and the number of all.
+
+    Returns:
+        The measurement, or the reason why there is none: the solver cannot run the scene, or positions are not finite.
+
+    Raises:
+        ValueError: If a name is unknown or a number out of range.
+    """
+    for name, value, known in (
+        ("scene", scene, SCENES),
+        ("configuration", configuration, CONFIGURATIONS),
+        ("solver", solver, SOLVERS),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
+    if seconds is not None and not 0.0 < seconds < math.inf:
+        raise ValueError(f"seconds must be finite and more than 0, not {seconds}")
+    if reference_rate < 1:
+        raise ValueError(f"reference_rate must be at least 1, not {reference_rate}")
+    if perturb is not None and not math.isfinite(perturb):
+        raise ValueError(f"perturb must be finite, not {perturb}")
+    from .response_scenes import NotRunnable  # noqa: PLC0415 (imports Newton)
+    from .response_simulation import NotFinite  # noqa: PLC0415 (imports Newton)
+
+    if configuration == "self-contact" and solver != "vbd":
+        return ResponseRun(scene, solver, configuration, problem="only VBD has contacts between particles of cloth")
+    passes = 2 if perturb is not None and configuration == "stage" else 1
+
+    def run(number: int, offset: float) -> ResponseMeasurement:
+        def show(done: int, steps: int) -> None:
+            if progress:
+                progress(number * steps + done, passes * steps)
+
+        return _measure(scene, configuration, solver, seconds, reference_rate, offset, show)
+
+    try:
+        with wp.ScopedDevice(device), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of large strain, which is measured
+            measured = run(0, 0.0)
+            if perturb is not None and passes == 2:
+                moved = run(1, perturb)
+                at_end, at_most = (
+                    abs(getattr(moved, name) - getattr(measured, name))
+                    for name in ("stretch_at_end", "stretch_at_most")
+                )
+                measured = replace(measured, spread=Spread(perturb, at_end, at_most))
+    except (NotRunnable, NotFinite) as reason:
+        return ResponseRun(scene, solver, configuration, problem=str(reason))
+    return ResponseRun(scene, solver, configuration, measured=measured)
+
+
+def _measure(
+    scene: str,
+    configuration: str,
+    solver: str,
+    seconds: float | None,
+    reference_rate: int,
+    offset: float,
+    progress: Callable[[int, int], None],
+) -> ResponseMeasurement:
+    """Runs a scene once, with all particles moved by an offset along x."""
+    from .response_scenes import build_scene  # noqa: PLC0415 (imports Newton)
+    from .response_simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
+
+    built = build_scene(scene, solver)
+    rate = reference_rate if configuration == REFERENCE else built.rate
+    if solver == "semi-implicit":
+        rate = max(rate, SEMI_IMPLICIT_RATE)
+    simulation = Simulation(
+        built,
+        solver,
+        rate,
+        has_self_contact=configuration == "self-contact",
+        has_contacts=configuration not in ("stage", REFERENCE),
+        stage_options=_STAGES.get(configuration),
+        offset=offset,
+    )
+    steps = simulation.run(built.seconds if seconds is None else seconds, progress)
+    stage, samples, last = simulation.stage, simulation.samples, max(1, steps // 10)
+    return ResponseMeasurement(
+        device=str(built.model.device),
+        particles=built.model.particle_count,
+        triangles=built.model.tri_count,
+        rate=rate,
+        steps=steps,
+        stretch_at_end=100.0 * float(np.mean(samples.stretch[-last:])),
+        stretch_at_most=100.0 * max(samples.stretch[1:]),
+        rest_speed=1e3 * float(np.mean(samples.speed[-last:])),
+        energy_gained=None if built.motion else energy_gained(np.array(samples.energy), samples.restarts),
+        crossings=simulation.count_crossings(),
+        uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
+        substeps=float(np.mean(simulation.substeps)) if stage else None,
+        milliseconds=simulation.milliseconds[WARM_UP:],
+    )

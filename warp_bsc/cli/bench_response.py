@@ -1,0 +1,231 @@
+"""The command ``warp-bsc bench response``: measures stretch, rest, energy and time of scenes by configuration."""
+
+import argparse
+import difflib
+import json
+import math
+
+import warp as wp
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from .._atomic_file import STDOUT, OutputFile
+from ..bench.response import (
+    CONFIGURATIONS,
+    REFERENCE,
+    REFERENCE_RATE,
+    SCENES,
+    SEMI_IMPLICIT_RATE,
+    SOLVERS,
+    ResponseRun,
+    measure_response,
+)
+from .bench_response_tables import print_response_runs, response_runs_to_dict
+from .device import find_device
+from .exit_status import explain_statuses
+from .interrupts import INTERRUPTS
+from .options import Commands, add_command, add_device, positive
+from .tables import Console, say
+
+__all__ = ["add_to"]
+
+_DESCRIPTION = f"""\
+Run scenes in which cloth, soft bodies, ropes and a ball touch, at 1/60 s, and
+measure what each configuration of a solver and the collision stage makes of
+them: the largest stretch of an edge, at the end and at most; the speed at rest;
+the energy that is gained, where nothing does work; the edges that cross faces
+at the end, found in exact arithmetic; the steps that were not certified; the
+substeps of a step, and its time, on a GPU in a CUDA graph. The balls take steps
+of 1/120 s. The configurations:
+  plain           the solver with Newton's contacts
+  self-contact    the same with VBD's own contacts between particles
+  stage           SolverCCD with default arguments, without Newton's contacts
+  stage+contacts  the same with Newton's contacts
+  reference       SolverCCD without substeps, at a small step: slow
+Ropes have particle_radius, without which nothing collides with springs. The
+semi-implicit solver takes steps of 1/{SEMI_IMPLICIT_RATE} s in all configurations. A scene that
+the solver cannot run is a row, and a line below says why."""
+
+_EPILOG = f"""\
+scenes:
+  {" ".join(SCENES[:8])}
+  {" ".join(SCENES[8:])}
+
+examples:
+  warp-bsc bench response --no-reference
+  warp-bsc bench response sphere box_edge --device cuda:0
+  warp-bsc bench response sphere --configurations stage --perturb 1e-6
+  warp-bsc bench response --solver xpbd --json response.json
+
+{explain_statuses()}
+After a signal, the runs that were complete are printed or written first."""
+
+
+def add_to(commands: Commands) -> None:
+    """Adds the command with its options."""
+    command = add_command(
+        commands,
+        "response",
+        _run,
+        summary="measure stretch, rest, energy and time of contact in Newton's solvers",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+    )
+    command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to run (default: all)")
+    command.add_argument("--solver", choices=SOLVERS, default="vbd", help="the inner solver (default: %(default)s)")
+    command.add_argument(
+        "--configurations",
+        type=_configurations,
+        metavar="NAME,...",
+        help="the configurations to run (default: all, with self-contact only for vbd)",
+    )
+    command.add_argument(
+        "--reference",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="whether the reference is among the default configurations",
+    )
+    command.add_argument(
+        "--reference-rate",
+        type=positive,
+        default=REFERENCE_RATE,
+        metavar="N",
+        help="steps a second of the reference (default: %(default)s)",
+    )
+    command.add_argument(
+        "--seconds", type=_seconds, metavar="T", help="simulated time of each run [s] (default: that of the scene)"
+    )
+    command.add_argument(
+        "--perturb",
+        type=_distance,
+        metavar="D",
+        help="run stage a second time with all particles moved sideways by D [m], and report how much its stretch "
+        "differs",
+    )
+    command.add_argument(
+        "--json",
+        metavar="FILE",
+        nargs="?",
+        const=STDOUT,
+        help="write all results as JSON to a file; without FILE, print them instead of tables",
+    )
+    add_device(command)
+
+
+def _configurations(text: str) -> tuple[str, ...]:
+    """Returns the configurations that an argument lists, each once."""
+    names = tuple(dict.fromkeys(text.split(",")))
+    for name in names:
+        if name not in CONFIGURATIONS:
+            raise argparse.ArgumentTypeError(f"must be of {', '.join(CONFIGURATIONS)}, not {name!r}")
+    return names
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _seconds(text: str) -> float:
+    number = _number(text)
+    if not 0.0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
+    return number
+
+
+def _distance(text: str) -> float:
+    number = _number(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"must be a finite number, not {text}")
+    return number
+
+
+def _check_scenes(names: list[str]) -> tuple[str, ...]:
+    """Returns scenes by name, each once; without one, all."""
+    for name in names:
+        if name not in SCENES:
+            close = difflib.get_close_matches(name, SCENES, n=1)
+            hint = f"; did you mean {close[0]}?" if close else "."
+            raise ValueError(f"{name!r}: there is no scene of this name{hint} The scenes are {', '.join(SCENES)}")
+    return tuple(dict.fromkeys(names)) or SCENES
+
+
+def _choose_configurations(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """Returns the configurations to run: those that are named, otherwise all that the solver and options allow."""
+    if arguments.configurations is not None:
+        return arguments.configurations
+    omitted = set() if arguments.solver == "vbd" else {"self-contact"}
+    omitted |= set() if arguments.reference else {REFERENCE}
+    return tuple(name for name in CONFIGURATIONS if name not in omitted)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    scenes, configurations = _check_scenes(arguments.scenes), _choose_configurations(arguments)
+    if arguments.json in SCENES:
+        raise ValueError(f"--json {arguments.json}: this is a scene; name scenes before the options")
+    if arguments.perturb is not None and "stage" not in configurations:
+        raise ValueError("--perturb runs the configuration stage a second time, and --configurations omits it")
+    device = find_device(arguments.device)
+    file = OutputFile(arguments.json) if arguments.json not in (None, STDOUT) else None
+    try:
+        runs: list[ResponseRun] = []
+        interrupt = None
+        try:
+            _measure(runs, scenes, configurations, arguments, device)
+        except KeyboardInterrupt as signal:
+            interrupt = signal
+        with INTERRUPTS.held():
+            settings = {"device": device, "partial": interrupt is not None}
+            found = response_runs_to_dict(runs, **settings)
+            if arguments.json == STDOUT:
+                print(json.dumps(found))
+            else:
+                print_response_runs(Console(), runs, **settings)
+            if file:
+                file.write(json.dumps(found))
+                file.commit()
+        if interrupt:
+            raise interrupt
+    finally:
+        if file:
+            file.discard()
+    return 0
+
+
+def _measure(
+    runs: list[ResponseRun],
+    scenes: tuple[str, ...],
+    configurations: tuple[str, ...],
+    arguments: argparse.Namespace,
+    device: wp.Device,
+) -> None:
+    """Adds a run for each scene and configuration to a list, with a progress bar on standard error."""
+    console = Console(stderr=True)
+    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("Measuring", total=len(scenes) * len(configurations))
+        for scene in scenes:
+            for configuration in configurations:
+                title, done = f"{scene}, {configuration}", len(runs)
+                progress.update(task, completed=done, description=f"{title}: starts")
+
+                def show(step: int, steps: int, title: str = title, done: int = done) -> None:
+                    INTERRUPTS.check()
+                    description = f"{title}: step {step:,} of {steps:,}"
+                    progress.update(task, completed=done + step / steps, description=description)
+
+                with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
+                    run = measure_response(
+                        scene,
+                        configuration,
+                        solver=arguments.solver,
+                        device=device,
+                        seconds=arguments.seconds,
+                        reference_rate=arguments.reference_rate,
+                        perturb=arguments.perturb,
+                        progress=show,
+                    )
+                runs.append(run)
+                if run.problem and console.is_terminal:
+                    say(progress.console, f"{title}: {run.problem}")

@@ -1,0 +1,123 @@
+"""Shows the measurements of scenes in contact: a table for each scene for people, plain data for programs."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import warp as wp
+from rich.console import Console
+from rich.text import Text
+
+from ..bench.response import WARM_UP, ResponseMeasurement, ResponseRun
+from .tables import count, make_table, say
+
+__all__ = ["print_response_runs", "response_runs_to_dict"]
+
+_HEADERS = (
+    "Stretch\nat end\n[%]",
+    "at\nmost\n[%]",
+    "Speed\nat rest\n[mm/s]",
+    "Energy\ngained\n[J]",
+    "Cross-\nings",
+    "Uncer-\ntified",
+    "Sub-\nsteps",
+    "Median\nof a step\n[ms]",
+    "Mean\n\n[ms]",
+)
+
+
+def print_response_runs(console: Console, runs: Sequence[ResponseRun], *, device: wp.Device, partial: bool) -> None:
+    """Prints a table for each scene, a row a run, and below it why runs are missing.
+
+    Args:
+        console: The terminal or file to print to.
+        runs: The runs, those of a scene one after another.
+        device: The Warp device.
+        partial: Whether the command was interrupted before all runs were complete.
+    """
+    say(console, f"Contact on {device}, {device.name}; times of a step without the first {WARM_UP}")
+    for scene in dict.fromkeys(run.scene for run in runs):
+        console.print()
+        _print_scene(console, [run for run in runs if run.scene == scene])
+    if partial:
+        say(console, "Interrupted: the other runs are missing.")
+
+
+def response_runs_to_dict(runs: Sequence[ResponseRun], *, device: wp.Device, partial: bool) -> dict[str, Any]:
+    """Returns the measurements as plain data for JSON. Arguments: as of :func:`print_response_runs`."""
+    return {
+        "benchmark": "response",
+        "device": str(device),
+        "device_name": device.name,
+        "steps_left_out": WARM_UP,
+        "partial": partial,
+        "runs": [
+            {
+                "scene": run.scene,
+                "solver": run.solver,
+                "configuration": run.configuration,
+                "problem": run.problem,
+                "measured": None if run.measured is None else _measurement_to_dict(run.measured),
+            }
+            for run in runs
+        ],
+    }
+
+
+def _print_scene(console: Console, runs: Sequence[ResponseRun]) -> None:
+    """Prints the table of one scene, and the lines below it."""
+    table = make_table(f"{runs[0].scene}\n{runs[0].solver}", *_HEADERS)
+    table.columns[0].width = 14
+    for column, width in zip(table.columns[1:], (8, 8, 8, 9, 7, 7, 6, 10, 8), strict=True):
+        column.width = width
+    notes = []
+    for run in runs:
+        table.add_row(*map(Text, (run.configuration, *_make_cells(run.measured))))
+        if run.measured is None:
+            notes.append(f"{run.configuration}: not run: {run.problem}")
+        elif run.measured.spread:
+            spread = run.measured.spread
+            notes.append(
+                f"{run.configuration}, particles moved by {spread.distance:g} m: stretch differs by "
+                f"{spread.stretch_at_end:.2f} at the end, {spread.stretch_at_most:.2f} at most"
+            )
+    console.print(table)
+    for note in [*_describe_sizes(runs), *notes]:
+        say(console, note)
+
+
+def _make_cells(took: ResponseMeasurement | None) -> list[str]:
+    """Returns the cells of a row; empty without a measurement, and where a quantity has no meaning."""
+    if took is None:
+        return [""] * len(_HEADERS)
+
+    def show(value: float | None, form: str) -> str:
+        return "" if value is None else format(value, form)
+
+    return [
+        f"{took.stretch_at_end:,.2f}",
+        f"{took.stretch_at_most:,.2f}",
+        f"{took.rest_speed:,.1f}",
+        show(took.energy_gained, ",.4f"),
+        f"{took.crossings:,}",
+        show(took.uncertified_steps, ","),
+        show(took.substeps, ".1f"),
+        f"{took.median:,.2f}",
+        f"{took.mean:,.2f}",
+    ]
+
+
+def _describe_sizes(runs: Sequence[ResponseRun]) -> list[str]:
+    """Returns a line with the size of a scene and the lengths of steps; none if nothing was measured."""
+    measured = [run.measured for run in runs if run.measured]
+    if not measured:
+        return []
+    steps = dict.fromkeys(f"{count(took.steps, 'step')} of 1/{took.rate} s" for took in measured)
+    sizes = count(measured[0].particles, "particle"), count(measured[0].triangles, "triangle")
+    return [", ".join([*sizes, " or ".join(steps)])]
+
+
+def _measurement_to_dict(took: ResponseMeasurement) -> dict[str, Any]:
+    values = asdict(took)
+    milliseconds = {"median": took.median, "mean": took.mean, "steps": values.pop("milliseconds")}
+    return values | {"milliseconds": milliseconds}
