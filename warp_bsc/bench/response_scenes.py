@@ -15,6 +15,7 @@ __all__ = ["SCENES", "Motion", "NotRunnable", "Scene", "build_scene"]
 
 _FRICTION = 0.5
 _IDENTITY = wp.quat_identity()
+_XPBD_STIFFNESS = 0.1 * 60.0**2  # N/m of a spring for each kilogram of a particle
 
 
 class NotRunnable(Exception):
@@ -44,7 +45,6 @@ class Scene:
         model: The model.
         seconds: Simulated time [s].
         rate: Steps a second.
-        contact_margin: Distance at which VBD's self-contact begins to push [m].
         motion: What a program moves; None if nothing.
         resets: Worlds that a program resets, by time [s].
         stage_options: Arguments of the stage that the scene needs.
@@ -54,7 +54,6 @@ class Scene:
     model: newton.Model
     seconds: float
     rate: int = 60
-    contact_margin: float = 0.005
     motion: Motion | None = None
     resets: dict[float, tuple[int, ...]] = field(default_factory=dict)
     stage_options: dict[str, Any] = field(default_factory=dict)
@@ -104,7 +103,7 @@ class _Builder:
         if self.solver == "style3d":
             newton.solvers.style3d.add_cloth_grid(self.to, **options, **_anisotropic(stiffness))
         else:
-            self.to.add_cloth_grid(**options, **self._membrane(stiffness))
+            self.to.add_cloth_grid(**options, **self._membrane(stiffness, mass))
 
     def add_cloth_mesh(
         self,
@@ -118,6 +117,8 @@ class _Builder:
         """Adds cloth that is at rest as it is given; the density is in kg/m^2."""
         if self.solver == "style3d":
             raise NotRunnable("Style3D needs the cut of a cloth in its plane, and a tube has none here")
+        a, b, c = points[faces].transpose(1, 0, 2)
+        area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
         self.to.add_cloth_mesh(
             pos=wp.vec3(),
             rot=_IDENTITY,
@@ -127,7 +128,7 @@ class _Builder:
             indices=faces.ravel().tolist(),
             density=density,
             particle_radius=radius,
-            **self._membrane(stiffness),
+            **self._membrane(stiffness, density * area / len(points)),
         )
 
     def add_block(
@@ -190,10 +191,11 @@ class _Builder:
             model.particle_ke = model.particle_kd = model.particle_kf = 0.0
         return model
 
-    def _membrane(self, stiffness: float) -> dict[str, Any]:
-        """Returns the material of cloth as arguments of Newton."""
-        if self.solver == "xpbd":  # has no triangles, but springs
-            return {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": stiffness, "spring_kd": 0.0}
+    def _membrane(self, stiffness: float, mass: float) -> dict[str, Any]:
+        """Returns the material of cloth as arguments of Newton; XPBD has springs instead of triangles."""
+        if self.solver == "xpbd":  # stiffer springs than this, by the mass of a particle, burst in XPBD itself
+            spring = min(stiffness, _XPBD_STIFFNESS * mass)
+            return {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": spring, "spring_kd": 0.0}
         return {"tri_ke": stiffness, "tri_ka": stiffness, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4}
 
 
@@ -257,7 +259,7 @@ def _build_tube_cone(builder: _Builder) -> Scene:
         return points[:around] + np.array([0.0, 0.0, 0.15 * _ease(t / 1.6)])
 
     motion = Motion(held=tuple(range(around)), positions=positions)
-    return Scene(builder.finish(), 2.4, contact_margin=0.003, motion=motion)
+    return Scene(builder.finish(), 2.4, motion=motion)
 
 
 def _build_fold(builder: _Builder) -> Scene:
@@ -272,7 +274,7 @@ def _build_fold(builder: _Builder) -> Scene:
     builder.add_box((half[0], 0.0, -half[2]), half, plate)
     builder.add_box((0.0, 0.0, -0.05), (0.3, 0.3, 0.05))
     builder.add_cloth((0.0, 0.0, hinge + 0.006), (16, 10), 0.025, mass=2e-4, stiffness=1e2)
-    return Scene(builder.finish(), 2.8, contact_margin=0.003, motion=Motion(poses))
+    return Scene(builder.finish(), 2.8, motion=Motion(poses))
 
 
 def _build_soft_bowl(builder: _Builder) -> Scene:
@@ -301,7 +303,7 @@ def _build_soft_bowl(builder: _Builder) -> Scene:
 
 def _build_pile(builder: _Builder) -> Scene:
     """Five soft cubes fall on each other, in a box without a lid."""
-    builder.add_walled_floor(0.16, 0.15)
+    builder.add_walled_floor(0.16, 0.5)
     places = (-0.06, 0.0, 0.01), (0.06, 0.005, 0.02), (0.01, 0.0, 0.14), (-0.01, 0.03, 0.26), (0.02, -0.02, 0.38)
     for place, turn in zip(places, (0.1, 0.4, 0.8, 0.2, 1.1), strict=True):
         builder.add_block(place, 3, 0.03, turn=turn)
@@ -386,7 +388,7 @@ def _build_worlds(builder: _Builder) -> Scene:
     for number in range(8):
         world = _Builder(builder.solver)
         world.to.add_shape_sphere(body=-1, radius=0.1)
-        world.add_cloth((0.0, 0.0, 0.12 + 0.03 * number), (8, 8), 0.05)
+        world.add_cloth((0.0, 0.0, 0.12 + 0.03 * number), (8, 8), 0.04)
         builder.to.add_world(world.to, xform=wp.transform(wp.vec3(number, 0.0, 0.0), _IDENTITY))
     return Scene(builder.finish(), 2.0, resets={0.8: (2, 5)})
 

@@ -18,6 +18,8 @@ from .response_scenes import Scene
 __all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
 
 _ITERATIONS = 10
+_MARGIN = 0.005
+"""Distance at which VBD's self-contact begins to push, and the gap beyond it [m]; smaller ones hinder a free fall."""
 
 
 class NotFinite(Exception):
@@ -316,8 +318,8 @@ def _make_solver(scene: Scene, solver: str, *, has_self_contact: bool) -> Any:
     if has_self_contact:
         own = {
             "particle_enable_self_contact": True,
-            "particle_self_contact_margin": scene.contact_margin,
-            "particle_self_contact_gap": scene.contact_margin,
+            "particle_self_contact_margin": _MARGIN,
+            "particle_self_contact_gap": _MARGIN,
             "particle_vertex_contact_buffer_size": 64,
             "particle_edge_contact_buffer_size": 128,
         }
