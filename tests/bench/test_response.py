@@ -1,5 +1,7 @@
 """Measurements of contact: the measures on states made by hand, and that all scenes run in all configurations."""
 
+from dataclasses import replace
+
 import newton
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from warp_bsc.bench.response import (
     measure_response,
 )
 from warp_bsc.bench.response_scenes import NotRunnable, build_scene
-from warp_bsc.bench.response_simulation import Samples, energy_gained, largest_stretch, total_energy
+from warp_bsc.bench.response_simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
 
 
 def measure(scene, configuration, *, device, **options):
@@ -57,7 +59,8 @@ def test_samples_of_a_state(device):
     builder.add_spring(0, 1, 1.0, 0.0, 0.0)
     inertia = wp.mat33(*np.diag([3.0, 3.0, 3.0]).ravel().tolist())
     builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0)), mass=2.0, inertia=inertia, lock_inertia=True)
-    builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 7.0)), mass=2.0, is_kinematic=True)
+    at = wp.transform(wp.vec3(0.0, 0.0, 7.0))
+    builder.add_body(xform=at, mass=2.0, inertia=inertia, lock_inertia=True, is_kinematic=True)
     model = builder.finalize(device=device)
     state, samples = model.state(), Samples(model)
     state.particle_q.assign(np.array([[0, 0, 0], [1.5, 0, 0]], dtype=np.float32))
@@ -138,9 +141,18 @@ def test_a_program_moves_bodies_and_particles(device):
 
 
 def test_worlds_are_reset(device):
-    scene = measure("worlds", "stage", device=device, seconds=0.9)
-    assert (scene.crossings, scene.uncertified_steps) == (0, 0)
-    assert scene.energy_gained is not None and scene.energy_gained < 0.1  # a reset is not counted
+    """They fall for two steps since then, the others for six."""
+    with wp.ScopedDevice(device):
+        scene = replace(build_scene("worlds", "vbd"), resets={0.05: (2, 5)})
+        simulation = Simulation(scene, "vbd", 60, stage_options={})
+        assert simulation.run(0.1, lambda *_: None) == 6
+    speed = -simulation._states[0].particle_qd.numpy()[:, 2].reshape(8, -1).mean(axis=1)
+    assert speed[[2, 5]] == pytest.approx(2 * 9.81 / 60, rel=1e-2)
+    assert speed[[3, 4, 6, 7]] == pytest.approx(6 * 9.81 / 60, rel=1e-2)
+    samples = simulation.samples
+    assert samples.restarts == [(5, 2), (5, 5)]
+    assert energy_gained(np.array(samples.energy), samples.restarts) < 1e-3 < energy_gained(np.array(samples.energy))
+    assert simulation.stage.report.totals.uncertified_steps == 0
 
 
 def test_a_small_offset_of_the_start(device):
