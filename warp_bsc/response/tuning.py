@@ -112,7 +112,7 @@ COMPRESSION = wp.constant(0.25)
 """What compression of cloth counts, as a share of the same elongation."""
 
 # contacts inside the solve of Style3D
-INNER_STIFFNESS = wp.constant(100.0)
+INNER_STIFFNESS = wp.constant(200.0)
 """Stiffness of a contact, in multiples of the mass that it moves by the squared length of the step."""
 SLOWEST_SLIP = wp.constant(0.01)
 """Speed of slip below which friction falls in proportion [m/s]."""

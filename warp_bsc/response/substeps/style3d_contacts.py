@@ -13,6 +13,7 @@ References:
 import newton
 import warp as wp
 
+from ...detection.host_function import run_on_host
 from ..state.motion import ModelMotion, StateArrays, arrays_of
 from ..state.structs import Constraints, Motion
 from ..state.vectors import to_double, to_single
@@ -38,7 +39,7 @@ class _Rows:
 def _point(
     motion: Motion, constraints: Constraints, i: int, x: wp.array[wp.vec3], fixed: wp.array[wp.vec3]
 ) -> wp.vec3d:
-    """Returns the vector between contact points, with particles that can be moved at ``x``, other vertices ``fixed``."""
+    """Returns the vector between contact points: particles that can be moved are at ``x``, others ``fixed``."""
     point = wp.vec3d()
     for j in range(4):
         vertex = constraints.vertices[i][j]
@@ -50,7 +51,7 @@ def _point(
 
 
 @wp.kernel
-def _begin_rows(motion: Motion, constraints: Constraints, dt: float, rows: _Rows, threads: int):
+def _begin_rows(motion: Motion, constraints: Constraints, rows: _Rows, dt: float, threads: int):
     """Initializes multipliers, and chooses stiffnesses by the mass that a constraint moves."""
     for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
         inverse_mass = float(0.0)
@@ -70,12 +71,11 @@ def _add_forces(
     # in
     motion: Motion,
     constraints: Constraints,
+    rows: _Rows,
     x: wp.array[wp.vec3],
     x_before: wp.array[wp.vec3],
     slowest: float,
     updates: bool,
-    # in and out
-    rows: _Rows,
     # out
     forces: wp.array[wp.vec3],
     diagonal: wp.array[wp.mat33],
@@ -187,12 +187,16 @@ class Style3DContacts:
             work.motion = motion
         if len(self._rows.stiffness) < len(work.constraints.vertices):
             self._reserve(len(work.constraints.vertices))
-        self._launch(_begin_rows, [dt, self._rows])
+        self._launch(_begin_rows, [dt])
 
     def _launch(self, kernel, inputs):
-        self._work.launch(
-            kernel, self._threads, [self._flight.vertices, self._work.constraints, *inputs, self._threads]
-        )
+        """Launches a kernel over the constraints, of which a replay of a CPU graph may have more than its capture."""
+        work, flight, rows = self._work, self._flight.vertices, self._rows
+
+        def launch():
+            work.launch(kernel, self._threads, [flight, work.constraints, rows, *inputs, self._threads])
+
+        run_on_host(launch, work.device)
 
     def frame_begin(self, *_arguments) -> None:
         """Does nothing: :meth:`find` has found the contacts."""
@@ -211,7 +215,7 @@ class Style3DContacts:
         """Adds the forces of an iteration [N], whose positions are those of ``state_in``."""
         self._diagonal.zero_()
         inputs = [state_in.particle_q, particle_q_prev, float(SLOWEST_SLIP) * dt, iteration > 0]
-        self._launch(_add_forces, [*inputs, self._rows, particle_forces, self._diagonal])
+        self._launch(_add_forces, [*inputs, particle_forces, self._diagonal])
 
     def contact_hessian_diagonal(self) -> wp.array:
         """Returns the blocks on the diagonal of the derivative of the forces [N/m], shape [particle_count]."""
@@ -220,7 +224,7 @@ class Style3DContacts:
     def hessian_multiply(self, x: wp.array) -> wp.array:
         """Returns the product of the derivative of the forces with changes of positions [N], shape [particle_count]."""
         self._product.zero_()
-        self._launch(_multiply, [self._rows, x, self._product])
+        self._launch(_multiply, [x, self._product])
         return self._product
 
     def linear_iteration_end(self, *_arguments) -> None:
