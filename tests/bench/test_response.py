@@ -13,7 +13,7 @@ from warp_bsc.bench.response import (
     CONFIGURATIONS,
     REFERENCE,
     SCENES,
-    SEMI_IMPLICIT_RATE,
+    SEMI_IMPLICIT_STEPS,
     WARM_UP,
     ResponseMeasurement,
     measure_response,
@@ -106,8 +106,12 @@ def test_every_scene_is_built_for_a_solver_or_says_why_not(solver, device):
                 build_scene(name, solver)
             except NotRunnable:
                 missing.add(name)
-    style3d = {"tube_cone", "soft_bowl", "pile", "press", "press_tight", "ropes", "ball_two_way"}
-    assert missing == (style3d if solver == "style3d" else set())
+    expected = {
+        "xpbd": set(),
+        "style3d": {"tube_cone", "soft_bowl", "pile", "press", "press_tight", "ropes", "ball_two_way"},
+        "semi-implicit": {"ball", "ball_two_way"},
+    }
+    assert missing == expected[solver]
 
 
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
@@ -174,7 +178,7 @@ def test_what_a_solver_cannot_run(device):
 
 def test_the_explicit_solver_takes_small_steps(device):
     found = measure("box_edge", "plain", solver="semi-implicit", device=device, seconds=0.005)
-    assert (found.rate, found.steps) == (SEMI_IMPLICIT_RATE, 10)
+    assert (found.rate, found.steps) == (60 * SEMI_IMPLICIT_STEPS, 10)
 
 
 def test_positions_that_are_not_finite(device, monkeypatch):

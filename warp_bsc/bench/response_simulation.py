@@ -309,7 +309,8 @@ def _make_solver(scene: Scene, solver: str, *, has_self_contact: bool) -> Any:
     """Returns a solver of Newton for a scene."""
     model, solvers = scene.model, newton.solvers
     if solver == "xpbd":
-        return solvers.SolverXPBD(model, iterations=_ITERATIONS)
+        # corrections of tetrahedra are added up at their vertices: with the default relaxation, soft bodies burst
+        return solvers.SolverXPBD(model, iterations=_ITERATIONS, soft_body_relaxation=0.2)
     if solver == "style3d":
         return solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=_ITERATIONS))
     if solver == "semi-implicit":

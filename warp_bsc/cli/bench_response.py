@@ -14,7 +14,7 @@ from ..bench.response import (
     REFERENCE,
     REFERENCE_RATE,
     SCENES,
-    SEMI_IMPLICIT_RATE,
+    SEMI_IMPLICIT_STEPS,
     SOLVERS,
     ResponseRun,
     measure_response,
@@ -42,8 +42,8 @@ of 1/120 s. The configurations:
   stage+contacts  the same with Newton's contacts
   reference       SolverCCD without substeps, at a small step: slow
 Ropes have particle_radius, without which nothing collides with springs. The
-semi-implicit solver takes steps of 1/{SEMI_IMPLICIT_RATE} s in all configurations. A scene that
-the solver cannot run is a row, and a line below says why."""
+semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations. A
+scene that the solver cannot run is a row, and a line below says why."""
 
 _EPILOG = f"""\
 scenes:
@@ -66,7 +66,7 @@ def add_to(commands: Commands) -> None:
         commands,
         "response",
         _run,
-        summary="measure stretch, rest, energy and time of contact in Newton's solvers",
+        summary="measure stretch, rest, energy and time of contact",
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )
