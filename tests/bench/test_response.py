@@ -200,7 +200,7 @@ def test_positions_that_are_not_finite(device, monkeypatch):
         ({"solver": "mpm"}, "solver must be one of vbd, xpbd, style3d, semi-implicit, not 'mpm'"),
         ({"seconds": 0.0}, "seconds must be finite and more than 0, not 0.0"),
         ({"reference_rate": 0}, "reference_rate must be at least 1, not 0"),
-        ({"perturb": np.inf}, "perturb must be finite, not inf"),
+        ({"perturb": np.inf}, "perturb must be finite and more than 0, not inf"),
     ],
 )
 def test_wrong_options(options, message):

@@ -157,7 +157,7 @@ def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measure
         ),
         (["--solver", "mpm"], "invalid choice: 'mpm'"),
         (["--seconds", "0"], "--seconds: must be a finite number more than 0, not 0"),
-        (["--perturb", "far"], "--perturb: must be a finite number, not far"),
+        (["--perturb", "far"], "--perturb: must be a finite number more than 0"),
         (["--perturb", "1e-6", "--configurations", "plain"], "--perturb runs the configuration stage a second time"),
         (["--reference-rate", "0"], "--reference-rate: must be an integer of at least 1"),
         (["--json", "sphere"], "--json sphere: this is a scene; name scenes before the options"),

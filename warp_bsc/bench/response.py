@@ -197,8 +197,8 @@ def measure_response(
         raise ValueError(f"seconds must be finite and more than 0, not {seconds}")
     if reference_rate < 1:
         raise ValueError(f"reference_rate must be at least 1, not {reference_rate}")
-    if perturb is not None and not math.isfinite(perturb):
-        raise ValueError(f"perturb must be finite, not {perturb}")
+    if perturb is not None and not 0.0 < perturb < math.inf:
+        raise ValueError(f"perturb must be finite and more than 0, not {perturb}")
     from .response_scenes import NotRunnable  # noqa: PLC0415 (imports Newton)
     from .response_simulation import NotFinite  # noqa: PLC0415 (imports Newton)
 

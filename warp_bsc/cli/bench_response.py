@@ -23,7 +23,7 @@ from .bench_response_tables import print_response_runs, response_runs_to_dict
 from .device import find_device
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, positive
+from .options import Commands, add_command, add_device, distance, positive
 from .tables import Console, say
 
 __all__ = ["add_to"]
@@ -96,7 +96,7 @@ def add_to(commands: Commands) -> None:
     )
     command.add_argument(
         "--perturb",
-        type=_distance,
+        type=distance,
         metavar="D",
         help="run stage a second time with all particles moved sideways by D [m], and report how much its stretch "
         "differs",
@@ -120,24 +120,14 @@ def _configurations(text: str) -> tuple[str, ...]:
     return names
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
 def _seconds(text: str) -> float:
-    number = _number(text)
+    """Returns the time that a text holds."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
     if not 0.0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
-    return number
-
-
-def _distance(text: str) -> float:
-    number = _number(text)
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"must be a finite number, not {text}")
     return number
 
 
