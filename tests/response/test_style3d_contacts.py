@@ -103,7 +103,8 @@ def test_in_a_graph_as_without(device):
             wp.capture_launch(graph) if graph else two_steps()
         assert solver.report.totals.uncertified_steps == 0 and solver.report.hits > 0
         ends.append(states[0].particle_q.numpy())
-    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-4 if device.is_cuda else 0.0)
+    # forces are added up in the order in which contacts were found, on a GPU in any
+    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-4 if device.is_cuda else 1e-6)
 
 
 def test_a_moving_wedge_pushes_without_penetration(device):
