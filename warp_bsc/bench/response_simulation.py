@@ -158,6 +158,8 @@ class Simulation:
             moved[:, 0] += offset
             model.particle_q.assign(moved.astype(np.float32))
         inner = _make_solver(scene, solver, has_self_contact=has_self_contact)
+        if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
+            inner.collision = None  # its own contacts, which need those of Newton
         self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
         self._solver = inner if self.stage is None else self.stage
         self._pipeline = newton.CollisionPipeline(model) if has_contacts else None

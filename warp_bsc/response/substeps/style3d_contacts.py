@@ -164,7 +164,7 @@ class Style3DContacts:
         self._reserve(1)
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
-        self._threads = 1 if device.is_cpu else 4 * 256 * device.sm_count  # Warp's additions are not atomic on the CPU
+        self._threads = work.summing_threads
 
     def _reserve(self, capacity):
         for name in _Rows.vars:
