@@ -120,5 +120,5 @@ def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
     assert steps(1, 7.0) == 8  # too soon
     assert steps(30, 1.0) == 8 and steps(3, 1.0) == 4
     assert steps(1, 31.0) == 32
-    assert steps(100, 9.0) == 32  # more than a quarter
+    assert steps(100, 17.0) == 32  # more than half
     assert steps(200, 0.0) == 0

@@ -96,7 +96,7 @@ def test_auto_follows_the_strain(device, monkeypatch):
 
 
 def test_soft_bodies_are_coupled_where_they_are_compressed(device):
-    """A plate presses a block at once by a tenth of a cell: cloth would buckle, but a solid is strained by a tenth."""
+    """A plate presses a block at once by a tenth of a cell: a third of its strain of a tenth counts."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     body = builder.add_body(is_kinematic=True)
     builder.add_shape_box(body, hx=0.2, hy=0.2, hz=0.05)
@@ -111,7 +111,7 @@ def test_soft_bodies_are_coupled_where_they_are_compressed(device):
     start, end = model.state(), model.state()
     end.body_q.assign(np.float32([[0.0, 0.0, 0.006, 0.0, 0.0, 0.0, 1.0]]))
     solver.step(start, end, model.control(), None, DT)
-    assert solver.report.certified and solver.report.substeps >= 8
+    assert solver.report.certified and solver.report.substeps >= 4
 
 
 @pytest.mark.parametrize("inner", SOLVERS)

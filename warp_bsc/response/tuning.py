@@ -98,7 +98,7 @@ SUBSTEP_STRAIN = wp.constant(1.5)
 """Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
 MAX_MISSED = wp.constant(20.0)
 """Most strain after the substeps, as a multiple of that left to one, with which they are repeated."""
-KEPT = wp.constant(0.25)
+KEPT = wp.constant(0.5)
 CALM_STEPS, MAX_CALM_STEPS = wp.constant(16), wp.constant(1024)
 """Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, at
 first and at most."""
@@ -110,6 +110,9 @@ MAX_STRAIN = wp.constant(0.2)
 """Largest strain by contacts of which the stage does not warn."""
 COMPRESSION = wp.constant(0.25)
 """What compression of cloth counts, as a share of the same elongation."""
+SOLID = wp.constant(1.0 / 3.0)
+"""The same of the strain of a soft body: an element that is wedged keeps its strain in any number of substeps, and the
+more there are, the more it moves."""
 
 # contacts inside the solve of Style3D
 INNER_STIFFNESS = wp.constant(200.0)

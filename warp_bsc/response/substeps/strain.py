@@ -14,6 +14,7 @@ from ..tuning import (
     MAX_CALM_STEPS,
     MAX_MISSED,
     MAX_REPEATS,
+    SOLID,
     STRAIN,
     SUBSTEP_STRAIN,
     WHOLE_STRAIN,
@@ -37,7 +38,7 @@ def measure_strain(
     """Finds the largest strain of an edge between predicted positions and ``x1``, in each world, or in all.
 
     Cloth that is compressed buckles, and resists less than cloth that is stretched: a quarter of its compression
-    counts.
+    counts, and of the strain of a solid a third.
     """
     i = wp.tid()
     a = edges[i][0]
@@ -46,7 +47,7 @@ def measure_strain(
     length = wp.length(x1[a] - x1[b])
     change = wp.max(length - wp.max(predicted, lengths[i]), COMPRESSION * (wp.min(predicted, lengths[i]) - length))
     if is_solid[i]:
-        change = wp.abs(length - predicted)
+        change = SOLID * wp.abs(length - predicted)
     if change > 0.0:
         wp.atomic_max(strain, wp.min(motion.world[a], strain.shape[0] - 1), change / lengths[i])
 
@@ -158,7 +159,7 @@ def predict_substeps(
 ):
     """Predicts the substeps of the next step in each world that took some, by the strain of this step.
 
-    They become fewer slowly, half as many once a number of steps needed less than a quarter of them: with another
+    They become fewer slowly, half as many once a number of steps needed less than half of them: with another
     number, elements come to rest elsewhere, and the difference sets them in motion.
     """
     world = wp.tid()

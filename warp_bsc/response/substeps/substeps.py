@@ -76,7 +76,7 @@ class Substeps:
 
         An inner solver that finds contacts of particles itself, by a ``collision_pipeline`` of its own or by VBD's
         self-contact, resolves them beside the stage: a whole step may leave stretch that substeps release. Contacts
-        that Style3D finds between cloth and cloth are disabled.
+        of Style3D itself are disabled; with ``"auto"`` it takes no substeps, see :mod:`.style3d_contacts`.
 
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken in substeps.
