@@ -101,8 +101,9 @@ def test_in_a_graph_as_without(device):
             graph = capture.graph
         for _ in range(4):
             wp.capture_launch(graph) if graph else two_steps()
-        assert solver.report.totals.uncertified_steps == 0 and solver.report.hits > 0
+        assert solver.report.totals.uncertified_steps == 0
         ends.append(states[0].particle_q.numpy())
+        assert ends[-1][:, 2].max() > 0.15  # the sphere holds it
     # forces are added up in the order in which contacts were found, on a GPU in any
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-4 if device.is_cuda else 1e-6)
 

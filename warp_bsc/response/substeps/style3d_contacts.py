@@ -1,13 +1,12 @@
-"""Contacts inside the solve of Style3D: each of its iterations sees the constraints, as forces with multipliers.
+"""Contacts inside the solve of Style3D: each of its iterations sees the constraints, as stiff springs.
 
 Before a step, the contacts of particles that fly on are detected. They and the proximities become constraints, planes
-at the times of impact, which Style3D gets in place of contacts of its own: an augmented Lagrangian, whose multipliers
-each iteration updates. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in
-equilibrium with them, so that it needs no substeps. What is left, the stage detects and resolves as ever.
+at the times of impact, which Style3D gets in place of contacts of its own: forces that push, with friction, and their
+derivatives. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in equilibrium
+with them, so that it needs no substeps. What is left, the stage detects and resolves as ever.
 
-References:
-    R. Glowinski and P. Le Tallec, Augmented Lagrangian and Operator-Splitting Methods in Nonlinear Mechanics, SIAM
-    1989, doi:10.1137/1.9781611970838.
+The springs are implicit, and add no energy. Multipliers in their place (an augmented Lagrangian) would meet the
+contacts closer, but those of the first iterations threw layers apart.
 """
 
 import newton
@@ -30,7 +29,6 @@ class _Rows:
     """The constraints as Style3D takes them."""
 
     stiffness: wp.array[float]  # [N/m], 0 where nothing can be moved
-    multiplier: wp.array[float]  # [N]
     along: wp.array[float]  # derivative of the force along the normal, 0 where it does not push [N/m]
     across: wp.array[float]  # the same across the normal, by friction [N/m]
 
@@ -52,7 +50,7 @@ def _point(
 
 @wp.kernel
 def _begin_rows(motion: Motion, constraints: Constraints, rows: _Rows, dt: float, threads: int):
-    """Initializes multipliers, and chooses stiffnesses by the mass that a constraint moves."""
+    """Chooses stiffnesses by the mass that a constraint moves."""
     for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
         inverse_mass = float(0.0)
         for j in range(4):
@@ -61,7 +59,6 @@ def _begin_rows(motion: Motion, constraints: Constraints, rows: _Rows, dt: float
         rows.stiffness[i] = 0.0
         if inverse_mass > 0.0:
             rows.stiffness[i] = INNER_STIFFNESS / (inverse_mass * dt * dt)
-        rows.multiplier[i] = 0.0
         rows.along[i] = 0.0
         rows.across[i] = 0.0
 
@@ -75,13 +72,12 @@ def _add_forces(
     x: wp.array[wp.vec3],
     x_before: wp.array[wp.vec3],
     slowest: float,
-    updates: bool,
     # out
     forces: wp.array[wp.vec3],
     diagonal: wp.array[wp.mat33],
     threads: int,
 ):
-    """Adds the forces of constraints and the diagonal of their derivative; ``updates`` the multipliers before.
+    """Adds the forces of constraints and the diagonal of their derivative.
 
     Friction acts against the slip since the start of the step, in proportion below ``slowest`` [m].
     """
@@ -90,10 +86,7 @@ def _add_forces(
         if stiffness > 0.0:
             normal = to_single(constraints.normal[i])
             point = _point(motion, constraints, i, x, motion.x1)
-            violation = float(constraints.separation[i] - wp.dot(constraints.normal[i], point))
-            if updates:
-                rows.multiplier[i] = wp.max(rows.multiplier[i] + stiffness * violation, 0.0)
-            push = rows.multiplier[i] + stiffness * violation
+            push = stiffness * float(constraints.separation[i] - wp.dot(constraints.normal[i], point))
             rows.along[i] = 0.0
             rows.across[i] = 0.0
             if push > 0.0:
@@ -214,7 +207,7 @@ class Style3DContacts:
     ) -> None:
         """Adds the forces of an iteration [N], whose positions are those of ``state_in``."""
         self._diagonal.zero_()
-        inputs = [state_in.particle_q, particle_q_prev, float(SLOWEST_SLIP) * dt, iteration > 0]
+        inputs = [state_in.particle_q, particle_q_prev, float(SLOWEST_SLIP) * dt]
         self._launch(_add_forces, [*inputs, particle_forces, self._diagonal])
 
     def contact_hessian_diagonal(self) -> wp.array:
