@@ -117,7 +117,7 @@ more there are, the more it moves."""
 # contacts inside the solve of Style3D
 INNER_STIFFNESS = wp.constant(200.0)
 """Stiffness of a contact, in multiples of the mass that it moves by the squared length of the step: weight moves it by
-14 micrometres at 1/60 s. Between 100 and 1000 results hardly differ."""
+14 micrometres at 1/60 s. Between 200 and 1000 results hardly differ."""
 SLOWEST_SLIP = wp.constant(0.01)
 """Speed of slip below which friction falls in proportion [m/s]."""
 
