@@ -146,7 +146,7 @@ def attributes_of(solver: SolverBase) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def with_contacts(solver: SolverBase, contacts: object | None) -> Iterator[None]:
+def with_contacts(solver: SolverBase, contacts: Any) -> Iterator[None]:
     """Gives Style3D other contacts than its own while it steps, or none: the stage resolves those.
 
     Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between

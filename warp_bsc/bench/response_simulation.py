@@ -161,7 +161,7 @@ class Simulation:
         if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
             inner.collision = None  # its own contacts, which need those of Newton
         self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
-        self._solver = inner if self.stage is None else self.stage
+        self._solver: Any = inner if self.stage is None else self.stage
         self._pipeline = newton.CollisionPipeline(model) if has_contacts else None
         self._contacts = self._pipeline.contacts() if self._pipeline else None
         self._states, self._control = (model.state(), model.state()), model.control()
