@@ -15,22 +15,13 @@ import warp as wp
 from ...detection.host_function import run_on_host
 from ..state.motion import ModelMotion, StateArrays, arrays_of
 from ..state.structs import Constraints, Motion
-from ..state.vectors import to_double, to_single
+from ..state.vectors import ZERO, to_double, to_single
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts
 from ..tuning import INNER_STIFFNESS, SLOWEST_SLIP
 from . import kernels
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class _Rows:
-    """The constraints as Style3D takes them."""
-
-    stiffness: wp.array[float]  # [N/m], 0 where nothing can be moved
-    along: wp.array[float]  # derivative of the force along the normal, 0 where it does not push [N/m]
-    across: wp.array[float]  # the same across the normal, by friction [N/m]
 
 
 @wp.func
@@ -48,19 +39,16 @@ def _point(
     return point
 
 
-@wp.kernel
-def _begin_rows(motion: Motion, constraints: Constraints, rows: _Rows, dt: float, threads: int):
-    """Chooses stiffnesses by the mass that a constraint moves."""
-    for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
-        inverse_mass = float(0.0)
-        for j in range(4):
-            weight = float(constraints.weights[i][j])
-            inverse_mass += weight * weight * motion.inverse_mass[constraints.vertices[i][j]]
-        rows.stiffness[i] = 0.0
-        if inverse_mass > 0.0:
-            rows.stiffness[i] = INNER_STIFFNESS / (inverse_mass * dt * dt)
-        rows.along[i] = 0.0
-        rows.across[i] = 0.0
+@wp.func
+def _stiffness(motion: Motion, constraints: Constraints, i: int, dt: float) -> float:
+    """Returns the stiffness of a constraint by the mass that it moves [N/m], 0 where nothing can be moved."""
+    inverse_mass = float(0.0)
+    for j in range(4):
+        weight = float(constraints.weights[i][j])
+        inverse_mass += weight * weight * motion.inverse_mass[constraints.vertices[i][j]]
+    if inverse_mass > 0.0:
+        return INNER_STIFFNESS / (inverse_mass * dt * dt)
+    return 0.0
 
 
 @wp.kernel
@@ -68,10 +56,9 @@ def _add_forces(
     # in
     motion: Motion,
     constraints: Constraints,
-    rows: _Rows,
     x: wp.array[wp.vec3],
     x_before: wp.array[wp.vec3],
-    slowest: float,
+    dt: float,
     # out
     forces: wp.array[wp.vec3],
     diagonal: wp.array[wp.mat33],
@@ -79,38 +66,36 @@ def _add_forces(
 ):
     """Adds the forces of constraints and the diagonal of their derivative.
 
-    Friction acts against the slip since the start of the step, in proportion below ``slowest`` [m].
+    Friction acts against the slip since the start of the step, in proportion below ``SLOWEST_SLIP``. The derivatives of
+    the force along the normal and across it [N/m] stand in place of the velocity multiplier, which the stage begins to
+    use after the inner solver.
     """
     for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
-        stiffness = rows.stiffness[i]
-        if stiffness > 0.0:
-            normal = to_single(constraints.normal[i])
-            point = _point(motion, constraints, i, x, motion.x1)
-            push = stiffness * float(constraints.separation[i] - wp.dot(constraints.normal[i], point))
-            rows.along[i] = 0.0
-            rows.across[i] = 0.0
-            if push > 0.0:
-                slip = to_single(point - _point(motion, constraints, i, x_before, motion.x0))
-                slip -= wp.dot(slip, normal) * normal
-                across = constraints.friction[i] * push / wp.max(wp.length(slip), slowest)
-                rows.along[i] = stiffness
-                rows.across[i] = across
-                force = push * normal - across * slip
-                normals = wp.outer(normal, normal)
-                derivative = stiffness * normals + across * (wp.identity(3, float) - normals)
-                for j in range(4):
-                    vertex = constraints.vertices[i][j]
-                    if motion.inverse_mass[vertex] > 0.0:
-                        weight = float(constraints.weights[i][j])
-                        wp.atomic_add(forces, vertex, weight * force)
-                        wp.atomic_add(diagonal, vertex, weight * weight * derivative)
+        constraints.velocity_multiplier[i] = wp.vec3d()
+        stiffness = _stiffness(motion, constraints, i, dt)
+        normal = to_single(constraints.normal[i])
+        point = _point(motion, constraints, i, x, motion.x1)
+        push = stiffness * float(constraints.separation[i] - wp.dot(constraints.normal[i], point))
+        if push > 0.0:
+            slip = to_single(point - _point(motion, constraints, i, x_before, motion.x0))
+            slip -= wp.dot(slip, normal) * normal
+            across = constraints.friction[i] * push / wp.max(wp.length(slip), SLOWEST_SLIP * dt)
+            constraints.velocity_multiplier[i] = wp.vec3d(wp.float64(stiffness), wp.float64(across), ZERO)
+            force = push * normal - across * slip
+            normals = wp.outer(normal, normal)
+            derivative = stiffness * normals + across * (wp.identity(3, float) - normals)
+            for j in range(4):
+                vertex = constraints.vertices[i][j]
+                if motion.inverse_mass[vertex] > 0.0:
+                    weight = float(constraints.weights[i][j])
+                    wp.atomic_add(forces, vertex, weight * force)
+                    wp.atomic_add(diagonal, vertex, weight * weight * derivative)
 
 
 @wp.kernel
 def _multiply(
     motion: Motion,
     constraints: Constraints,
-    rows: _Rows,
     x: wp.array[wp.vec3],
     # out
     product: wp.array[wp.vec3],
@@ -118,7 +103,8 @@ def _multiply(
 ):
     """Multiplies changes of positions by the derivative of the forces."""
     for i in range(wp.tid(), wp.min(constraints.count[0], constraints.vertices.shape[0]), threads):
-        if rows.along[i] > 0.0:
+        derivatives = constraints.velocity_multiplier[i]
+        if derivatives[0] > ZERO:
             normal = to_single(constraints.normal[i])
             change = wp.vec3()
             for j in range(4):
@@ -126,7 +112,7 @@ def _multiply(
                 if motion.inverse_mass[vertex] > 0.0:
                     change += float(constraints.weights[i][j]) * x[vertex]
             along = wp.dot(change, normal) * normal
-            resisting = rows.along[i] * along + rows.across[i] * (change - along)
+            resisting = float(derivatives[0]) * along + float(derivatives[1]) * (change - along)
             for j in range(4):
                 vertex = constraints.vertices[i][j]
                 if motion.inverse_mass[vertex] > 0.0:
@@ -153,15 +139,8 @@ class Style3DContacts:
             wp.zeros(model.particle_count, dtype=wp.vec3, device=device) for _ in range(2)
         )
         self._flies = wp.ones(work.worlds, dtype=int, device=device)
-        self._rows = _Rows()
-        self._reserve(1)
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
-        self._threads = work.summing_threads
-
-    def _reserve(self, capacity):
-        for name in _Rows.vars:
-            setattr(self._rows, name, wp.zeros(capacity, dtype=float, device=self._work.device))
 
     def find(self, state: newton.State, dt: float) -> None:
         """Finds the contacts of particles that fly on from a state for a step of length ``dt`` [s]."""
@@ -178,16 +157,13 @@ class Style3DContacts:
             wp.copy(work.vertices.x1, self._last)  # where the step before ended
         finally:
             work.motion = motion
-        if len(self._rows.stiffness) < len(work.constraints.vertices):
-            self._reserve(len(work.constraints.vertices))
-        self._launch(_begin_rows, [dt])
 
     def _launch(self, kernel, inputs):
         """Launches a kernel over the constraints, of which a replay of a CPU graph may have more than its capture."""
-        work, flight, rows = self._work, self._flight.vertices, self._rows
+        work, flight, threads = self._work, self._flight.vertices, self._work.summing_threads
 
         def launch():
-            work.launch(kernel, self._threads, [flight, work.constraints, rows, *inputs, self._threads])
+            work.launch(kernel, threads, [flight, work.constraints, *inputs, threads])
 
         run_on_host(launch, work.device)
 
@@ -207,8 +183,7 @@ class Style3DContacts:
     ) -> None:
         """Adds the forces of an iteration [N], whose positions are those of ``state_in``."""
         self._diagonal.zero_()
-        inputs = [state_in.particle_q, particle_q_prev, float(SLOWEST_SLIP) * dt]
-        self._launch(_add_forces, [*inputs, particle_forces, self._diagonal])
+        self._launch(_add_forces, [state_in.particle_q, particle_q_prev, dt, particle_forces, self._diagonal])
 
     def contact_hessian_diagonal(self) -> wp.array:
         """Returns the blocks on the diagonal of the derivative of the forces [N/m], shape [particle_count]."""
