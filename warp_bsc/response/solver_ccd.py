@@ -29,6 +29,8 @@ from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
 from .write_back import count_record, write_back
 
+_COUPLED = "a coupled solver steps the stage"
+
 
 class SolverCCD(CollisionStage):
     """Lets another solver step, then makes the motion that it predicted free of collisions.
@@ -220,6 +222,8 @@ class SolverCCD(CollisionStage):
 
     def _begin_step(self, state, contacts):
         self._in_substeps, self._inner_contacts = None, None
+        if self._coupled is not None and self._inner_rows is not None:
+            self._inner_rows, self.report.substeps_omitted = None, _COUPLED
         if self._substepping is None:
             return contacts
         in_substeps, inner_contacts = self._substepping
@@ -236,13 +240,13 @@ class SolverCCD(CollisionStage):
         """Returns why ``"auto"`` takes no substeps in the step that begins; None if it may."""
         device = self.mesh.device
         if self._coupled is not None:
-            return "a coupled solver steps the stage"
+            return _COUPLED
         if device.is_cuda and device.is_capturing and in_substeps.may_allocate:
             return f"{type(self.solver).__name__} may allocate memory, in a graph"
         return None
 
     def _step_inner(self, *arguments, **options):
-        if self._inner_rows is not None and self._coupled is None:
+        if self._inner_rows is not None:
             state_in, dt = arguments[0], arguments[-1]
             with paused_tape():
                 run_on_host(functools.partial(self._inner_rows.find, state_in, dt), self.mesh.device)
