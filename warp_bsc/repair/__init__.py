@@ -1,0 +1,1 @@
+"""Moves positions that cross to the nearest positions that do not, and certifies them."""
