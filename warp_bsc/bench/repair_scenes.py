@@ -62,7 +62,7 @@ def _tube(centre: Callable[[np.ndarray], np.ndarray], radius: Callable, n: int, 
         across = np.stack([-ahead[:, 1], ahead[:, 0], 0 * u], -1)
         angle = 2 * np.pi * v
         r = radius(u)[:, None]
-        return centre(u) + r * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.array([0.0, 0.0, 1.0]))
+        return centre(u) + r * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.array([0.0, 0.0, -1.0]))
 
     x, faces = _grid(n, m, place, closed=True)
     ends = centre(np.array([0.0, 1.0]))
@@ -195,11 +195,7 @@ def damaged(kind: str, seed: int) -> TangledMesh:
         x = free.copy()
         for _ in range(rng.integers(1, 5)):
             x += _bump(rng, mesh, x, edge, np.flatnonzero(~fixed))
-    return (
-        TangledMesh(faces, x, free, fixed, layer)
-        if not fixed.any()
-        else TangledMesh(faces, np.where(fixed[:, None], free, x), free, fixed, layer)
-    )
+    return TangledMesh(faces, x, free, fixed, layer)
 
 
 def _bump(rng: np.random.Generator, mesh: CollisionMesh, x: np.ndarray, edge: float, movable: np.ndarray) -> np.ndarray:

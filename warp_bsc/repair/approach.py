@@ -31,7 +31,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     best, best_score = x, _score(surface, x, max_strain)
     held = np.zeros(len(x), dtype=bool)
     for _ in range(_ROUNDS):
-        goal = np.where((springs.movable & ~held)[:, None], surface.home, x)
+        goal = np.where(held[:, None], x, surface.home)
         if held.any():
             goal = springs.relax(goal, _SWEEPS, _SOUGHT * max_strain)
         moved, stopped = move_freely(surface, x, surface.rounded(goal))

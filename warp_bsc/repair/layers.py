@@ -22,8 +22,8 @@ _SWEEPS = 12
 def separate_layers(surface: Surface, layer: np.ndarray) -> np.ndarray:
     """Returns positions in which layers that cross are on their sides, nearly: contours may be left.
 
-    Along a contour the outer of two layers is cut. Its parts behind the layers inside move in front of these, to the
-    side to which their faces point. Where they are fixed, the layers inside move back instead.
+    Parts of a layer that are behind the layers inside, bounded by contours, move in front of these: to the side to
+    which their faces point. Where the layer is fixed, the layers inside move back instead.
 
     Args:
         surface: The surface.
@@ -53,26 +53,24 @@ def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: 
     crossings = surface.crossings(surface.rounded(x))
     ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
     cuts = moving[ends].all(axis=1) & obstacle[corners].all(axis=1)
-    (faces,) = np.nonzero(obstacle[mesh.faces].all(axis=1))
     if not cuts.any():
         return x
+    (vertices,) = np.nonzero(moving & ~surface.fixed)
+    (faces,) = np.nonzero(obstacle[mesh.faces].all(axis=1))
+    closest, normals = _closest(surface, x, faces, x[vertices])
+    way = closest - x[vertices]
+    behind = np.zeros(len(x), dtype=bool)
+    behind[vertices] = side * np.einsum("ij,ij->i", way, normals) > _ALONG_NORMAL * np.linalg.norm(way, axis=1)
+    # of these, the parts that contours bound
+    part = connected_components(len(x), mesh.edges[behind[mesh.edges].all(axis=1)])
     a, b, c = (x[corners[cuts, i]] for i in range(3))
     heights = np.einsum("ikj,ij->ik", x[ends[cuts]] - a[:, None], np.cross(b - a, c - a))
-    is_cut = np.zeros(len(mesh.edges), dtype=bool)
-    is_cut[crossings[cuts, 0]] = True
-    whole = mesh.edges[moving[mesh.edges].all(axis=1) & ~is_cut]
-    part = connected_components(len(x), whole)
-    votes = np.bincount(part[ends[cuts]].ravel(), np.sign(side * heights).ravel(), len(x))
-    (wrong,) = np.nonzero((votes < 0)[part] & moving & ~surface.fixed)
-    closest, normals = _closest(surface, x, faces, x[wrong])
-    way = closest - x[wrong]
-    distance = np.linalg.norm(way, axis=1)
-    along = side * np.einsum("ij,ij->i", way, normals) >= _ALONG_NORMAL * distance
+    wrong = behind & np.isin(part, part[ends[cuts][side * heights < 0.0]])
     moves = np.zeros_like(x)
-    moves[wrong[along]] = (way + side * _GAP * surface.edge * normals)[along]
-    given = np.zeros(len(x), dtype=bool)
-    given[wrong[along]] = True
-    return x + Springs(surface, near(surface, wrong, _RINGS) & moving).spread(moves, given, _SWEEPS)
+    moves[vertices] = way + side * _GAP * surface.edge * normals
+    moves[~wrong] = 0.0
+    springs = Springs(surface, near(surface, np.flatnonzero(wrong), _RINGS) & moving)
+    return x + springs.spread(moves, wrong, _SWEEPS)
 
 
 def _closest(surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -148,14 +148,14 @@ def _welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
 
 def _repaired(surface: Surface, before: np.ndarray, layer: np.ndarray | None, max_strain: float) -> np.ndarray:
     """Returns the best positions for an input that crosses, in units of the surface."""
-    start, crossings = surface.home, before
-    if layer is not None:
+    if layer is None:
+        start, crossings = surface.home, before
+    else:
         start = separate_layers(surface, layer)
         crossings = surface.crossings(start)
     untangled = untangle(surface, start, crossings)
     x = untangled.x
-    movable = untangled.movable | (x != surface.home).any(axis=1)
-    springs = Springs(surface, movable)
+    springs = Springs(surface, untangled.movable if layer is None else ~surface.fixed)
     if surface.min_distance:
         x = push_apart(surface, x)
     x = approach(surface, x, springs, max_strain)
