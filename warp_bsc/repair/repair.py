@@ -96,7 +96,10 @@ def repair(
     before = surface.crossings(surface.home)
     final = surface.home
     if x_previous is not None:
-        final = _reached(surface, surface.in_units(previous), strain)
+        reached = _reached(surface, surface.in_units(previous), strain)
+        # fixed vertices that contact keeps from their places cannot stay elsewhere
+        if len(before) and not (reached != surface.home).any(axis=1)[is_fixed].any():
+            final = reached
     elif len(before):
         final = _repaired(surface, before, layer if order is not None else None, strain)
     crossings = surface.crossings(final)

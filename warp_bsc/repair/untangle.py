@@ -60,7 +60,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     movable = near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
     springs = Springs(surface, movable)
     best, since, iteration = Untangled(x, crossings, movable), 0, 0
-    while len(crossings) and since < _PATIENCE:
+    while not _are_fixed(surface, crossings).all() and since < _PATIENCE:
         needed = near(surface, _vertices_of(surface, crossings), _RINGS)
         if (needed & ~movable).any():
             movable = movable | near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
@@ -75,9 +75,14 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     return best
 
 
+def _are_fixed(surface: Surface, crossings: np.ndarray) -> np.ndarray:
+    """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
+    return surface.fixed[_vertices_of(surface, crossings).reshape(-1, 5)].all(axis=1)
+
+
 def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
     """Returns the vertices of edges and faces that cross, with repetitions, int, shape [5 m]."""
-    return np.concatenate([surface.mesh.edges[crossings[:, 0]].ravel(), surface.mesh.faces[crossings[:, 1]].ravel()])
+    return np.hstack([surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]]).ravel()
 
 
 def _contour_moves(
