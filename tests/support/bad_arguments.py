@@ -285,9 +285,9 @@ def calls() -> dict[str, Call]:
     vertices = without(bad_arrays(np.array([1]), index=True), "None")
     found["repair"] = Call(
         bsc.repair,
-        {"mesh": FACES, "x": X, "device": "cpu"},
+        {"mesh": mesh, "x": X},
         {
-            "mesh": {},
+            "mesh": without(OBJECTS, "None") | {"negative": -FACES, "columns": np.zeros((2, 4), int)},
             "x": COORDINATES,
             "fixed": vertices,
             "order": without(bad_arrays(np.zeros(6, int), index=True), "None", "negative")
@@ -295,7 +295,7 @@ def calls() -> dict[str, Call]:
             "x_previous": without(COORDINATES, "None") | {"single": X.astype(np.float32)},
             "min_distance": without(DISTANCES, "None"),
             "max_strain": {**NUMBERS, "zero": 0.0, "negative": -1.0},
-            "device": DEVICES,
+            "device": {"beside a mesh": "cpu"},
         },
     )
     found |= calls_of_scenes() | calls_of_solvers()

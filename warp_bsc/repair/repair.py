@@ -7,6 +7,7 @@ import warp as wp
 
 from .._arguments import check_finite, checked_distance, checked_number, checked_shape
 from ..detection.mesh import CollisionMesh
+from ..detection.start import checked_device
 from .approach import approach
 from .arguments import checked_layers, checked_mask, host
 from .contours import connected_components, trace_contours
@@ -15,7 +16,7 @@ from .layers import separate_layers
 from .motion import near_contacts, push_apart
 from .results import RepairResult, UnresolvedContour
 from .surface import Surface, weld_borders
-from .untangle import untangle
+from .untangle import are_fixed, untangle
 
 __all__ = ["repair"]
 
@@ -78,7 +79,11 @@ def repair(
     """
     given = checked_shape(host(x), (3,), "x")
     if not isinstance(mesh, CollisionMesh):
-        mesh = CollisionMesh(mesh, len(given), device=device)
+        chosen = checked_device(device)
+        try:
+            mesh = CollisionMesh(mesh, len(given), device=chosen)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"mesh: {error}") from None
     elif device is not None:
         raise ValueError("device must be omitted with a mesh, which has its own")
     if len(given) != mesh.vertex_count:
@@ -205,8 +210,7 @@ def _unresolved(
     if not len(crossings):
         return ()
     contours = trace_contours(surface.mesh, crossings)
-    fixed = surface.fixed[surface.mesh.edges[crossings[:, 0]]].all(axis=1)
-    fixed &= surface.fixed[surface.mesh.faces[crossings[:, 1]]].all(axis=1)
+    fixed = are_fixed(surface, crossings)
     # an edge of the given mesh for each one of the welded mesh
     n = len(weld)
     keys = np.sort(weld[mesh.edges], axis=1).astype(np.int64) @ np.array([n, 1])

@@ -18,7 +18,7 @@ from .elastic import Springs, near
 from .kernels import contour_gradients
 from .surface import Surface
 
-__all__ = ["Untangled", "untangle"]
+__all__ = ["Untangled", "are_fixed", "untangle"]
 
 _STEP = 0.25
 """Distance by which an edge and a face move apart in an iteration, in edges."""
@@ -60,7 +60,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     movable = near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
     springs = Springs(surface, movable)
     best, since, iteration = Untangled(x, crossings, movable), 0, 0
-    while not _are_fixed(surface, crossings).all() and since < _PATIENCE:
+    while not are_fixed(surface, crossings).all() and since < _PATIENCE:
         needed = near(surface, _vertices_of(surface, crossings), _RINGS)
         if (needed & ~movable).any():
             movable = movable | near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
@@ -75,9 +75,9 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     return best
 
 
-def _are_fixed(surface: Surface, crossings: np.ndarray) -> np.ndarray:
+def are_fixed(surface: Surface, crossings: np.ndarray) -> np.ndarray:
     """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
-    return surface.fixed[_vertices_of(surface, crossings).reshape(-1, 5)].all(axis=1)
+    return np.all(surface.fixed[_vertices_of(surface, crossings).reshape(-1, 5)], axis=1)
 
 
 def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
