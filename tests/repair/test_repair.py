@@ -1,5 +1,7 @@
 """Repairs of meshes that cross themselves: free in the end, near, and never worse."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -65,6 +67,14 @@ def test_order_or_history_solves_it(hint):
     result = repair(scene, scene.x, **({"x_previous": scene.free} if hint == "x_previous" else option))
     assert result.certified
     assert result.max_strain <= 0.1
+
+
+@pytest.mark.parametrize("layer", [0, 1])
+def test_what_is_fixed_stays_where_history_has_it_elsewhere(layer):
+    scene = KNOWN["sheets"]()
+    held = replace(scene, fixed=scene.layer == layer)
+    moved = scene.free + np.array([0.0, 0.0, 0.05])
+    assert repair(held, scene.x, x_previous=moved).certified
 
 
 @pytest.mark.parametrize("kind", KINDS)

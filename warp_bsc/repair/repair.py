@@ -99,14 +99,12 @@ def repair(
     is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
     surface = Surface(welded_mesh, given, is_fixed, distance)
     before = surface.crossings(surface.home)
+    history = None if x_previous is None else surface.in_units(previous)
+    if history is not None and (count := len(surface.crossings(history))):
+        raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
     final = surface.home
-    if x_previous is not None:
-        reached = _reached(surface, surface.in_units(previous), strain)
-        # fixed vertices that contact keeps from their places cannot stay elsewhere
-        if len(before) and not (reached != surface.home).any(axis=1)[is_fixed].any():
-            final = reached
-    elif len(before):
-        final = _repaired(surface, before, layer if order is not None else None, strain)
+    if len(before):
+        final = _repaired(surface, before, history, layer if order is not None else None, strain)
     crossings = surface.crossings(final)
     positions = surface.positions(final)[weld]
     has_moved = (final != surface.home).any(axis=1)[weld]
@@ -154,8 +152,15 @@ def _welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
     )
 
 
-def _repaired(surface: Surface, before: np.ndarray, layer: np.ndarray | None, max_strain: float) -> np.ndarray:
+def _repaired(
+    surface: Surface, before: np.ndarray, history: np.ndarray | None, layer: np.ndarray | None, max_strain: float
+) -> np.ndarray:
     """Returns the best positions for an input that crosses, in units of the surface."""
+    if history is not None:
+        reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
+        # fixed vertices that contact keeps from their places cannot stay elsewhere
+        if (reached == surface.home)[surface.fixed].all():
+            return reached
     if layer is None:
         start, crossings = surface.home, before
     else:
@@ -172,13 +177,6 @@ def _repaired(surface: Surface, before: np.ndarray, layer: np.ndarray | None, ma
         x = _restored(surface, x, before, left)
         left = surface.crossings(x)
     return x if len(left) < len(before) else surface.home
-
-
-def _reached(surface: Surface, previous: np.ndarray, max_strain: float) -> np.ndarray:
-    """Returns the positions nearest to the input that are reached from a configuration that does not cross."""
-    if count := len(surface.crossings(previous)):
-        raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
-    return approach(surface, previous, Springs(surface, ~surface.fixed), max_strain)
 
 
 def _restored(surface: Surface, x: np.ndarray, before: np.ndarray, left: np.ndarray) -> np.ndarray:
